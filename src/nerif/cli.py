@@ -1,0 +1,64 @@
+"""The command line: `nerif VERB ...`. One module of nerif.commands a verb, loaded only when it is asked for."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from nerif import __version__
+
+__all__ = ["main"]
+
+VERBS = {
+    "simulate": "trace curved rays through a phantom and write a measurement, with its truth",
+    "reconstruct": "reconstruct the refractive-index field of a measurement",
+    "project": "predict the displacement that any camera would see of a reconstruction",
+    "evaluate": "compare a reconstruction with a truth, or with measured views",
+    "export": "write a reconstruction as .vti (ParaView), .nc or .csv, on any grid",
+    "info": "print what a measurement, volume or result holds",
+    "demo": "simulate, reconstruct and evaluate a small flame",
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0 done, 2 bad input, 130 interrupted."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print("usage: nerif VERB [options]      (nerif VERB --help tells all options, units and defaults)\n")
+        print("Refractive index, density and temperature in 3-D from background-oriented schlieren pictures.\n")
+        print("\n".join(f"  {verb:<12} {text}" for verb, text in VERBS.items()))
+        return 0
+    if words[0] == "--version":
+        print(f"nerif {__version__}")
+        return 0
+    verb = words[0]
+    if verb not in VERBS:
+        import difflib
+
+        near = difflib.get_close_matches(verb, VERBS, n=1, cutoff=0)
+        return _refuse(f"unknown verb '{verb}'; the nearest known one is '{near[0]}'; see nerif --help")
+
+    from nerif.conventions import InputError
+
+    try:
+        command = importlib.import_module(f"nerif.commands.{verb}")
+        command.main(words[1:])
+    except InputError as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except OSError as error:
+        return _refuse(f"{error.filename or 'file'}: {error.strerror or error}")
+    return 0
+
+
+def _refuse(message: str) -> int:
+    print("nerif: " + " ".join(message.split()), file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

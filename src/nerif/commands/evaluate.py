@@ -1,0 +1,78 @@
+"""nerif evaluate: how close a reconstruction is to a truth, and to measured views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from nerif.commands.output import say
+from nerif.commands.settings import parse
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views, evaluate_volume, update_json
+from nerif.measurement import Measurement
+from nerif.reconstruction.files import read_field
+from nerif.volume import read_volume
+
+__all__ = ["Evaluate", "main", "run"]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a reconstruction with a truth over the volume, or with measured views; adds to its metrics.json."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """Result directory of nerif reconstruct."""
+    truth: Path | None = None
+    """Volume file (.nc, .vti) of the true index; compared on its own grid."""
+    measurement: Path | None = None
+    """Measurement to re-project into."""
+    hold_out: tuple[str, ...] = ()
+    """Views of that measurement which the reconstruction has not seen."""
+
+
+def run(settings: Evaluate) -> dict[str, Any]:
+    """Print the metrics, keep them in metrics.json, and return them."""
+    if settings.truth is None and settings.measurement is None:
+        raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")
+    field, box, n_ambient = read_field(settings.result)
+    metrics: dict[str, Any] = {}
+    if settings.truth is not None:
+        truth = read_volume(settings.truth)
+        if truth.quantity != "index_excess":
+            raise InputError(f"{settings.truth}: expected index_excess or n in it, got '{truth.quantity}'")
+        outside = [
+            a
+            for i, a in enumerate("xyz")
+            if truth.grid.box.lower[i] < box.lower[i] - 1e-6 or truth.grid.box.upper[i] > box.upper[i] + 1e-6
+        ]
+        if outside:
+            raise InputError(
+                f"{settings.truth}: expected a volume inside the reconstructed box ({box.lower} to {box.upper} mm), "
+                f"got one that sticks out along {', '.join(outside)}"
+            )
+        metrics |= evaluate_volume(field, truth, n_ambient)
+        say(f"L2            {metrics['l2']:8.3%}   |n_gt - n_rec| / |n_gt - 1|, the paper's")
+        say(f"L2 variation  {metrics['l2_variation']:8.3%}   |n_gt - n_rec| / |n_gt - n_ambient|")
+        say(f"CC            {metrics['cc']:8.5f}")
+        say(f"SSIM          {metrics['ssim']:8.5f}")
+        say(f"PSNR          {metrics['psnr']:8.2f} dB")
+        say("   z [mm]      CC    SSIM   PSNR [dB]")
+        for s in metrics["slices"]:
+            say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
+    if settings.measurement is not None:
+        measurement = Measurement.read(settings.measurement)
+        metrics["views"] = evaluate_views(field, measurement, settings.hold_out)
+        say("view                CC    SSIM  PSNR [dB]  rms [px]")
+        for v in metrics["views"]:
+            held = "  held out" if v["held_out"] else ""
+            say(f"{v['name']:<14} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {v['rms_px']:9.4f}{held}")
+    update_json(settings.result / "metrics.json", metrics)
+    return metrics
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    run(parse(Evaluate(result=tyro.MISSING), arguments, "nerif evaluate", Evaluate.__doc__ or ""))

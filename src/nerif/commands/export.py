@@ -1,0 +1,71 @@
+"""nerif export: a reconstruction on any grid, for other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nerif.commands.output import check_file, say
+from nerif.commands.settings import parse
+from nerif.conventions import InputError
+from nerif.geometry import Box, Grid
+from nerif.physics.quantities import GasSettings, derive
+from nerif.reconstruction.files import read_field
+from nerif.report.exports import export
+from nerif.volume import Volume
+
+__all__ = ["Export", "main", "run"]
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a reconstruction as .vti (opens in ParaView), .nc or .csv, on any grid."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """Result directory of nerif reconstruct."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """File to write; its ending says the format: .vti, .nc or .csv."""
+    quantities: tuple[str, ...] = ("index_excess", "n", "density")
+    """Out of index_excess (1), n (1), density (kg/m3), temperature (K)."""
+    voxels: int = 100
+    """Voxels along the longest edge; near-cubic voxels."""
+    shape: tuple[int, int, int] | None = None
+    """Voxels along z y x, instead of --voxels."""
+    lower: tuple[float, float, float] | None = None
+    """Lower corner x y z of the part to write, mm; default: the whole box."""
+    upper: tuple[float, float, float] | None = None
+    """Upper corner x y z, mm."""
+    force: bool = False
+    """Overwrite an existing file."""
+    gas: GasSettings = field(default_factory=GasSettings)
+    """What density and temperature are computed for."""
+
+
+def run(settings: Export) -> None:
+    """Write the file."""
+    if settings.voxels < 1:
+        raise InputError(f"voxels: expected at least 1, got {settings.voxels}")
+    if not settings.quantities:
+        raise InputError("quantities: expected at least one, got none")
+    if settings.out.suffix not in (".vti", ".nc", ".csv"):
+        raise InputError(f"out: expected a name ending in .vti, .nc or .csv, got '{settings.out.name}'")
+    check_file(settings.out, settings.force)
+    index, whole, n_ambient = read_field(settings.result)
+    lower, upper = settings.lower or whole.lower, settings.upper or whole.upper
+    box = Box(lower, upper)
+    if any(a < w - 1e-6 for a, w in zip(lower, whole.lower, strict=True)) or any(
+        b > w + 1e-6 for b, w in zip(upper, whole.upper, strict=True)
+    ):
+        raise InputError(f"lower, upper: expected a part of the box {whole.lower} to {whole.upper} mm, got {lower} to {upper}")
+    grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
+    excess = Volume(index.sample(grid), grid, attributes={"n_ambient": n_ambient})
+    export(settings.out, [derive(excess, q, settings.gas) for q in settings.quantities])
+    say(f"{settings.out}: {', '.join(settings.quantities)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    run(parse(Export(tyro.MISSING, tyro.MISSING), arguments, "nerif export", Export.__doc__ or ""))

@@ -1,0 +1,114 @@
+"""nerif info: what a file or a result directory holds, in words."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nerif.commands.output import say
+from nerif.commands.settings import parse
+from nerif.conventions import InputError
+from nerif.measurement import CONVENTIONS, Measurement
+from nerif.reconstruction.files import read_field
+from nerif.volume import Volume, read_volume
+
+__all__ = ["Info", "main", "run"]
+
+
+@dataclass(frozen=True)
+class Info:
+    """Print what a measurement, a volume or a result directory holds."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """Measurement (.nc), volume (.nc, .vti) or result directory."""
+
+
+def run(settings: Info) -> None:
+    """Print it."""
+    path = settings.path
+    if path.is_dir():
+        _result(path)
+    elif path.suffix == ".vti" or (path.suffix == ".nc" and path.is_file() and not _is_measurement(path)):
+        _volume(path, read_volume(path))
+    else:
+        _measurement(path, Measurement.read(path))
+
+
+def _is_measurement(path: Path) -> bool:
+    """A volume says CF, a measurement BOST; what says nothing is left to the stricter reader."""
+    import xarray as xr
+
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as dataset:
+            said = dataset.attrs.get("Conventions") == CONVENTIONS or "displacement" in dataset
+            return said or not {"x", "y", "z"} <= set(dataset.coords)
+    except (OSError, ValueError, KeyError):
+        return True
+
+
+def _corners(lower: tuple[float, ...], upper: tuple[float, ...]) -> str:
+    return " x ".join(f"{a:g}..{b:g}" for a, b in zip(lower, upper, strict=True)) + " mm (x, y, z)"
+
+
+def _measurement(path: Path, m: Measurement) -> None:
+    rays, d, sigma = m.rays()
+    say(f"{path}: measurement, {len(m.cameras)} views of {m.displacement.shape[1]} x {m.displacement.shape[2]} px")
+    say(f"  box            {_corners(m.box.lower, m.box.upper)}")
+    light = f", wavelength {m.wavelength_nm:g} nm" if m.wavelength_nm else ""
+    say(f"  n_ambient      {m.n_ambient:.8g}{light}")
+    say(f"  ambient faces  {' '.join(m.ambient_faces) or 'none'}")
+    noise = "unknown" if sigma is None else f"rms {float(sigma.square().mean().sqrt()):.4g} px"
+    say(f"  rays           {len(rays)} cross the box; rms displacement {float(d.square().mean().sqrt()):.4g} px; sigma {noise}")
+    say(f"  masked         {m.bad_pixels} pixels with NaN or infinite displacement")
+    say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
+    say("  view            size [px]      f [px]   centre to camera [mm]   to background [mm]   usable   rms [px]")
+    usable = m.usable
+    for i, c in enumerate(m.cameras):
+        centre = c.centre.new_tensor(m.box.centre)
+        away = float((c.centre - centre).norm())
+        plane = abs(float(centre @ c.background.normal.to(centre)) - c.background.offset)
+        good = m.displacement[i][usable[i]]
+        share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
+        size = f"{c.image_size[0]} x {c.image_size[1]}"
+        say(
+            f"  {c.name:<14} {size:>10} {float(c.intrinsics[0, 0]):11.1f} {away:23.1f} {plane:20.1f} "
+            f"{share:8.1%} {float(good.square().mean().sqrt()):10.4f}"
+        )
+
+
+def _volume(path: Path, v: Volume) -> None:
+    say(f"{path}: volume of {v.quantity} [{v.unit}] on {' x '.join(map(str, v.grid.shape))} voxels (z, y, x)")
+    say(f"  box            {_corners(v.grid.box.lower, v.grid.box.upper)}")
+    say(f"  values         {float(v.values.min()):.6g} to {float(v.values.max()):.6g}, mean {float(v.values.mean()):.6g}")
+    for name, value in v.attributes.items():
+        say(f"  {name:<14} {value}")
+
+
+def _result(path: Path) -> None:
+    _, box, n_ambient = read_field(path)
+    say(f"{path}: reconstruction")
+    say(f"  box            {_corners(box.lower, box.upper)}")
+    say(f"  n_ambient      {n_ambient:.8g}")
+    file = path / "metrics.json"
+    if not file.is_file():
+        say("  metrics.json is missing; the run may not have ended")
+        return
+    try:
+        metrics = json.loads(file.read_text())
+    except ValueError:
+        raise InputError(f"{file}: not a JSON file, or truncated") from None
+    for name, value in metrics.items():
+        if not isinstance(value, list):
+            say(f"  {name:<18} {value}")
+    for v in metrics.get("views", []):
+        held = "held out" if v["held_out"] else "training"
+        say(f"  view {v['name']:<14} {held}  CC {v['cc']}  rms {v['rms_px']} px")
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    run(parse(Info(tyro.MISSING), arguments, "nerif info", Info.__doc__ or ""))

@@ -1,0 +1,87 @@
+"""Where results go, and what is said on the way."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from nerif.conventions import InputError
+from nerif.reconstruction.base import Step
+
+__all__ = ["check_directory", "check_file", "interruptible", "progress_bar", "say"]
+
+
+def say(text: str) -> None:
+    """Print a line for the user."""
+    print(text, flush=True)
+
+
+def check_file(path: Path, force: bool, *others: Path) -> None:
+    """Refuse an output file that exists (unless forced) or whose folder does not."""
+    for file in (path, *others):
+        if not file.parent.is_dir():
+            raise InputError(f"{file}: the folder {file.parent} does not exist; make it first")
+        if file.is_dir():
+            raise InputError(f"{file}: expected the name of a file to write, got a folder")
+        if file.exists() and not force:
+            raise InputError(f"{file}: exists already and was left as it is; give another --out, or --force")
+
+
+def check_directory(path: Path, force: bool) -> None:
+    """Refuse an output directory that holds anything, unless forced."""
+    if path.is_file():
+        raise InputError(f"{path}: expected a directory for --out, got a file")
+    if path.is_dir() and any(path.iterdir()) and not force:
+        raise InputError(
+            f"{path}: exists already and was left as it is; give another --out, --force to overwrite, "
+            "or --resume to go on with it"
+        )
+
+
+@contextmanager
+def interruptible() -> Iterator[list[bool]]:
+    """Turn the first Ctrl-C into a request to stop (the list becomes [True]); the second one breaks off."""
+    asked = [False]
+
+    def handler(number: int, frame: object) -> None:
+        if asked[0]:
+            raise KeyboardInterrupt
+        asked[0] = True
+        print("\nstopping after this step; Ctrl-C again to break off", file=sys.stderr, flush=True)
+
+    try:
+        before = signal.signal(signal.SIGINT, handler)
+    except ValueError:  # not in the main thread: nothing to catch here
+        yield asked
+        return
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[object]:
+    """Show a bar of the training: a callable for each Step, with epoch, loss terms, rays/s and time left."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn(title), BarColumn(bar_width=20), TextColumn("{task.percentage:3.0f}% {task.fields[figures]}"))
+    last = [0.0]
+    with Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=4) as bar:
+        task = bar.add_task(title, total=1.0, figures="")
+
+        def update(step: Step) -> None:
+            left = step.seconds * (1 / step.progress - 1) if step.progress > 0.001 else float("nan")
+            terms = " ".join(f"{k} {v:.2e}" for k, v in step.losses.items())
+            figures = f"epoch {step.epoch:.1f} | {terms} | {step.rays_per_second:.3g} rays/s | {left:.0f} s left"
+            bar.update(task, completed=step.progress, figures=figures)
+            if not console.is_terminal and step.seconds - last[0] >= 15:
+                last[0] = step.seconds
+                print(f"{title} {step.progress:4.0%} {figures}", file=sys.stderr, flush=True)
+
+        yield update

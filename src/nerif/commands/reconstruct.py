@@ -1,0 +1,214 @@
+"""nerif reconstruct: from a measurement file to a result directory."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from nerif import __version__
+from nerif.commands.output import check_directory, interruptible, progress_bar, say
+from nerif.commands.settings import flag_value, merge, parse, read_toml, to_toml
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views, update_json
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
+from nerif.physics.quantities import GasSettings, derive
+from nerif.reconstruction.base import OnStep, Reconstruction, Step, compose
+from nerif.reconstruction.files import CHECKPOINT, FIELD, read_state, write_field, write_state
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.presets import preset
+from nerif.report.exports import export
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from contextlib import AbstractContextManager
+
+__all__ = ["Reconstruct", "main", "run"]
+
+RUN, METRICS, HISTORY = "run.toml", "metrics.json", "history.csv"
+OWN_FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, "volume.nc", "volume.vti")
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct the refractive-index field of a measurement and write a result directory."""
+
+    measurement: Annotated[Path, tyro.conf.Positional]
+    """Measurement file (.nc); with --resume it may be left out."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Result directory to write."""
+    preset: str = "auto"
+    """One of fast, best, paper; auto is best where there is a GPU, else fast. Single settings below win over it."""
+    hold_out: tuple[str, ...] = ()
+    """Views kept out of the reconstruction and re-projected from it."""
+    voxels: int = 100
+    """Voxels of the written volume along the longest edge of the box."""
+    force: bool = False
+    """Overwrite an existing result directory."""
+    resume: bool = False
+    """Go on with an interrupted run in --out; limits such as --epochs may be raised."""
+    checkpoint_every: float = 60.0
+    """Seconds between checkpoints."""
+    tensorboard: bool = False
+    """Write TensorBoard scalars to OUT/tensorboard."""
+    config: Path | None = None
+    """TOML file of settings (such as the run.toml of a result); flags win over it."""
+    gas: GasSettings = field(default_factory=GasSettings)
+    """What the density is computed for."""
+    nerif: Annotated[NeRIF, tyro.conf.arg(name="")] = field(default_factory=NeRIF)
+
+
+def run(settings: Reconstruct) -> Reconstruction:
+    """Reconstruct, and write everything that docs/formats.md lists."""
+    if settings.voxels < 1:
+        raise InputError(f"voxels: expected at least 1, got {settings.voxels}")
+    measurement = Measurement.read(settings.measurement)
+    training = _without(measurement, settings.hold_out)
+    if measurement.wavelength_nm is not None:
+        settings = replace(settings, gas=replace(settings.gas, wavelength_nm=measurement.wavelength_nm))
+    derive_check(settings.gas)
+    if measurement.bad_pixels:
+        say(f"{settings.measurement}: {measurement.bad_pixels} pixels with NaN or infinite displacement left out")
+    resume = read_state(settings.out) if settings.resume else None
+    if not settings.resume:
+        check_directory(settings.out, settings.force)
+        settings.out.mkdir(parents=True, exist_ok=True)
+        for name in OWN_FILES:
+            (settings.out / name).unlink(missing_ok=True)
+    (settings.out / RUN).write_text(_run_toml(settings))
+
+    with interruptible() as asked, _scalars(settings) as scalars, progress_bar("training") as bar:
+        callbacks: list[OnStep] = [bar, _checkpoints(settings), lambda _: asked[0], *scalars]  # type: ignore[list-item]
+        result = settings.nerif(training, compose(*callbacks), resume)
+    say(f"{result.outcome.reason}: {result.outcome.message}")
+    _write(settings, measurement, result)
+    return result
+
+
+def _without(measurement: Measurement, names: tuple[str, ...]) -> Measurement:
+    for name in names:
+        if name not in measurement.names:
+            raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{name}'")
+    kept = [name for name in measurement.names if name not in names]
+    if not kept:
+        raise InputError("hold_out: every view is held out, so none is left to reconstruct from")
+    return measurement.select(kept)
+
+
+def derive_check(gas: GasSettings) -> None:
+    """Refuse an unknown gas before the long work, not after it."""
+    from nerif.physics.gas_optics import gladstone_dale
+
+    gladstone_dale(gas.composition, gas.wavelength_nm)
+
+
+def _checkpoints(settings: Reconstruct) -> Callable[[Step], None]:
+    last = [time.monotonic()]
+
+    def write(step: Step) -> None:
+        if time.monotonic() - last[0] >= settings.checkpoint_every:
+            write_state(settings.out, step.capture())
+            last[0] = time.monotonic()
+
+    return write
+
+
+def _scalars(settings: Reconstruct) -> AbstractContextManager[list[OnStep]]:
+    """A context that gives the callback writing TensorBoard scalars, if asked for."""
+    from contextlib import contextmanager
+
+    @contextmanager
+    def nothing() -> Iterator[list[OnStep]]:
+        yield []
+
+    @contextmanager
+    def board() -> Iterator[list[OnStep]]:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            raise InputError("tensorboard: not installed; pip install 'nerif[tensorboard]'") from None
+        with SummaryWriter(str(settings.out / "tensorboard")) as writer:
+
+            def write(step: Step) -> None:
+                if step.step % 20 == 0:
+                    for name, value in {**step.losses, "rays_per_second": step.rays_per_second}.items():
+                        writer.add_scalar(name, value, step.step)
+
+            yield [write]  # type: ignore[list-item]
+
+    return board() if settings.tensorboard else nothing()
+
+
+def _run_toml(settings: Reconstruct, about: dict[str, Any] | None = None) -> str:
+    kept = replace(settings, force=False, resume=False, config=None, measurement=settings.measurement.resolve())
+    head = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
+    return head + to_toml(kept, {"nerif": __version__, **(about or {})})
+
+
+def _write(settings: Reconstruct, measurement: Measurement, result: Reconstruction) -> None:
+    """Write the result directory; the field first, it is the costliest."""
+    import torch
+
+    out = settings.out
+    write_field(out, result)
+    if result.state is not None:
+        write_state(out, result.state)
+    _write_history(out / HISTORY, result.history)
+    views = evaluate_views(result.field, measurement, settings.hold_out, result.device)
+    update_json(
+        out / METRICS,
+        {
+            "views": views,
+            "seconds": result.seconds,
+            "peak_memory_bytes": result.peak_memory_bytes,
+            "device": result.device,
+            "outcome": result.outcome.reason,
+        },
+    )
+    about = {"torch": torch.__version__, "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
+    (out / RUN).write_text(_run_toml(settings, about))
+    excess = result.volume(Grid.of_resolution(result.box, settings.voxels))
+    volumes = [derive(excess, quantity, settings.gas) for quantity in ("index_excess", "n", "density")]
+    volumes[0] = replace(volumes[0], attributes=volumes[-1].attributes)
+    for name in ("volume.nc", "volume.vti"):
+        export(out / name, volumes)
+    for group, held in (("training views", False), ("held-out views", True)):
+        chosen = [v for v in views if v["held_out"] is held]
+        if chosen:
+            cc = min(v["cc"] for v in chosen)
+            rms = max(v["rms_px"] for v in chosen)
+            noise = max(v.get("rms_over_sigma", float("nan")) for v in chosen)
+            beside = "" if noise != noise else f", at most {noise:.2f} sigma"
+            say(f"{len(chosen)} {group}: CC at least {cc:.4f}, rms error at most {rms:.4f} px{beside}")
+    say(f"{out}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView")
+
+
+def _write_history(path: Path, history: list[dict[str, float]]) -> None:
+    columns = list(dict.fromkeys(key for record in history for key in record))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        writer.writerows(history)
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    config = flag_value(arguments, "--config")
+    out = flag_value(arguments, "-o", "--out")
+    if "--resume" in arguments and config is None and out is not None:
+        if not (Path(out) / RUN).is_file():
+            raise InputError(f"{out}: expected an interrupted run to resume, got no {RUN} in it")
+        config = str(Path(out) / RUN)
+    values = read_toml(Path(config)) if config else {}
+    name = flag_value(arguments, "--preset") or values.get("preset", "auto")
+    # settings of a file are complete: there the preset has had its say already
+    default = Reconstruct(measurement=tyro.MISSING, out=tyro.MISSING, preset=name, nerif=preset(name))
+    if config:
+        default = merge(default, values, config)
+    run(parse(default, arguments, "nerif reconstruct", Reconstruct.__doc__ or ""))

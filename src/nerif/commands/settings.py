@@ -1,0 +1,168 @@
+"""From the command line and a TOML file to a checked record of settings.
+
+The names in the file are those of the flags; a nested flag such as --network.width stands in the table [network].
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import json
+import re
+import tomllib
+import typing
+from pathlib import Path
+from typing import Any, TypeVar
+
+from nerif.conventions import InputError
+
+__all__ = ["flag_value", "merge", "parse", "read_toml", "to_toml"]
+
+T = TypeVar("T")
+
+IGNORED = ("about",)  # the table of run.toml that tells what came out
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a settings file.
+
+    Raises
+    ------
+    InputError
+        If it is missing or no TOML.
+    """
+    try:
+        return {k: v for k, v in tomllib.loads(path.read_text()).items() if k not in IGNORED}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such settings file (--config)") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise InputError(f"{path}: not a TOML file ({error})") from None
+
+
+def flat_names(cls: type) -> dict[str, tuple[str, ...]]:
+    """Map each name a user may give to where it stands: fields of a record annotated name="" stand at the top."""
+    names: dict[str, tuple[str, ...]] = {}
+    for field in dataclasses.fields(cls):
+        inner = _inner_record(cls, field.name)
+        if inner is not None:
+            names |= {f.name: (field.name, f.name) for f in dataclasses.fields(inner)}
+        else:
+            names[field.name] = (field.name,)
+    return names
+
+
+def _hint(cls: type, name: str) -> Any:
+    return typing.get_type_hints(cls, include_extras=True)[name]
+
+
+def _inner_record(cls: type, name: str) -> type | None:
+    """The record behind a field whose own name is left out of the flags."""
+    hint = _hint(cls, name)
+    if typing.get_origin(hint) is typing.Annotated and getattr(hint.__metadata__[0], "name", None) == "":
+        return typing.cast(type, hint.__origin__)
+    return None
+
+
+def merge(default: T, values: dict[str, Any], source: str) -> T:
+    """Return a record with the values of a settings file put in, each checked against its type.
+
+    Raises
+    ------
+    InputError
+        If a key is unknown (the nearest known one is named) or a value is of the wrong type.
+    """
+    cls = type(default)
+    names = flat_names(cls)
+    groups: dict[str, dict[str, Any]] = {}
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        key = key.replace("-", "_")
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=1, cutoff=0)
+            raise InputError(f"{source}: unknown key '{key}'; the nearest known one is '{near[0]}'")
+        where = names[key]
+        if len(where) == 2:
+            groups.setdefault(where[0], {})[where[1]] = value
+        elif dataclasses.is_dataclass(getattr(default, key)) and isinstance(value, dict):
+            changes[key] = merge(getattr(default, key), value, f"{source} [{key}]")
+        else:
+            changes[key] = _typed(cls, key, value, source)
+    for name, inner in groups.items():
+        changes[name] = merge(getattr(default, name), inner, source)
+    return dataclasses.replace(default, **changes)  # type: ignore[type-var]
+
+
+def _typed(cls: type, name: str, value: Any, source: str) -> Any:
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(_hint(cls, name)).validate_json(json.dumps(value, default=str), strict=True)
+    except ValidationError as error:
+        detail = error.errors()[0]
+        raise InputError(f"{source}: '{name}' = {value!r}: {detail['msg'].lower()}") from None
+
+
+def flag_value(arguments: list[str], *flags: str) -> str | None:
+    """Return the value of a flag before the whole line is parsed: it decides what the defaults are."""
+    for i, word in enumerate(arguments):
+        for flag in flags:
+            if word == flag and i + 1 < len(arguments):
+                return arguments[i + 1]
+            if flag.startswith("--") and word.startswith(flag + "="):
+                return word.split("=", 1)[1]
+    return None
+
+
+def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
+    """Parse the arguments of a verb; those not given keep the values of `default`.
+
+    Raises
+    ------
+    InputError
+        In one line, where the library would draw a box.
+    """
+    import tyro
+
+    arguments = [re.sub(r"^(--[\w.-]+)", lambda m: m[1].replace("_", "-"), a) for a in arguments]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(type(default), prog=prog, description=description, args=arguments, default=default)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(_one_line(said.getvalue(), prog)) from None
+
+
+def _one_line(box: str, prog: str) -> str:
+    """Reduce the library's box to its first sentence and the nearest option it offers."""
+    lines = [re.sub(r"[│╭╮╰╯─]+", " ", re.sub(r"\x1b\[[0-9;]*m", "", line)).strip() for line in box.splitlines()]
+    lines = [line for line in lines if line][1:]
+    text = " ".join(lines)
+    text = re.split(r"\s*(?:For full helptext|Argument helptext)", text)[0]
+    text = re.sub(r"\s+", " ", text)
+    text = re.sub(r" Perhaps you meant: (--[\w.-]+|-\w, --[\w.-]+).*", r"; perhaps you meant \1", text)
+    return f"{text}; see {prog} --help"
+
+
+def to_toml(settings: Any, about: dict[str, Any] | None = None) -> str:
+    """Write a record as TOML under the names of the flags, and what came out under [about]."""
+    import tomli_w
+
+    def plain(value: Any) -> Any:
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        if isinstance(value, list | tuple):
+            return [plain(v) for v in value]
+        return str(value) if isinstance(value, Path) else value
+
+    table: dict[str, Any] = {}
+    for name, value in plain(settings).items():
+        if value is None:
+            continue
+        table |= value if _inner_record(type(settings), name) else {name: value}
+    # tables last, as TOML wants them
+    table = dict(sorted(table.items(), key=lambda item: isinstance(item[1], dict)))
+    return tomli_w.dumps({**table, **({"about": about} if about else {})})

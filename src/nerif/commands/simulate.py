@@ -1,0 +1,108 @@
+"""nerif simulate: a measurement of a phantom, and its truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nerif.commands.output import check_file, say
+from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
+from nerif.fields.base import Field
+from nerif.fields.grid import VoxelField
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Grid, Ring
+from nerif.simulation import STEPS, simulate
+from nerif.volume import Volume, read_volume, write_netcdf
+
+__all__ = ["Simulate", "main", "run"]
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Trace curved rays through a phantom and write a measurement, with its truth as a volume beside it."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Measurement to write, NAME.nc; the truth becomes NAME.truth.nc."""
+    phantom: str = "flame"
+    """One of gaussians, flame, octahedron, 1-7 (the paper's numbers), or a volume file (.nc, .vti) of your own."""
+    noise: float = 0.0
+    """Standard deviation of the noise as a share of the rms displacement over rays that cross the box."""
+    seed: int = 0
+    """Of phantom and noise."""
+    time: float = 0.0
+    """Instant of the flame, s."""
+    box: tuple[float, float, float] = (50.0, 50.0, 50.0)
+    """Edges of the box around the origin, along x y z, mm; a volume file brings its own."""
+    n_ambient: float = 1.00027
+    """Refractive index around the flow."""
+    wavelength_nm: float = 532.0
+    """Wavelength of the light, nm (kept in the file)."""
+    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
+    """Faces of the box on which the index is ambient (kept in the file)."""
+    truth_voxels: int = 100
+    """Voxels of the truth along the longest edge."""
+    steps: int = STEPS
+    """Runge-Kutta steps of a ray through the box."""
+    force: bool = False
+    """Overwrite existing files."""
+    config: Path | None = None
+    """TOML file of settings; flags win over it."""
+    ring: Annotated[Ring, tyro.conf.arg(name="")] = field(default_factory=Ring)
+
+
+def truth_path(out: Path) -> Path:
+    """Return NAME.truth.nc for NAME.nc."""
+    return out.with_name(out.stem + ".truth.nc")
+
+
+def run(settings: Simulate) -> None:
+    """Write the measurement and its truth."""
+    if settings.out.suffix != ".nc":
+        raise InputError(f"out: expected a name ending in .nc, got '{settings.out.name}'")
+    if settings.truth_voxels < 1:
+        raise InputError(f"truth_voxels: expected at least 1, got {settings.truth_voxels}")
+    check_file(settings.out, settings.force, truth_path(settings.out))
+    phantom, box = _phantom(settings)
+    cameras = settings.ring.cameras()
+    from rich.console import Console
+    from rich.progress import track
+
+    views = iter(track(range(len(cameras)), "tracing rays", console=Console(stderr=True), transient=True))
+    measurement = simulate(
+        phantom, cameras, box, settings.n_ambient, settings.noise, settings.seed, settings.steps,
+        settings.wavelength_nm, settings.ambient_faces, on_view=lambda _: next(views, None),
+    )  # fmt: skip
+    next(views, None)
+    grid = Grid.of_resolution(box, settings.truth_voxels)
+    truth = Volume(phantom.sample(grid), grid, attributes={"n_ambient": settings.n_ambient})
+    measurement.write(settings.out)
+    write_netcdf(truth_path(settings.out), [truth])
+    rays, d, _ = measurement.rays()
+    rms = float(d.square().mean().sqrt())
+    say(f"{settings.out}: {len(cameras)} views, {len(rays)} rays cross the box, rms displacement {rms:.3f} px a component")
+    say(f"{truth_path(settings.out)}: the truth on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
+
+
+def _phantom(settings: Simulate) -> tuple[Field, Box]:
+    path = Path(settings.phantom)
+    if path.suffix in (".nc", ".vti"):
+        volume = read_volume(path)
+        if volume.quantity != "index_excess":
+            raise InputError(f"{path}: expected index_excess or n in it, got '{volume.quantity}'")
+        return VoxelField(volume.values, volume.grid), volume.grid.box
+    x, y, z = (e / 2 for e in settings.box)
+    box = Box((-x, -y, -z), (x, y, z))
+    return make_phantom(settings.phantom, box, settings.seed, settings.time), box
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    default = Simulate(out=tyro.MISSING)
+    config = flag_value(arguments, "--config")
+    if config:
+        default = merge(default, read_toml(Path(config)), config)
+    run(parse(default, arguments, "nerif simulate", Simulate.__doc__ or ""))

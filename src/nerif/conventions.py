@@ -1,0 +1,60 @@
+"""Axis names, units and array aliases: the one place where each is written down (prose in docs/conventions.md).
+
+Lengths are millimetres, image quantities pixels, angles radians, times seconds. Volumes are indexed [z, y, x].
+"""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+__all__ = [
+    "COMPONENTS",
+    "DEFAULT_AMBIENT_FACES",
+    "FACES",
+    "InputError",
+    "Mask",
+    "Matrix3",
+    "Pixels",
+    "Points",
+    "Values",
+    "Vectors",
+    "VoxelIndex",
+    "parse_faces",
+]
+
+COMPONENTS = ("u", "v")
+"""Displacement components: u along columns, v along rows, both in px."""
+
+FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
+"""Faces of the box, by outward normal."""
+
+DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
+"""Where the index is taken as ambient when nothing else is said: the side faces (the gauge)."""
+
+Points = Float[Tensor, "*batch 3"]  # mm, world frame
+Vectors = Float[Tensor, "*batch 3"]  # direction (1) or gradient (1/mm)
+Values = Float[Tensor, "*batch"]  # index excess n - n_ambient (1)
+Pixels = Float[Tensor, "*batch 2"]  # px, (column u, row v), (0, 0) the centre of the top-left pixel
+Matrix3 = Float[Tensor, "3 3"]
+Mask = Bool[Tensor, "*batch"]
+VoxelIndex = Int[Tensor, "*batch 3"]
+
+
+class InputError(ValueError):
+    """Input that cannot be right: the message names what, what was expected, what came, and the remedy."""
+
+
+def parse_faces(text: str | tuple[str, ...] | list[str], name: str = "ambient_faces") -> tuple[str, ...]:
+    """Return the faces named in a text such as ``"x- x+ y- y+"``.
+
+    Raises
+    ------
+    InputError
+        If a word is not one of ``x- x+ y- y+ z- z+``.
+    """
+    words = tuple(text.replace(",", " ").split()) if isinstance(text, str) else tuple(text)
+    for word in words:
+        if word not in FACES:
+            raise InputError(f"{name}: expected faces out of '{' '.join(FACES)}', got '{word}'")
+    return words

@@ -1,0 +1,83 @@
+"""How good a reconstruction is: against a truth over the volume, and against measured views."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.fields.base import Field
+from nerif.geometry import Camera
+from nerif.measurement import Measurement
+from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
+from nerif.physics.deflection import Deflection, ForwardModel, project
+from nerif.volume import Volume
+
+__all__ = ["evaluate_views", "evaluate_volume", "predict_view", "update_json"]
+
+
+def predict_view(
+    field: Field, camera: Camera, model: ForwardModel, box: Any, device: torch.device | str = "cpu"
+) -> Float[Tensor, "row column 2"]:
+    """Return the displacement (px) that a camera would see of a field; 0 where a ray misses the box."""
+    rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
+    return project(model, field, rays, device).reshape(*camera.image_size, 2)
+
+
+def evaluate_views(
+    field: Field, measurement: Measurement, held_out: Collection[str] = (), device: torch.device | str = "cpu"
+) -> list[dict[str, Any]]:
+    """Re-project a field into every view: cc, ssim, psnr and rms_px over the usable pixels whose rays cross the box.
+
+    Where sigma is known, rms_over_sigma tells whether the residual is the noise (1) or more.
+    """
+    model = Deflection(n_ambient=measurement.n_ambient)
+    usable = measurement.usable
+    views = []
+    for i, camera in enumerate(measurement.cameras):
+        height, width = camera.image_size
+        crosses = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).crosses.reshape(height, width)
+        mask = usable[i, :height, :width] & crosses
+        predicted = predict_view(field, camera, model, measurement.box, device)
+        measured = measurement.displacement[i, :height, :width].nan_to_num(0.0, 0.0, 0.0)
+        view: dict[str, Any] = {"name": camera.name, "held_out": camera.name in held_out}
+        view |= displacement_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
+        if measurement.sigma is not None and bool(mask.any()):
+            residual = (predicted - measured)[mask] / measurement.sigma[i, :height, :width][mask]
+            view["rms_over_sigma"] = float(residual.square().mean().sqrt())
+        views.append(view)
+    return views
+
+
+def evaluate_volume(field: Field, truth: Volume, n_ambient: float, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Compare a field with a truth on the truth's own grid: see metrics.volume_metrics, and ten slices."""
+    rec = field.sample(truth.grid, device).numpy()
+    gt = truth.values.numpy()
+    heights = truth.grid.axis("z").numpy()
+    return {**volume_metrics(gt, rec, n_ambient), "slices": slice_metrics(gt, rec, heights)}
+
+
+def update_json(path: Path, entries: dict[str, Any]) -> dict[str, Any]:
+    """Add entries to a JSON file, atomically, and return all it holds; NaN and infinity are written as null."""
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    known |= entries
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(json.dumps(_plain(known), indent=2, allow_nan=False) + "\n")
+    os.replace(temporary, path)
+    return known
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not (-float("inf") < value < float("inf")):
+        return None
+    return value

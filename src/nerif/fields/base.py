@@ -1,0 +1,42 @@
+"""What every field of refractive index answers: phantom, network and voxel grid alike."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import Points, Values, Vectors
+from nerif.geometry import Grid
+
+__all__ = ["Field", "in_chunks"]
+
+
+class Field(ABC):
+    """A scalar field of index excess n - n_ambient over space."""
+
+    @abstractmethod
+    def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
+        """Return the index excess (1) and its gradient (1/mm) at points (mm)."""
+
+    def __call__(self, points: Points) -> Values:
+        """Return the index excess (1) at points (mm)."""
+        return self.value_and_gradient(points)[0]
+
+    def gradient(self, points: Points) -> Vectors:
+        """Return the gradient of the index (1/mm) at points (mm)."""
+        return self.value_and_gradient(points)[1]
+
+    @torch.no_grad()
+    def sample(self, grid: Grid, device: torch.device | str = "cpu") -> Float[Tensor, "z y x"]:
+        """Return the index excess at the voxel centres of a grid."""
+        points = grid.points().reshape(-1, 3)
+        values = [self(p.to(device)).cpu().to(torch.float32) for p in in_chunks(points)]
+        return torch.cat(values).reshape(grid.shape)
+
+
+def in_chunks(points: Tensor, size: int = 1 << 16) -> tuple[Tensor, ...]:
+    """Split along the first axis, so that what is computed of each chunk stays in cache."""
+    return torch.split(points, size)

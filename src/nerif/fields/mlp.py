@@ -1,0 +1,191 @@
+"""The paper's network (App. A): encoding, fully connected layers with a skip, four heads for n and grad(n).
+
+The gradient of the n head by automatic differentiation is the reverse pass *written out as forward operations*:
+one more pass through the transposed layers. So the training loss, which holds this gradient, needs a single call of
+autograd, and the whole can be compiled (`torch.compile` cannot differentiate twice).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerif.conventions import InputError, Points, Values, Vectors
+from nerif.fields.base import Field
+from nerif.fields.encoding import encode, encode_pullback, encoded_width
+from nerif.geometry import Box
+
+__all__ = ["ACTIVATIONS", "Network", "NetworkShape", "NeuralField"]
+
+
+def _silu(a: Tensor) -> tuple[Tensor, Tensor]:
+    s = torch.sigmoid(a)
+    h = a * s
+    return h, s + h * (1 - s)
+
+
+def _softplus(a: Tensor) -> tuple[Tensor, Tensor]:
+    # sharpness 10 on a scaled argument: close to ReLU, but with a second derivative to learn from
+    return torch.nn.functional.softplus(a, beta=10.0), torch.sigmoid(10.0 * a)
+
+
+def _tanh(a: Tensor) -> tuple[Tensor, Tensor]:
+    h = torch.tanh(a)
+    return h, 1 - h * h
+
+
+def _relu(a: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.relu(a), (a > 0).to(a)
+
+
+def _sine(a: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.sin(a), torch.cos(a)
+
+
+ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
+    "silu": _silu,
+    "softplus": _softplus,
+    "tanh": _tanh,
+    "relu": _relu,
+    "sine": _sine,
+}
+"""Each gives the activation and its derivative."""
+
+
+@dataclass(frozen=True)
+class NetworkShape:
+    """Size of the network."""
+
+    depth: int = 4
+    """Hidden layers before the heads (paper: 7)."""
+    width: int = 128
+    """Neurons per hidden layer (paper: 256)."""
+    octaves: int = 5
+    """N of the sinusoidal encoding."""
+    skip: int = 0
+    """The encoding is joined to the output of this layer (paper: 4); 0 for none."""
+    head_width: int = 0
+    """Neurons of each head (paper: 64); 0 for one linear output."""
+    gradient_head: bool = False
+    """Whether the three heads for grad(n) exist."""
+    activation: str = "silu"
+    """Silu, softplus, tanh, relu or sine."""
+    octave_decay: float = 0.0
+    """Octave k of the encoding is weighted 2^(-k octave_decay) (paper: 0)."""
+
+    def __post_init__(self) -> None:
+        if self.activation not in ACTIVATIONS:
+            raise InputError(f"activation: expected one of {', '.join(ACTIVATIONS)}, got '{self.activation}'")
+        for name, least in (("depth", 1), ("width", 1), ("octaves", 0), ("skip", 0), ("head_width", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+
+
+class Network(nn.Module):
+    """Maps coordinates in [-1, 1] to the scaled index excess and, by its own heads, the scaled gradient."""
+
+    gains: Tensor
+
+    def __init__(self, shape: NetworkShape) -> None:
+        super().__init__()
+        self.shape = shape
+        e, w = encoded_width(shape.octaves), shape.width
+        inputs = [e] + [w + (e if i == shape.skip else 0) for i in range(1, shape.depth + 1)]
+        self.layers = nn.ModuleList(nn.Linear(inputs[i], w) for i in range(shape.depth))
+        outputs = 4 if shape.gradient_head else 1
+        self.heads = nn.ModuleList(nn.Linear(inputs[-1], shape.head_width) for _ in range(outputs if shape.head_width else 0))
+        self.outputs = nn.ModuleList(nn.Linear(shape.head_width or inputs[-1], 1) for _ in range(outputs))
+        self.register_buffer("gains", 2.0 ** (-shape.octave_decay * torch.arange(shape.octaves)), persistent=False)
+
+    def forward(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Return the scaled index excess."""
+        activate = ACTIVATIONS[self.shape.activation]
+        h, _ = self._trunk(p, [])
+        return self._head(0, h, activate)[0]
+
+    def head_gradient(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return the gradient as the three gradient heads predict it."""
+        h, _ = self._trunk(p, [])
+        return self._gradient_heads(h)
+
+    def value_and_gradient(
+        self, p: Float[Tensor, "n 3"], heads: bool = False
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
+        """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
+        slopes: list[Tensor] = []
+        h, encoded = self._trunk(p, slopes)
+        value, cotangent = self._head(0, h, ACTIVATIONS[self.shape.activation])
+        # from here on the reverse pass: cotangent is d value / d (output of the layer)
+        to_encoding: Tensor | None = None
+        for i in range(self.shape.depth, 0, -1):
+            if i == self.shape.skip:
+                to_encoding = cotangent[:, self.shape.width :]
+                cotangent = cotangent[:, : self.shape.width]
+            cotangent = (cotangent * slopes[i - 1]) @ self.layers[i - 1].weight
+        if to_encoding is not None:
+            cotangent = cotangent + to_encoding
+        gains = self.gains.to(encoded)
+        gradient = encode_pullback(encoded, cotangent, self.shape.octaves) if len(gains) else cotangent
+        return value, gradient, self._gradient_heads(h) if heads else None
+
+    def _trunk(self, p: Tensor, slopes: list[Tensor]) -> tuple[Tensor, Tensor]:
+        activate = ACTIVATIONS[self.shape.activation]
+        encoded = encode(p, self.shape.octaves, self.gains.to(p) if self.shape.octave_decay else None)
+        h = encoded
+        for i, layer in enumerate(self.layers, start=1):
+            h, slope = activate(layer(h))
+            slopes.append(slope)
+            if i == self.shape.skip:
+                h = torch.cat([h, encoded], dim=1)
+        return h, encoded
+
+    def _head(
+        self, index: int, h: Tensor, activate: Callable[[Tensor], tuple[Tensor, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
+        """Output `index` and its derivative with respect to h."""
+        output = self.outputs[index]
+        if not self.shape.head_width:
+            return output(h)[:, 0], output.weight.expand(h.shape[0], -1)
+        inner, slope = activate(self.heads[index](h))
+        return output(inner)[:, 0], (slope * output.weight) @ self.heads[index].weight
+
+    def _gradient_heads(self, h: Tensor) -> Tensor:
+        if not self.shape.gradient_head:
+            raise InputError("gradient_head: this network was made without gradient heads, so they cannot be asked")
+        activate = ACTIVATIONS[self.shape.activation]
+        return torch.stack([self._head(i, h, activate)[0] for i in (1, 2, 3)], dim=1)
+
+
+class NeuralField(Field):
+    """A network in physical units: excess = index_scale (network((x - centre) / half_edge) - offset).
+
+    Parameters
+    ----------
+    network : Network
+    box : Box, mm; its longest edge is mapped to [-1, 1]
+    index_scale : index excess of one unit of network output
+    offset : network output that counts as ambient (the gauge)
+    """
+
+    def __init__(self, network: Network, box: Box, index_scale: float, offset: float = 0.0) -> None:
+        self.network, self.box, self.index_scale, self.offset = network, box, index_scale, offset
+        self.half_edge = max(box.edges) / 2
+
+    def normalise(self, points: Points) -> Points:
+        """Map points in mm to the coordinates of the network."""
+        return (points - points.new_tensor(self.box.centre)) / self.half_edge
+
+    def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
+        p = self.normalise(points.reshape(-1, 3))
+        value, gradient, _ = self.network.value_and_gradient(p)
+        value = self.index_scale * (value - self.offset)
+        gradient = gradient * (self.index_scale / self.half_edge)
+        return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
+
+    def __call__(self, points: Points) -> Values:
+        p = self.normalise(points.reshape(-1, 3))
+        return (self.index_scale * (self.network(p) - self.offset)).reshape(points.shape[:-1])

@@ -1,0 +1,109 @@
+"""The box under study and the voxel grid laid into it.
+
+A volume is indexed [z, y, x] and its values stand at voxel centres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import FACES, InputError
+
+__all__ = ["Box", "Grid"]
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned volume of interest.
+
+    Parameters
+    ----------
+    lower, upper : (x, y, z) corners, mm, world frame
+
+    Raises
+    ------
+    InputError
+        If an edge is not longer than zero, or a corner is not finite.
+    """
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        edges = [b - a for a, b in zip(self.lower, self.upper, strict=True)]
+        if len(edges) != 3 or not all(0 < e < float("inf") for e in edges):
+            raise InputError(f"box: expected lower < upper along x, y and z (mm), got {self.lower} to {self.upper}")
+
+    @classmethod
+    def cube(cls, edge: float) -> Box:
+        """Return a cube of `edge` mm centred on the origin."""
+        return cls((-edge / 2,) * 3, (edge / 2,) * 3)
+
+    @property
+    def edges(self) -> tuple[float, float, float]:
+        """Edge lengths along x, y, z, mm."""
+        x, y, z = (b - a for a, b in zip(self.lower, self.upper, strict=True))
+        return (x, y, z)
+
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        """Centre, mm."""
+        x, y, z = ((a + b) / 2 for a, b in zip(self.lower, self.upper, strict=True))
+        return (x, y, z)
+
+    def face_points(
+        self, face: str, unit: Float[Tensor, "n 2"]
+    ) -> Float[Tensor, "n 3"]:
+        """Map points of the unit square onto a face such as ``"x-"``, mm."""
+        axis, side = FACES.index(face) // 2, FACES.index(face) % 2
+        lower, edges = unit.new_tensor(self.lower), unit.new_tensor(self.edges)
+        inside = torch.full_like(unit[:, :1], float(side))
+        relative = torch.cat([unit[:, :axis], inside, unit[:, axis:]], dim=1)
+        return lower + relative * edges
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Voxels filling a box.
+
+    Parameters
+    ----------
+    box : Box, mm
+    shape : (nz, ny, nx) number of voxels along z, y, x
+    """
+
+    box: Box
+    shape: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or min(self.shape) < 1:
+            raise InputError(f"grid: expected three positive voxel counts (z, y, x), got {self.shape}")
+
+    @classmethod
+    def of_resolution(cls, box: Box, voxels: int) -> Grid:
+        """Return near-cubic voxels, `voxels` of them along the longest edge of the box."""
+        size = max(box.edges) / voxels
+        nx, ny, nz = (max(1, round(e / size)) for e in box.edges)
+        return cls(box, (nz, ny, nx))
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """Voxel edges along x, y, z, mm."""
+        nz, ny, nx = self.shape
+        ex, ey, ez = self.box.edges
+        return (ex / nx, ey / ny, ez / nz)
+
+    def axis(self, name: str, dtype: torch.dtype = torch.float64) -> Float[Tensor, " n"]:
+        """Voxel-centre coordinates along ``"x"``, ``"y"`` or ``"z"``, mm."""
+        i = "xyz".index(name)
+        n = self.shape[2 - i]
+        return self.box.lower[i] + (torch.arange(n, dtype=dtype) + 0.5) * self.spacing[i]
+
+    def points(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "z y x 3"]:
+        """Voxel centres, mm."""
+        z, y, x = torch.meshgrid(self.axis("z"), self.axis("y"), self.axis("x"), indexing="ij")
+        return torch.stack([x, y, z], dim=-1).to(dtype)

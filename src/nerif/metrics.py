@@ -1,0 +1,105 @@
+"""How close two volumes or two displacement maps are (paper, App. C), by scikit-image where it has the measure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = ["correlation", "displacement_metrics", "psnr", "slice_metrics", "ssim", "volume_metrics"]
+
+Array = np.ndarray
+
+
+def correlation(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> float:
+    """Return the correlation coefficient (paper, Eq. (cc)); NaN where one of the two is constant."""
+    x, y = a.astype(np.float64).ravel(), b.astype(np.float64).ravel()
+    x, y = x - x.mean(), y - y.mean()
+    norm = math.sqrt(float(x @ x) * float(y @ y))
+    return float(x @ y) / norm if norm > 0 else float("nan")
+
+
+def psnr(truth: Float[Array, "*n"], test: Float[Array, "*n"]) -> float:
+    """Return the peak signal-to-noise ratio in dB (paper, Eq. (psnr)), the peak being the range of the truth."""
+    from skimage.metrics import peak_signal_noise_ratio
+
+    span = float(truth.max() - truth.min())
+    if span == 0:
+        return float("nan")
+    if np.array_equal(truth, test):
+        return float("inf")
+    return float(peak_signal_noise_ratio(truth.astype(np.float64), test.astype(np.float64), data_range=span))
+
+
+def ssim(truth: Float[Array, "*n"], test: Float[Array, "*n"]) -> float:
+    """Return the mean structural similarity (paper, Eq. (ssim)) over windows of 7; in 2-D or 3-D."""
+    from skimage.metrics import structural_similarity
+
+    span = float(truth.max() - truth.min())
+    if span == 0 or min(truth.shape) < 7:
+        return float("nan")
+    return float(structural_similarity(truth.astype(np.float64), test.astype(np.float64), data_range=span))
+
+
+def volume_metrics(
+    truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_ambient: float
+) -> dict[str, float]:
+    """Compare two volumes of index excess.
+
+    l2 = |n_gt - n_rec| / |n_gt - 1| (the paper's, flattered by the ambient), l2_variation = the same over
+    |n_gt - n_ambient| (the honest one), cc, ssim, psnr.
+    """
+    gt, rec = truth.astype(np.float64), test.astype(np.float64)
+    error = float(np.linalg.norm(gt - rec))
+    variation = float(np.linalg.norm(gt))
+    return {
+        "l2": error / float(np.linalg.norm(gt + (n_ambient - 1))),
+        "l2_variation": error / variation if variation > 0 else float("nan"),
+        "cc": correlation(gt, rec),
+        "ssim": ssim(gt, rec),
+        "psnr": psnr(gt, rec),
+    }
+
+
+def slice_metrics(
+    truth: Float[Array, "z y x"], test: Float[Array, "z y x"], heights: Float[Array, " z"], slices: int = 10
+) -> list[dict[str, float]]:
+    """Return cc, ssim and psnr of equally spaced slices across z; `heights` in mm."""
+    nz = truth.shape[0]
+    chosen = np.unique(((np.arange(slices) + 0.5) * nz / slices).astype(int))
+    return [
+        {
+            "z_mm": float(heights[i]),
+            "cc": correlation(truth[i], test[i]),
+            "ssim": ssim(truth[i], test[i]),
+            "psnr": psnr(truth[i], test[i]),
+        }
+        for i in chosen
+    ]
+
+
+def displacement_metrics(
+    measured: Float[Array, "row column 2"], predicted: Float[Array, "row column 2"], valid: Array
+) -> dict[str, float]:
+    """Compare two displacement maps over the valid pixels: cc, ssim, psnr over both components, rms_px in px.
+
+    SSIM needs whole windows: pixels that are not valid are set to the same value in both maps and windows centred on
+    them are left out.
+    """
+    from skimage.metrics import structural_similarity
+
+    if not valid.any():
+        nan = float("nan")
+        return {"cc": nan, "ssim": nan, "psnr": nan, "rms_px": nan}
+    a, b = measured[valid], predicted[valid]
+    rms = float(np.sqrt(np.mean((a - b).astype(np.float64) ** 2)))
+    span = float(a.max() - a.min())
+    similarity = float("nan")
+    if span > 0 and min(valid.shape) >= 7:
+        maps = []
+        for c in range(2):
+            x, y = (np.where(valid, m[..., c], 0).astype(np.float64) for m in (measured, predicted))
+            maps.append(structural_similarity(x, y, data_range=span, full=True)[1][valid])
+        similarity = float(np.mean(maps))
+    return {"cc": correlation(a, b), "ssim": similarity, "psnr": psnr(a, b), "rms_px": rms}

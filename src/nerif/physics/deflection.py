@@ -1,0 +1,90 @@
+"""The forward model: what displacement the pixels see through a field.
+
+    d = integral (s_b - s) S grad(n) / n ds      lever_arm (default)
+    d = (s_b - s_mid) integral S grad(n) / n ds  paraxial: one lever arm for the whole ray (paper, Eq. (3))
+
+`curved`, which bends the ray, is in ray_tracing.py.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.fields.base import Field
+from nerif.geometry import Rays
+
+__all__ = ["Deflection", "ForwardModel", "integration_weights", "midpoints", "project"]
+
+
+class ForwardModel(ABC):
+    """From a field and rays to what the pixels see."""
+
+    @abstractmethod
+    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n 2"]:
+        """Return the displacement in px of rays clipped to the box."""
+
+
+@dataclass(frozen=True)
+class Deflection(ForwardModel):
+    """First-order deflection along straight rays.
+
+    Parameters
+    ----------
+    model : "lever_arm" or "paraxial"
+    samples : number of midpoint samples along a ray
+    n_ambient : refractive index the excess is counted from
+
+    Source: DESIGN of the forward model in docs/conventions.md; paper, Eqs. (1) and (3).
+    """
+
+    model: str = "lever_arm"
+    samples: int = 200
+    n_ambient: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.model not in ("lever_arm", "paraxial"):
+            raise InputError(f"model: expected lever_arm or paraxial, got '{self.model}'")
+        if self.samples < 1:
+            raise InputError(f"samples: expected at least one sample along a ray, got {self.samples}")
+
+    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n 2"]:
+        s, step = midpoints(rays, self.samples)
+        value, gradient = field.value_and_gradient(rays.at(s))
+        weights = integration_weights(rays, s, step, self.model) / (self.n_ambient + value)
+        return torch.einsum("nm,nij,nmj->ni", weights, rays.sensitivity, gradient)
+
+
+def midpoints(rays: Rays, samples: int) -> tuple[Float[Tensor, "n m"], Float[Tensor, " n"]]:
+    """Return the midpoints of `samples` equal intervals between near and far, and the interval length, both mm."""
+    step = (rays.far - rays.near) / samples
+    index = torch.arange(samples, dtype=rays.near.dtype, device=rays.near.device) + 0.5
+    return rays.near[:, None] + index * step[:, None], step
+
+
+def integration_weights(
+    rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, " n"], model: str
+) -> Float[Tensor, "n m"]:
+    """Return lever arm times step, mm^2: what each sample of S grad(n) counts for."""
+    if model == "paraxial":
+        lever = (rays.background - 0.5 * (rays.near + rays.far))[:, None].expand_as(s)
+    else:
+        lever = rays.background[:, None] - s
+    return lever * step[:, None]
+
+
+@torch.no_grad()
+def project(
+    model: ForwardModel, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int = 4096
+) -> Float[Tensor, "n 2"]:
+    """Return the displacement (px) of many rays, chunk by chunk; 0 where a ray misses the box."""
+    result = torch.zeros(len(rays), 2, dtype=rays.origin.dtype)
+    index = rays.crosses.nonzero()[:, 0]
+    for part in torch.split(index, chunk):
+        result[part] = model(field, rays[part].to(device)).to(result)
+    return result

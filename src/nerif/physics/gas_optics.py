@@ -1,0 +1,316 @@
+"""Gas optics: from refractive index to density by Gladstone-Dale, and on to temperature by the ideal gas law.
+
+    n - 1 = K rho,      K = sum_i w_i K_i,      K_i = (n_i - 1) R T_i / (p_i M_i)      at each gas's reference state
+
+K belongs to a composition. A single K for a field in which the composition changes (fuel, products, co-flow) is an
+approximation, and where the products stand the temperature inherits its error.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerif.conventions import InputError
+
+__all__ = [
+    "GASES",
+    "GAS_CONSTANT",
+    "Composition",
+    "Gas",
+    "ambient_index",
+    "density_from_index",
+    "density_from_temperature",
+    "gladstone_dale",
+    "index_excess_from_density",
+    "molar_mass",
+    "parse_mixture",
+    "temperature_from_density",
+]
+
+GAS_CONSTANT = 8.314462618  # J/(mol K), CODATA 2018
+
+Composition = str | Mapping[str, float]
+"""A gas of `GASES`, or mole fractions as a mapping or a text such as ``"CH4:0.112, O2:0.888"``."""
+
+Quantity = TypeVar("Quantity", float, np.ndarray, Tensor)
+
+_ATM = 101325.0  # Pa
+_FRACTION_TOLERANCE = 1.0001e-3  # three thirds printed as 0.333 miss 1 by 1e-3, and rounding must not tip them over
+
+
+def _sellmeier(constant: float, *terms: tuple[float, float]) -> Callable[[float], float]:
+    """Return n - 1 = constant + sum_i a_i / (b_i - s^2), with s = 1 / wavelength in 1/um."""
+    return lambda wavelength_um: constant + sum(a / (b - wavelength_um**-2) for a, b in terms)
+
+
+def _power_series(*coefficients: float) -> Callable[[float], float]:
+    """Return n - 1 = sum_i c_i s^(2 i), with s = 1 / wavelength in 1/um."""
+    return lambda wavelength_um: sum(c * wavelength_um ** (-2 * i) for i, c in enumerate(coefficients))
+
+
+@dataclass(frozen=True)
+class Gas:
+    """A gas and its dispersion formula, as measured at a reference state.
+
+    Attributes
+    ----------
+    name : common name
+    molar_mass : kg/mol
+    temperature : K, reference state of the formula
+    pressure : Pa, reference state of the formula
+    refractivity : n - 1 (1) at the reference state, of the vacuum wavelength in um
+    wavelength_range : nm, where the formula was fitted
+    source : where the formula was published
+    """
+
+    name: str
+    molar_mass: float
+    temperature: float
+    pressure: float
+    refractivity: Callable[[float], float]
+    wavelength_range: tuple[float, float]
+    source: str
+
+
+GASES: Mapping[str, Gas] = {
+    "air": Gas(
+        "dry air, 450 ppm CO2", 28.9641e-3, 288.15, _ATM,
+        _sellmeier(0.0, (5792105e-8, 238.0185), (167917e-8, 57.362)), (230.0, 1690.0),
+        "Ciddor 1996, Appl. Opt. 35, 1566"),
+    "N2": Gas(
+        "nitrogen", 28.0134e-3, 288.15, _ATM,
+        _sellmeier(6.497378e-5, (3.0738649e-2, 144.0)), (467.9, 2058.7),
+        "Peck & Khanna 1966, J. Opt. Soc. Am. 56, 1059"),
+    "O2": Gas(
+        "oxygen", 31.9988e-3, 293.15, _ATM,
+        _sellmeier(1.181494e-4, (9.708931e-3, 75.4)), (400.0, 1800.0),
+        "Zhang, Lu & Wang 2008, Appl. Opt. 47, 3143, corrected by Kren 2011, Appl. Opt. 50, 6484"),
+    "CH4": Gas(
+        "methane", 16.0425e-3, 273.15, _ATM,
+        _power_series(4.2607e-4, 6.1396687e-6), (529.0, 658.5),
+        "Loria 1909, Ann. Phys. 334, 605"),
+    "CO2": Gas(
+        "carbon dioxide", 44.0095e-3, 273.15, _ATM,
+        _sellmeier(0.0, (6.99100e-2, 166.175), (1.44720e-3, 79.609), (6.42941e-5, 56.3064), (5.21306e-5, 46.0196),
+                   (1.46847e-6, 0.0584738)), (180.7, 1694.5),
+        "Bideau-Mehu, Guern, Abjean & Johannin-Gilles 1973, Opt. Commun. 9, 432"),
+    "H2O": Gas(
+        "water vapour", 18.0153e-3, 293.15, 1333.0,
+        _power_series(*(1.022e-8 * c for c in (295.235, 2.6422, -0.032380, 0.004028))), (300.0, 1690.0),
+        "Ciddor 1996, Appl. Opt. 35, 1566"),
+    "Ar": Gas(
+        "argon", 39.948e-3, 273.15, _ATM,
+        _sellmeier(6.7867e-5, (3.0182943e-2, 144.0)), (467.9, 2058.7),
+        "Peck & Fisher 1964, J. Opt. Soc. Am. 54, 1362"),
+    "He": Gas(
+        "helium", 4.002602e-3, 273.15, _ATM,
+        _sellmeier(0.0, (0.01470091, 423.98)), (480.1, 2058.6),
+        "Mansfield & Peck 1969, J. Opt. Soc. Am. 59, 199"),
+}  # fmt: skip
+"""The known gases; the formulas are those of refractiveindex.info, with which the tests compare them."""
+
+
+def _known(species: str) -> str:
+    """Return `species`, or raise an InputError that names the gas it may have meant."""
+    if species in GASES:
+        return species
+    spellings = {key.lower(): key for key in GASES} | {gas.name.split(",")[0]: key for key, gas in GASES.items()}
+    near = difflib.get_close_matches(species.lower(), spellings, n=1)
+    hint = f"; did you mean '{spellings[near[0]]}'?" if near else "; give its mixture, or compute K from its own data"
+    raise InputError(f"composition: expected gases out of '{' '.join(GASES)}', got '{species}'{hint}")
+
+
+def _positive(name: str, value: float, unit: str, remedy: str) -> float:
+    """Return `value` as a Python float, which leaves the dtype of an array it meets alone."""
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name}: expected a positive number in {unit}, got {value:g}; {remedy}")
+    return float(value)
+
+
+def _refractivity(n_ambient: float) -> float:
+    if not (math.isfinite(n_ambient) and n_ambient >= 1):
+        raise InputError(
+            f"n_ambient: expected a refractive index of at least 1, got {n_ambient:g}; "
+            "give n itself, not n - 1 (ambient_index computes it)"
+        )
+    return float(n_ambient) - 1.0
+
+
+def parse_mixture(composition: Composition) -> dict[str, float]:
+    """Return the mole fractions of a composition, normalised to the sum 1.
+
+    Parameters
+    ----------
+    composition : a gas such as ``"air"``, a text such as ``"CH4:0.112, O2:0.888"``, or {species: mole fraction (1)}
+
+    Raises
+    ------
+    InputError
+        If a gas is unknown or named twice, a fraction is not a number >= 0, or the sum is further than 1e-3 from 1.
+    """
+    pairs: Iterable[tuple[str, str | float]]
+    if not isinstance(composition, str):
+        pairs = composition.items()
+    elif ":" in composition:
+        pairs = [(part.partition(":")[0], part.partition(":")[2]) for part in composition.split(",")]
+    else:
+        pairs = [(composition, 1.0)]
+
+    fractions: dict[str, float] = {}
+    for word, number in pairs:
+        species = _known(word.strip())
+        if species in fractions:
+            raise InputError(f"composition: expected each gas once, got '{species}' twice; add its fractions up")
+        try:
+            fractions[species] = float(number)
+        except (TypeError, ValueError):
+            fractions[species] = math.nan
+        if not fractions[species] >= 0:
+            raise InputError(
+                f"composition: expected a mole fraction >= 0 for {species}, got '{number}'; "
+                "write it as in 'CH4:0.112, O2:0.888'"
+            )
+    total = sum(fractions.values())
+    if not abs(total - 1) <= _FRACTION_TOLERANCE:
+        raise InputError(
+            f"composition: expected mole fractions with the sum 1, got the sum {total:g}; divide each by {total:g}"
+            if total > 0
+            else "composition: expected mole fractions with the sum 1, got none above 0; name at least one gas"
+        )
+    return {species: fraction / total for species, fraction in fractions.items()}
+
+
+def molar_mass(composition: Composition) -> float:
+    """Return the molar mass M = sum_i x_i M_i (kg/mol) of a composition, see `parse_mixture`."""
+    return sum(fraction * GASES[species].molar_mass for species, fraction in parse_mixture(composition).items())
+
+
+def gladstone_dale(composition: Composition, wavelength_nm: float) -> float:
+    """Return the Gladstone-Dale constant K = sum_i w_i K_i (m^3/kg), w_i the mass fractions x_i M_i / M.
+
+    The reference density is the ideal gas's, as in the way on to temperature; for CO2, the least ideal of the table,
+    the real density at 0 degrees C is 0.7 % above it.
+
+    Parameters
+    ----------
+    composition : see `parse_mixture`
+    wavelength_nm : vacuum wavelength, nm
+
+    Raises
+    ------
+    InputError
+        If the composition cannot be right, or the wavelength is outside the range of a gas's dispersion formula.
+
+    Source: paper, Eq. (2); formulas and reference states in `GASES`.
+    """
+    mass, weighted = 0.0, 0.0
+    for species, fraction in parse_mixture(composition).items():
+        gas = GASES[species]
+        low, high = gas.wavelength_range
+        if not low <= wavelength_nm <= high:
+            raise InputError(
+                f"wavelength_nm: expected {low:g} to {high:g} nm for {species} ({gas.source}), got {wavelength_nm:g}; "
+                "give nanometres, or the nearest end of the range (K changes by a few per cent over the visible)"
+            )
+        density = gas.pressure * gas.molar_mass / (GAS_CONSTANT * gas.temperature)
+        constant = gas.refractivity(wavelength_nm / 1000) / density
+        mass += fraction * gas.molar_mass
+        weighted += fraction * gas.molar_mass * constant
+    return weighted / mass
+
+
+def density_from_index(index_excess: Quantity, n_ambient: float, K: float) -> Quantity:
+    """Return the density rho = ((n_ambient - 1) + (n - n_ambient)) / K.
+
+    n itself is never formed: one float32 step near 1.00027 is already 0.04 % of n - 1.
+
+    Parameters
+    ----------
+    index_excess : (...) n - n_ambient (1); float, array or tensor
+    n_ambient : index of the ambient gas (1)
+    K : Gladstone-Dale constant, m^3/kg
+
+    Returns
+    -------
+    (...) kg/m^3, in the type and dtype that came
+
+    Raises
+    ------
+    InputError
+        If n_ambient < 1 or K <= 0.
+    """
+    return (index_excess + _refractivity(n_ambient)) / _positive("K", K, "m^3/kg", "see gladstone_dale")
+
+
+def index_excess_from_density(density: Quantity, n_ambient: float, K: float) -> Quantity:
+    """Return the index excess n - n_ambient = K rho - (n_ambient - 1) (1): `density_from_index` turned round.
+
+    `density` is (...) in kg/m^3; `n_ambient`, `K`, errors and dtype are those of `density_from_index`.
+    """
+    return density * _positive("K", K, "m^3/kg", "see gladstone_dale") - _refractivity(n_ambient)
+
+
+def temperature_from_density(density: Quantity, pressure_pa: float, molar_mass: float) -> Quantity:
+    """Return the temperature T = p M / (R rho) of an ideal gas, NaN where the density is not above 0.
+
+    Noise can take a reconstructed density to 0 and below, where there is no temperature to tell.
+
+    Parameters
+    ----------
+    density : (...) kg/m^3; float, array or tensor
+    pressure_pa : absolute pressure, Pa
+    molar_mass : kg/mol
+
+    Returns
+    -------
+    (...) K, in the type and dtype that came
+
+    Raises
+    ------
+    InputError
+        If pressure or molar mass is not positive.
+    """
+    pressure = _positive("pressure_pa", pressure_pa, "Pa", "give the absolute pressure, 101325 for one atmosphere")
+    mass = _positive("molar_mass", molar_mass, "kg/mol", "see molar_mass")
+    scale = pressure * mass / GAS_CONSTANT
+    if isinstance(density, Tensor):
+        return scale / torch.where(density > 0, density, math.nan)
+    if isinstance(density, np.ndarray):
+        return scale / np.where(density > 0, density, math.nan)
+    return scale / density if density > 0 else math.nan
+
+
+def density_from_temperature(temperature: Quantity, pressure_pa: float, molar_mass: float) -> Quantity:
+    """Return the density rho = p M / (R T) (kg/m^3) of an ideal gas, NaN where the temperature is not above 0.
+
+    `temperature` is (...) in K; the law is its own inverse, see `temperature_from_density` for the rest.
+    """
+    return temperature_from_density(temperature, pressure_pa, molar_mass)
+
+
+def ambient_index(composition: Composition, temperature_k: float, pressure_pa: float, wavelength_nm: float) -> float:
+    """Return the refractive index n = 1 + K p M / (R T) (1) of a gas at rest.
+
+    Parameters
+    ----------
+    composition : see `parse_mixture`
+    temperature_k : K
+    pressure_pa : absolute pressure, Pa
+    wavelength_nm : vacuum wavelength, nm
+
+    Raises
+    ------
+    InputError
+        If temperature or pressure is not positive, or as `gladstone_dale`.
+    """
+    temperature = _positive("temperature_k", temperature_k, "K", "add 273.15 to degrees Celsius")
+    density = density_from_temperature(temperature, pressure_pa, molar_mass(composition))
+    return 1.0 + gladstone_dale(composition, wavelength_nm) * density

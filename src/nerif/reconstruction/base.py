@@ -1,0 +1,122 @@
+"""What every reconstruction method takes and gives back.
+
+A Reconstructor is a frozen record of settings; called with a Measurement it returns a Reconstruction.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from nerif.fields.base import Field
+from nerif.geometry import Box, Grid
+from nerif.measurement import Measurement
+from nerif.volume import Volume
+
+__all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Why a reconstruction stopped.
+
+    Parameters
+    ----------
+    reason : one word: converged, epochs, steps, time_limit, interrupted or diverged
+    message : one sentence, with the remedy where there is one
+    """
+
+    reason: str
+    message: str
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything needed to go on with a run: tensors by name, and plain numbers and texts."""
+
+    tensors: dict[str, Tensor]
+    scalars: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a method tells of itself after a step.
+
+    Parameters
+    ----------
+    step, epoch : counts; epoch in passes over all rays
+    seconds : spent so far, earlier runs included
+    progress : 0 at the start, 1 at the end
+    losses : the terms by name
+    rays_per_second : 1/s
+    capture : gives the State to resume from
+    """
+
+    step: int
+    epoch: float
+    seconds: float
+    progress: float
+    losses: dict[str, float]
+    rays_per_second: float
+    capture: Callable[[], State]
+
+
+OnStep = Callable[[Step], bool | None]
+"""Called after each step; True asks the method to stop and return what it has."""
+
+
+def compose(*callbacks: OnStep) -> OnStep:
+    """Return a callback that calls each in turn and asks to stop if one of them does."""
+
+    def call(step: Step) -> bool:
+        return any([bool(c(step)) for c in callbacks])
+
+    return call
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The result of a reconstruction.
+
+    Parameters
+    ----------
+    field : Field of index excess
+    box : where it holds, mm
+    n_ambient : refractive index the excess is counted from
+    history : one record a logged step
+    outcome : why it stopped
+    settings : what the method was asked, as plain values
+    seconds : spent
+    peak_memory_bytes : on the device (CUDA) or of the process (CPU)
+    device : where it ran
+    state : to resume from, or None
+    """
+
+    field: Field
+    box: Box
+    n_ambient: float
+    history: list[dict[str, float]]
+    outcome: Outcome
+    settings: dict[str, Any]
+    seconds: float = 0.0
+    peak_memory_bytes: int = 0
+    device: str = "cpu"
+    state: State | None = field(default=None, repr=False)
+
+    def volume(self, grid: Grid) -> Volume:
+        """Return the index excess at the voxel centres of a grid."""
+        return Volume(self.field.sample(grid, self.device), grid, attributes={"n_ambient": self.n_ambient})
+
+
+class Reconstructor(ABC):
+    """A method of reconstruction: a frozen record of its settings, called with the data."""
+
+    @abstractmethod
+    def __call__(
+        self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None
+    ) -> Reconstruction:
+        """Reconstruct the field of a measurement, from the start or from an earlier State."""

@@ -1,0 +1,62 @@
+"""Where to compute, in which precision, and how much memory it took."""
+
+from __future__ import annotations
+
+import sys
+
+import torch
+
+from nerif.conventions import InputError
+
+__all__ = ["autocast_dtype", "peak_memory", "resolve_device"]
+
+
+def resolve_device(name: str) -> torch.device:
+    """Return the device called `name`; "auto" is the GPU where there is one.
+
+    Raises
+    ------
+    InputError
+        If the device does not exist here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device: expected auto, cpu, cuda or cuda:N, got '{name}'") from None
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"device: expected auto, cpu, cuda or cuda:N, got '{name}'")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError(
+            f"device: expected one of {torch.cuda.device_count()} GPUs, got '{name}'; use --device cpu, "
+            "or install the CUDA build of torch"
+        )
+    return device
+
+
+def autocast_dtype(precision: str, device: torch.device) -> torch.dtype | None:
+    """Return bfloat16 where the precision asks for it (or, with "auto", where the hardware has it), else None.
+
+    Sets whether CUDA's float32 products may be rounded to TF32.
+    """
+    if device.type == "cuda":
+        torch.backends.cuda.matmul.allow_tf32 = precision != "float32"
+        fast = torch.cuda.is_bf16_supported()
+    else:
+        fast = bool(torch.cpu._is_avx512_bf16_supported())
+    if precision == "bf16" or (precision == "auto" and fast):
+        return torch.bfloat16
+    return None
+
+
+def peak_memory(device: torch.device) -> int:
+    """Return the highest memory in bytes: of tensors on a GPU, of the whole process on a CPU."""
+    if device.type == "cuda":
+        return int(torch.cuda.max_memory_allocated(device))
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak if sys.platform == "darwin" else peak * 1024)

@@ -1,0 +1,100 @@
+"""The field and the checkpoint on disk: weights in safetensors, the rest as plain JSON beside them."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.base import Field
+from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.geometry import Box
+from nerif.reconstruction.base import Reconstruction, State
+
+__all__ = ["CHECKPOINT", "FIELD", "read_field", "read_state", "write_field", "write_state"]
+
+FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
+
+
+def write_field(directory: Path, result: Reconstruction) -> None:
+    """Write the weights of a reconstructed network and all that is needed to evaluate it, atomically."""
+    field = result.field
+    assert isinstance(field, NeuralField)
+    about = {
+        "kind": "neural",
+        "network": vars(field.network.shape),
+        "box": [field.box.lower, field.box.upper],
+        "index_scale": field.index_scale,
+        "offset": field.offset,
+        "n_ambient": result.n_ambient,
+        "outcome": vars(result.outcome),
+    }
+    tensors = {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}
+    _save(directory / FIELD, tensors, about)
+
+
+def read_field(directory: Path) -> tuple[Field, Box, float]:
+    """Read the field of a result directory, its box and n_ambient.
+
+    Raises
+    ------
+    InputError
+        If the directory holds no finished reconstruction, or its field is damaged.
+    """
+    path = directory / FIELD
+    if not path.is_file():
+        what = "the directory has no" if directory.is_dir() else "no such directory with a"
+        raise InputError(f"{directory}: expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first")
+    tensors, about = _load(path)
+    try:
+        network = Network(NetworkShape(**about["network"]))
+        network.load_state_dict(tensors)
+        lower, upper = about["box"]
+        box = Box(tuple(lower), tuple(upper))
+        field = NeuralField(network.eval(), box, float(about["index_scale"]), float(about["offset"]))
+        return field, box, float(about["n_ambient"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: not a field of this version of nerif ({type(error).__name__}: {error})") from None
+
+
+def write_state(directory: Path, state: State) -> None:
+    """Write a checkpoint, atomically: a run killed while writing leaves the one before."""
+    _save(directory / CHECKPOINT, {k: v.cpu().contiguous() for k, v in state.tensors.items()}, state.scalars)
+
+
+def read_state(directory: Path) -> State:
+    """Read the checkpoint of a result directory.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is damaged.
+    """
+    path = directory / CHECKPOINT
+    if not path.is_file():
+        raise InputError(f"{directory}: expected {CHECKPOINT} to resume from, got none; start without --resume")
+    tensors, scalars = _load(path)
+    return State(tensors, scalars)
+
+
+def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -> None:
+    from safetensors.torch import save_file
+
+    temporary = path.with_name(path.name + ".part")
+    save_file(tensors, temporary, metadata={"nerif": json.dumps(about)})
+    os.replace(temporary, path)
+
+
+def _load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {})["nerif"])
+            return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: damaged or not written by nerif ({error})") from None

@@ -1,0 +1,84 @@
+"""The gauge: where the index is known to be ambient. Displacements fix n only up to a constant.
+
+By default the side faces of the box; where flow masks are given, all that lies outside the visual hull as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.geometry import Box, Grid
+from nerif.measurement import Measurement
+
+__all__ = ["AmbientRegion", "visual_hull"]
+
+
+def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
+    """Return the voxels that every view which sees them sees inside its flow mask.
+
+    Raises
+    ------
+    InputError
+        If the measurement has no flow mask, or no voxel is left.
+    """
+    if measurement.flow_mask is None:
+        raise InputError("flow_mask: expected masks in the measurement to carve the visual hull, got none")
+    points = grid.points(torch.float64).reshape(-1, 3)
+    inside = torch.ones(len(points), dtype=torch.bool)
+    for camera, mask in zip(measurement.cameras, measurement.flow_mask, strict=True):
+        column, row = camera.project(points).round().long().unbind(-1)
+        height, width = camera.image_size
+        seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        inside &= ~seen | mask[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    if not bool(inside.any()):
+        raise InputError("flow_mask: the masks leave no voxel of the box; are they inverted, or of other views?")
+    return inside.reshape(grid.shape)
+
+
+@dataclass(frozen=True)
+class AmbientRegion:
+    """Faces of the box, and voxels outside the visual hull, in which the index excess is 0.
+
+    Parameters
+    ----------
+    box : Box, mm
+    faces : names such as "x-"
+    empty : (m, 3) centres of voxels outside the hull, mm; may be of length 0
+    voxel : edges of those voxels, mm
+    """
+
+    box: Box
+    faces: tuple[str, ...]
+    empty: Float[Tensor, "m 3"]
+    voxel: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, measurement: Measurement, faces: tuple[str, ...], resolution: int = 48) -> AmbientRegion:
+        """Find the ambient region of a measurement; with neither faces nor masks there is no gauge, an error."""
+        grid = Grid.of_resolution(measurement.box, resolution)
+        empty = torch.zeros(0, 3)
+        if measurement.flow_mask is not None:
+            empty = grid.points()[~visual_hull(measurement, grid)]
+        if not faces and not len(empty):
+            raise InputError(
+                "ambient_faces: expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
+                "fix the index only up to a constant"
+            )
+        return cls(measurement.box, faces, empty, grid.spacing)
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
+        """Draw about `count` random points, half of them outside the hull where there is one, mm."""
+        points = []
+        share = count // 2 if len(self.empty) and self.faces else count
+        for face in self.faces:
+            points.append(self.box.face_points(face, torch.rand(-(-share // len(self.faces)), 2, generator=generator)))
+        if len(self.empty):
+            chosen = torch.randint(len(self.empty), (share,), generator=generator)
+            shift = (torch.rand(share, 3, generator=generator) - 0.5) * torch.tensor(self.voxel)
+            points.append(self.empty[chosen] + shift)
+        return torch.cat(points)

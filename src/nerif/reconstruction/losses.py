@@ -1,0 +1,142 @@
+"""The loss of NeRIF (paper, Eq. (lossfunction)), in normalised units.
+
+    loss = w_c |grad(n)_AD - grad(n)_net| + w_n |d_ND - d| + w_h |d_net - d| + w_a |d_AD - d| + w_g |n|_ambient
+
+d_ND integrates central differences of n, d_net the gradient heads, d_AD the exact gradient of n; the first three
+terms are the paper's. The last but one is its noise-free twin, the last the gauge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.fields.mlp import NeuralField
+from nerif.geometry import Rays
+from nerif.physics.deflection import integration_weights
+
+__all__ = ["LossWeights", "Target", "loss_terms"]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms of the loss."""
+
+    consistency: float = 0.0
+    """|grad(n)_AD - grad(n)_net| over sample points (paper: 1)."""
+    numerical: float = 0.0
+    """|d_ND - d| over rays (paper: 1)."""
+    head: float = 0.0
+    """|d_net - d| over rays (paper: 1)."""
+    automatic: float = 1.0
+    """|d_AD - d| over rays (paper: 0)."""
+    gauge: float = 1.0
+    """N over the ambient region."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value >= 0:
+                raise InputError(f"weight of the {name} term: expected 0 or more, got {value}")
+        if self.numerical + self.head + self.automatic == 0:
+            raise InputError("loss weights: expected a positive numerical, head or automatic weight, got none")
+
+
+@dataclass(frozen=True)
+class Target:
+    """Rays and what they measured.
+
+    Parameters
+    ----------
+    rays : Rays
+    displacement : (n, 2) px
+    inverse_scale : (n, 2) 1/px; residuals are multiplied by it: 1/sigma, scaled so that a zero field has loss 1
+    """
+
+    rays: Rays
+    displacement: Float[Tensor, "n 2"]
+    inverse_scale: Float[Tensor, "n 2"]
+
+
+def loss_terms(
+    field: NeuralField,
+    network: object,
+    target: Target,
+    s: Float[Tensor, "n m"],
+    step: Float[Tensor, " n"],
+    weights: LossWeights,
+    model: str,
+    norm: str,
+    n_ambient: float,
+) -> dict[str, Tensor]:
+    """Return the terms with positive weight by name, not yet weighted; `network` evaluates value_and_gradient.
+
+    Parameters
+    ----------
+    s : path lengths of the samples, mm
+    step : length of the intervals, mm; the central differences reach half of it to either side
+    norm : "l2" (mean length of the residual vectors, the paper's) or "squared" (mean square)
+    """
+    rays, shape = target.rays, s.shape
+    p = field.normalise(rays.at(s)).reshape(-1, 3)
+    unit = field.index_scale / field.half_edge  # 1/mm of one unit of network gradient
+    weight = integration_weights(rays, s, step, model) * (unit / n_ambient)
+
+    def data(gradient: Float[Tensor, "p 3"]) -> Tensor:
+        d = torch.einsum("nm,nij,nmj->ni", weight, rays.sensitivity, gradient.float().reshape(*shape, 3))
+        return reduce((d - target.displacement) * target.inverse_scale, norm)
+
+    terms = {}
+    if weights.automatic or weights.head or weights.consistency:
+        heads = bool(weights.head or weights.consistency)
+        value, automatic, head = network(p, heads)  # type: ignore[operator]
+        if weights.automatic:
+            terms["automatic"] = data(automatic)
+        if head is not None:
+            if weights.head:
+                terms["head"] = data(head)
+            if weights.consistency:
+                terms["consistency"] = reduce(automatic.float() - head.float(), norm)
+    if weights.numerical:
+        d = numerical_displacement(field, rays, p.reshape(*shape, 3), step / 2, weight)
+        terms["numerical"] = reduce((d - target.displacement) * target.inverse_scale, norm)
+    return terms
+
+
+def numerical_displacement(
+    field: NeuralField,
+    rays: Rays,
+    p: Float[Tensor, "n m 3"],
+    delta: Float[Tensor, " n"],
+    weight: Float[Tensor, "n m"],
+) -> Float[Tensor, "n 2"]:
+    """Return the displacement by central differences of n (paper, Eq. (samplegrad)), px.
+
+    S grad(n) asks for the derivatives along the two rows of S only, so four evaluations a sample serve.
+
+    Parameters
+    ----------
+    p : sample points in the coordinates of the network
+    delta : reach of the differences to either side, mm
+    weight : lever arm times step in the units of the network
+    """
+    length = rays.sensitivity.norm(dim=-1)  # px/mm
+    along = rays.sensitivity / length[..., None]
+    reach = delta / field.half_edge
+    offset = (reach[:, None, None] * along)[:, None]  # n 1 2 3
+    centre = p[:, :, None, :]
+    points = torch.stack([centre + offset, centre - offset])  # 2 n m 2 3
+    n = field.network(points.reshape(-1, 3)).float().reshape(points.shape[:-1])
+    slope = (n[0] - n[1]) / (2 * reach[:, None, None])  # n m 2
+    return (weight[..., None] * slope).sum(dim=1) * length
+
+
+def reduce(residual: Float[Tensor, "n k"], norm: str) -> Tensor:
+    """Mean length of the residual vectors ("l2") or mean square of their components ("squared")."""
+    if norm == "l2":
+        # the tiny term keeps the slope finite where a residual is exactly 0
+        return (residual.square().sum(dim=-1) + 1e-24).sqrt().mean()
+    return residual.square().mean()

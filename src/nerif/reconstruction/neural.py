@@ -1,0 +1,362 @@
+"""NeRIF: a coordinate network trained until the displacements it predicts match those measured (paper, Alg. 1)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError, parse_faces
+from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.measurement import Measurement
+from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step
+from nerif.reconstruction.device import autocast_dtype, peak_memory, resolve_device
+from nerif.reconstruction.gauge import AmbientRegion
+from nerif.reconstruction.losses import LossWeights, Target, loss_terms
+from nerif.reconstruction.sampling import sample_count, sample_rays
+
+__all__ = ["NeRIF"]
+
+CHOICES = {
+    "model": ("lever_arm", "paraxial"),
+    "sampling": ("random", "shifted", "regular"),
+    "norm": ("l2", "squared"),
+    "schedule": ("cosine", "constant"),
+    "precision": ("auto", "float32", "tf32", "bf16"),
+    "compile": ("auto", "on", "off"),
+}
+WARM_UP = 50  # steps over which the learning rate rises
+RETRIES = 5  # times a run that turned non-finite is taken back before it gives up
+GAUGE_POINTS = 256  # a step
+LOG_EVERY, KEEP_EVERY = 20, 200  # steps
+
+
+@dataclass(frozen=True)
+class NeRIF(Reconstructor):
+    """Neural refractive index field."""
+
+    network: NetworkShape = field(default_factory=NetworkShape)
+    """Size of the network."""
+    weights: LossWeights = field(default_factory=LossWeights)
+    """Weights of the terms of the loss."""
+    norm: str = "squared"
+    """Either "squared" residuals (maximum likelihood for Gaussian noise) or "l2", the paper's."""
+    model: str = "lever_arm"
+    """Forward model, "lever_arm" or "paraxial"."""
+    samples: tuple[int, int] = (24, 48)
+    """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
+    sample_jitter: int = 10
+    """Half-range of the random number of samples a ray, see samples."""
+    sampling: str = "shifted"
+    """One draw an interval ("random", the paper's), one a ray ("shifted"), or midpoints ("regular")."""
+    points_per_batch: int = 8192
+    """Sample points of a step; a step takes points_per_batch / N rays."""
+    learning_rate: float = 1.5e-2
+    """Adam's, at its highest."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Adam's decay rates."""
+    schedule: str = "cosine"
+    """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
+    epochs: float = 40.0
+    """Stop after so many passes over all rays (the paper's n_outer)."""
+    max_steps: int = 0
+    """Stop after so many steps; 0 for no limit."""
+    time_limit: float = 0.0
+    """Stop after so many seconds; 0 for no limit."""
+    stop_ratio: float = 0.0
+    """Stop when the loss is below this share of the initial loss; 0 never (paper: 0.005)."""
+    ambient_faces: tuple[str, ...] = ()
+    """Faces on which the index is ambient; empty: those of the measurement."""
+    open_faces: tuple[str, ...] = ()
+    """Faces through which flow leaves the box; rays that cross them are dropped."""
+    seed: int = 0
+    """Of weights and samples; makes a CPU run repeatable."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1, ..."""
+    precision: str = "auto"
+    """One of auto, float32, tf32, bf16 (mixed; the last part of the run in float32)."""
+    full_precision_from: float = 0.7
+    """Share of the run after which bf16 gives way to float32."""
+    compile: str = "auto"
+    """Compile the network: on, off, or auto (on CUDA only)."""
+
+    def __post_init__(self) -> None:
+        for name, allowed in CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
+        for name in ("epochs", "learning_rate", "points_per_batch"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("max_steps", "time_limit", "stop_ratio", "sample_jitter"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if not (len(self.samples) == 2 and min(self.samples) > self.sample_jitter):
+            raise InputError(
+                f"samples: expected two counts above sample_jitter ({self.sample_jitter}), got {self.samples}"
+            )
+        if self.points_per_batch < max(self.samples) + self.sample_jitter:
+            raise InputError(
+                f"points_per_batch: expected room for one ray ({max(self.samples) + self.sample_jitter} points), "
+                f"got {self.points_per_batch}"
+            )
+        if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
+            raise InputError("weights: the head and consistency terms need gradient_head = true")
+        parse_faces(self.ambient_faces)
+        parse_faces(self.open_faces, "open_faces")
+
+    def __call__(
+        self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None
+    ) -> Reconstruction:
+        return _Training(self, measurement, resume).run(on_step)
+
+
+class _Training:
+    """One run: the data, the network, Adam, and the loop."""
+
+    def __init__(self, settings: NeRIF, measurement: Measurement, resume: State | None) -> None:
+        self.settings, self.measurement = settings, measurement
+        self.device = resolve_device(settings.device)
+        self.low_precision = autocast_dtype(settings.precision, self.device)
+        self.generator = torch.Generator().manual_seed(settings.seed)
+        faces = settings.ambient_faces or measurement.ambient_faces
+        self.ambient = AmbientRegion.of(measurement, faces)
+        self.target, index_scale = _targets(settings, measurement, self.device)
+        self.count = len(self.target.rays)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.seed)
+            network = Network(settings.network)
+        self.field = NeuralField(network.to(self.device), measurement.box, index_scale)
+        self.adam = torch.optim.Adam(network.parameters(), lr=settings.learning_rate, betas=settings.betas)
+        self.evaluate = _compiled(settings, network, self.device)
+        self.history: list[dict[str, float]] = []
+        self.order = torch.empty(0, dtype=torch.long)
+        self.step, self.rays_done, self.retries, self.rate = 0, 0, 0, 1.0
+        self.initial_loss, self.running = float("nan"), float("nan")
+        self.spent, self.started = 0.0, time.perf_counter()
+        if resume is not None:
+            self._restore(resume)
+        self.good = self._capture()
+
+    # -- the loop ------------------------------------------------------------------------------------------------
+
+    def run(self, on_step: OnStep | None) -> Reconstruction:
+        """Train until something says stop, and return what there is."""
+        settings, outcome = self.settings, self._stop()
+        clock, rays_then = time.perf_counter(), self.rays_done
+        while outcome is None:
+            target, count = self._batch()
+            s, interval = sample_rays(target.rays, count, self.generator, settings.sampling)
+            terms = self._terms(target, s, interval)
+            loss = sum(getattr(settings.weights, name) * term for name, term in terms.items())
+            assert isinstance(loss, Tensor)
+            self._set_learning_rate()
+            self.adam.zero_grad()
+            loss.backward()
+            self.adam.step()
+            self.step += 1
+            outcome = self._stop()
+            if self.device.type == "cuda" and self.step % LOG_EVERY and outcome is None:
+                continue  # looking at a number waits for the GPU, so look now and then
+            values = {name: float(term.detach()) for name, term in terms.items()}
+            values["loss"] = float(loss.detach())
+            if not math.isfinite(values["loss"]):
+                outcome = self._take_back()
+                continue
+            self._follow(values["loss"])
+            speed = (self.rays_done - rays_then) / max(time.perf_counter() - clock, 1e-9)
+            if self.step % LOG_EVERY == 0 or self.step == 1 or outcome is not None:
+                self._log(values, speed)
+            if self.step % KEEP_EVERY == 0:
+                self.good = self._capture()
+            if on_step is not None and on_step(self._tell(values, speed)) and outcome is None:
+                outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
+        return self._result(outcome)
+
+    def _batch(self) -> tuple[Target, int]:
+        """The next rays of this epoch's random order, and the number of samples each gets."""
+        settings = self.settings
+        count = sample_count(self.progress, *settings.samples, settings.sample_jitter, self.generator)
+        rays = min(max(1, settings.points_per_batch // count), self.count)
+        if len(self.order) < rays:
+            self.order = torch.cat([self.order, torch.randperm(self.count, generator=self.generator)])
+        index, self.order = self.order[:rays], self.order[rays:]
+        self.rays_done += rays
+        t = self.target
+        index = index.to(self.device)
+        return Target(t.rays[index], t.displacement[index], t.inverse_scale[index]), count
+
+    def _terms(self, target: Target, s: Tensor, interval: Tensor) -> dict[str, Tensor]:
+        settings = self.settings
+        bf16 = self.low_precision is not None and self.progress < settings.full_precision_from
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=bf16):
+            terms = loss_terms(
+                self.field, self.evaluate, target, s, interval,
+                settings.weights, settings.model, settings.norm, self.measurement.n_ambient,
+            )  # fmt: skip
+        points = self.ambient.sample(GAUGE_POINTS, self.generator).to(self.device)
+        terms["gauge"] = self.field.network(self.field.normalise(points)).square().mean()
+        return terms
+
+    def _set_learning_rate(self) -> None:
+        settings, rate = self.settings, self.rate * self.settings.learning_rate
+        if settings.schedule == "cosine":
+            rate *= min(1.0, (self.step + 1) / WARM_UP)
+            rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(self.progress, 1.0)))
+        for group in self.adam.param_groups:
+            group["lr"] = rate
+
+    # -- how far, and whether to stop -------------------------------------------------------------------------------
+
+    @property
+    def seconds(self) -> float:
+        """Spent on training, earlier parts of a resumed run included."""
+        return self.spent + time.perf_counter() - self.started
+
+    @property
+    def epoch(self) -> float:
+        """Passes over all rays."""
+        return self.rays_done / self.count
+
+    @property
+    def progress(self) -> float:
+        """0 at the start, 1 when the first of the limits is reached."""
+        settings = self.settings
+        shares = [self.epoch / settings.epochs]
+        if settings.max_steps:
+            shares.append(self.step / settings.max_steps)
+        if settings.time_limit:
+            shares.append(self.seconds / settings.time_limit)
+        return max(shares)
+
+    def _stop(self) -> Outcome | None:
+        settings = self.settings
+        if self.epoch >= settings.epochs:
+            return Outcome("epochs", f"all {settings.epochs:g} epochs done")
+        if settings.max_steps and self.step >= settings.max_steps:
+            return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may give more")
+        if settings.time_limit and self.seconds >= settings.time_limit:
+            return Outcome("time_limit", f"time limit of {settings.time_limit:g} s reached; more time may give more")
+        if settings.stop_ratio and self.running <= settings.stop_ratio * self.initial_loss:
+            return Outcome("converged", f"loss fell to {settings.stop_ratio:g} of its initial value")
+        return None
+
+    def _follow(self, loss: float) -> None:
+        """A running mean of the loss; squares are rooted so that ratios mean the same for both norms."""
+        loss = math.sqrt(loss) if self.settings.norm == "squared" else loss
+        if math.isnan(self.initial_loss):
+            self.initial_loss = self.running = loss
+        self.running += 0.1 * (loss - self.running)
+
+    def _take_back(self) -> Outcome | None:
+        """Return to the last good state with half the learning rate."""
+        retries = self.retries + 1
+        rate = self.rate / 2
+        seconds = self.seconds
+        self._restore(self.good)
+        self.retries, self.rate, self.spent = retries, rate, seconds
+        self.history.append({**self._where(), "taken_back": float(retries)})
+        if retries > RETRIES:
+            return Outcome(
+                "diverged",
+                f"loss turned non-finite {retries} times; kept the last good state of step {self.step}; "
+                "try a smaller --learning-rate or --precision float32",
+            )
+        return None
+
+    # -- what is told and kept -----------------------------------------------------------------------------------
+
+    def _where(self) -> dict[str, float]:
+        return {"step": float(self.step), "epoch": self.epoch, "seconds": self.seconds}
+
+    def _log(self, values: dict[str, float], speed: float) -> None:
+        self.history.append({**self._where(), **values, "rays_per_second": speed})
+
+    def _tell(self, values: dict[str, float], speed: float) -> Step:
+        return Step(self.step, self.epoch, self.seconds, min(self.progress, 1.0), values, speed, self._capture)
+
+    def _capture(self) -> State:
+        tensors = {f"network.{k}": v.detach().clone() for k, v in self.field.network.state_dict().items()}
+        for i, moments in self.adam.state_dict()["state"].items():
+            tensors |= {f"adam.{i}.{k}": torch.as_tensor(v).clone() for k, v in moments.items()}
+        tensors["generator"] = self.generator.get_state().clone()
+        tensors["order"] = self.order.clone()
+        names = ("step", "rays_done", "retries", "rate", "initial_loss", "running")
+        scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
+        return State(tensors, {**scalars, "seconds": self.seconds, "history": list(self.history)})
+
+    def _restore(self, state: State) -> None:
+        network = {k[8:]: v for k, v in state.tensors.items() if k.startswith("network.")}
+        try:
+            self.field.network.load_state_dict(network)
+        except RuntimeError:
+            raise InputError("resume: the checkpoint is of a network of another shape; give the same settings") from None
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, tensor in state.tensors.items():
+            if key.startswith("adam."):
+                _, i, name = key.split(".")
+                moments.setdefault(int(i), {})[name] = tensor.clone()
+        self.adam.load_state_dict({"state": moments, "param_groups": self.adam.state_dict()["param_groups"]})
+        self.generator.set_state(state.tensors["generator"])
+        self.order = state.tensors["order"].clone()
+        scalars = dict(state.scalars)
+        self.history = list(scalars.pop("history"))
+        self.spent, self.started = scalars.pop("seconds"), time.perf_counter()
+        for name, value in scalars.items():
+            setattr(self, name, value)
+
+    def _result(self, outcome: Outcome) -> Reconstruction:
+        state = self._capture()
+        self.field.offset = self._ambient_level()
+        return Reconstruction(
+            field=self.field,
+            box=self.measurement.box,
+            n_ambient=self.measurement.n_ambient,
+            history=self.history,
+            outcome=outcome,
+            settings=asdict(self.settings),
+            seconds=self.seconds,
+            peak_memory_bytes=peak_memory(self.device),
+            device=str(self.device),
+            state=state,
+        )
+
+    @torch.no_grad()
+    def _ambient_level(self) -> float:
+        """Mean network output over the ambient region: the constant that the data leave open."""
+        points = self.ambient.sample(1 << 14, torch.Generator().manual_seed(0)).to(self.device)
+        return float(self.field.network(self.field.normalise(points)).mean())
+
+
+def _targets(settings: NeRIF, measurement: Measurement, device: torch.device) -> tuple[Target, float]:
+    """The usable rays with their data, and the index excess that makes displacements of the size measured."""
+    rays, displacement, sigma = measurement.rays()
+    keep = ~rays.exit_faces(measurement.box, settings.open_faces)
+    if not bool(keep.any()):
+        raise InputError("open_faces: every ray crosses one of them, so none is left; name fewer faces")
+    rays, displacement = rays[keep], displacement[keep]
+    rms = float(displacement.square().mean().sqrt())
+    if rms == 0:
+        rms = 1.0  # no displacement at all: the answer is the ambient index, in whatever scale
+    lever = rays.background - 0.5 * (rays.near + rays.far)
+    pixels_per_radian = lever * rays.sensitivity.norm(dim=(1, 2)) / math.sqrt(2)
+    index_scale = float((displacement / pixels_per_radian[:, None]).square().mean().sqrt()) or 1e-6
+    inverse_scale = torch.full_like(displacement, 1 / rms)
+    if sigma is not None:
+        inverse = 1 / sigma[keep]
+        inverse_scale = inverse / float((displacement * inverse).square().mean().sqrt() or 1.0)
+    return Target(rays.to(device), displacement.to(device), inverse_scale.to(device)), index_scale
+
+
+def _compiled(
+    settings: NeRIF, network: Network, device: torch.device
+) -> Callable[[Float[Tensor, "n 3"], bool], tuple[Tensor, Tensor, Tensor | None]]:
+    if settings.compile == "on" or (settings.compile == "auto" and device.type == "cuda"):
+        return torch.compile(network.value_and_gradient, dynamic=True)
+    return network.value_and_gradient
+

@@ -1,0 +1,56 @@
+"""Settings by name. Where a preset departs from the paper, the figures behind it are in benchmarks/."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.mlp import NetworkShape
+from nerif.reconstruction.losses import LossWeights
+from nerif.reconstruction.neural import NeRIF
+
+__all__ = ["PRESETS", "preset"]
+
+PRESETS: dict[str, NeRIF] = {
+    # a small network and the exact gradient alone: made for a CPU
+    "fast": NeRIF(),
+    # the paper's network, trained by the exact gradient: made for a GPU
+    "best": NeRIF(
+        network=NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64),
+        samples=(48, 128),
+        points_per_batch=1 << 18,
+        learning_rate=2e-3,
+        epochs=60,
+    ),
+    # the paper to the letter: three terms, lengths of residuals, constant learning rate, its stopping rule
+    "paper": NeRIF(
+        network=NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64, gradient_head=True),
+        weights=LossWeights(consistency=1, numerical=1, head=1, automatic=0),
+        norm="l2",
+        samples=(60, 200),
+        sampling="random",
+        points_per_batch=1 << 18,
+        learning_rate=1e-3,
+        schedule="constant",
+        epochs=200,
+        stop_ratio=0.005,
+        precision="float32",
+    ),
+}
+
+
+def preset(name: str) -> NeRIF:
+    """Return the settings of a preset; "auto" is `best` where there is a GPU, else `fast`.
+
+    Raises
+    ------
+    InputError
+        If there is no preset of that name.
+    """
+    if name == "auto":
+        return PRESETS["best" if torch.cuda.is_available() else "fast"]
+    if name not in PRESETS:
+        raise InputError(f"preset: expected auto, {', '.join(PRESETS)}, got '{name}'")
+    return replace(PRESETS[name])
