@@ -42,6 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     try:
         command = importlib.import_module(f"nerif.commands.{verb}")
+        importlib.import_module("nerif.reconstruction.device").keep_freed_memory()
         command.main(words[1:])
     except InputError as error:
         return _refuse(str(error))

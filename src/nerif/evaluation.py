@@ -19,6 +19,8 @@ from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
 from nerif.physics.deflection import Deflection, ForwardModel, project
 from nerif.volume import Volume
 
+REPROJECTION_SAMPLES = 128  # a ray; 0.1 % of the rms displacement on the flame
+
 __all__ = ["evaluate_views", "evaluate_volume", "predict_view", "update_json"]
 
 
@@ -37,7 +39,7 @@ def evaluate_views(
 
     Where sigma is known, rms_over_sigma tells whether the residual is the noise (1) or more.
     """
-    model = Deflection(n_ambient=measurement.n_ambient)
+    model = Deflection(samples=REPROJECTION_SAMPLES, n_ambient=measurement.n_ambient)
     usable = measurement.usable
     views = []
     for i, camera in enumerate(measurement.cameras):

@@ -37,6 +37,6 @@ class Field(ABC):
         return torch.cat(values).reshape(grid.shape)
 
 
-def in_chunks(points: Tensor, size: int = 1 << 16) -> tuple[Tensor, ...]:
+def in_chunks(points: Tensor, size: int = 1 << 13) -> tuple[Tensor, ...]:
     """Split along the first axis, so that what is computed of each chunk stays in cache."""
     return torch.split(points, size)

@@ -80,9 +80,11 @@ def integration_weights(
 
 @torch.no_grad()
 def project(
-    model: ForwardModel, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int = 4096
+    model: ForwardModel, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int | None = None
 ) -> Float[Tensor, "n 2"]:
     """Return the displacement (px) of many rays, chunk by chunk; 0 where a ray misses the box."""
+    if chunk is None:  # arrays that stay in the cache of a CPU, and fill a GPU
+        chunk = 32 if torch.device(device).type == "cpu" else 4096
     result = torch.zeros(len(rays), 2, dtype=rays.origin.dtype)
     index = rays.crosses.nonzero()[:, 0]
     for part in torch.split(index, chunk):

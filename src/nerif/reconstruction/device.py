@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import platform
 import sys
 
 import torch
 
 from nerif.conventions import InputError
 
-__all__ = ["autocast_dtype", "peak_memory", "resolve_device"]
+__all__ = ["autocast_dtype", "keep_freed_memory", "peak_memory", "resolve_device"]
 
 
 def resolve_device(name: str) -> torch.device:
@@ -60,3 +62,17 @@ def peak_memory(device: torch.device) -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(peak if sys.platform == "darwin" else peak * 1024)
+
+
+def keep_freed_memory() -> None:
+    """Ask glibc to keep freed blocks for the next step, rather than hand megabytes back to the kernel each time.
+
+    A step on the CPU allocates the same few arrays again and again; with the default thresholds their pages are
+    unmapped and zeroed anew every time, which takes as long as the arithmetic (benchmarks/README.md).
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return
+    trim_threshold, top_pad, mmap_threshold = -1, -2, -3  # malloc.h
+    libc = ctypes.CDLL(None)
+    for option, value in ((mmap_threshold, 32 << 20), (trim_threshold, 1 << 30), (top_pad, 64 << 20)):
+        libc.mallopt(option, value)
