@@ -57,7 +57,9 @@ def evaluate_views(
     return views
 
 
-def evaluate_volume(field: Field, truth: Volume, n_ambient: float, device: torch.device | str = "cpu") -> dict[str, Any]:
+def evaluate_volume(
+    field: Field, truth: Volume, n_ambient: float, device: torch.device | str = "cpu"
+) -> dict[str, Any]:
     """Compare a field with a truth on the truth's own grid: see metrics.volume_metrics, and ten slices."""
     rec = field.sample(truth.grid, device).numpy()
     gt = truth.values.numpy()

@@ -235,7 +235,8 @@ class Measurement:
         if self.wavelength_nm is not None:
             dataset.attrs["wavelength_nm"] = self.wavelength_nm
         temporary = Path(f"{os.fspath(path)}.part")
-        packed = {k: {"zlib": True, "complevel": 3} for k in ("displacement", "sigma", "valid", "flow_mask") if k in data}
+        maps = ("displacement", "sigma", "valid", "flow_mask")
+        packed = {k: {"zlib": True, "complevel": 3} for k in maps if k in data}
         dataset.to_netcdf(temporary, engine="h5netcdf", encoding=packed)
         os.replace(temporary, path)
 
@@ -291,7 +292,9 @@ class Measurement:
         for i in range(views):
             length = float(normals[i].norm())
             if not 0.99 < length < 1.01:
-                raise InputError(f"background_normal of view '{names[i]}': expected a unit vector, got length {length:g}")
+                raise InputError(
+                    f"background_normal of view '{names[i]}': expected a unit vector, got length {length:g}"
+                )
             cameras.append(
                 Camera(
                     intrinsics=intrinsics[i],
@@ -304,7 +307,7 @@ class Measurement:
                 )
             )
         if "n_ambient" not in dataset.attrs:
-            raise InputError("attribute n_ambient: expected the refractive index around the flow, e.g. 1.00027, got none")
+            raise InputError("attribute n_ambient: expected the index around the flow, e.g. 1.00027, got none")
         wavelength = dataset.attrs.get("wavelength_nm")
         return cls(
             cameras=tuple(cameras),
@@ -328,11 +331,13 @@ def _check_variables(dataset: xr.Dataset) -> None:
             raise InputError(f"variable '{name}': expected on ({', '.join(dimensions)}) in {unit}, got none")
         variable = dataset[name]
         if tuple(variable.dims) != dimensions:
-            raise InputError(f"variable '{name}': expected dimensions {dimensions}, got {tuple(map(str, variable.dims))}")
+            got = tuple(map(str, variable.dims))
+            raise InputError(f"variable '{name}': expected dimensions {dimensions}, got {got}")
         for dimension in dimensions:
             size = SIZES.get(dimension)
             if size is not None and variable.sizes[dimension] != size:
-                raise InputError(f"variable '{name}': expected {size} along {dimension}, got {variable.sizes[dimension]}")
+                got_size = variable.sizes[dimension]
+                raise InputError(f"variable '{name}': expected {size} along {dimension}, got {got_size}")
         given = variable.attrs.get("units")
         if given is not None and given != unit:
             raise InputError(f"variable '{name}': expected units '{unit}', got '{given}'")

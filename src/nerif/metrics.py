@@ -42,9 +42,7 @@ def ssim(truth: Float[Array, "*n"], test: Float[Array, "*n"]) -> float:
     return float(structural_similarity(truth.astype(np.float64), test.astype(np.float64), data_range=span))
 
 
-def volume_metrics(
-    truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_ambient: float
-) -> dict[str, float]:
+def volume_metrics(truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_ambient: float) -> dict[str, float]:
     """Compare two volumes of index excess.
 
     l2 = |n_gt - n_rec| / |n_gt - 1| (the paper's, flattered by the ambient), l2_variation = the same over

@@ -150,5 +150,9 @@ def _read_netcdf(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float |
         for name, v in dataset.data_vars.items()
         if set(v.dims) == {"z", "y", "x"}
     }
-    attributes = {str(k): v for k, v in dataset.attrs.items() if isinstance(v, (str, int, float, np.number))}
+    attributes: dict[str, float | str] = {
+        str(k): v if isinstance(v, str) else float(v)
+        for k, v in dataset.attrs.items()
+        if isinstance(v, str | int | float | np.number)
+    }
     return arrays, grid, attributes

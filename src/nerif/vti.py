@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ def write_vti(
         image.GetPointData().AddArray(array)
     image.GetPointData().SetActiveScalars(next(iter(arrays)))
     for name, value in attributes.items():
-        entry: vtkStringArray | vtkDoubleArray = vtkStringArray() if isinstance(value, str) else vtkDoubleArray()
+        entry: Any = vtkStringArray() if isinstance(value, str) else vtkDoubleArray()
         entry.SetName(name)
         entry.InsertNextValue(value if isinstance(value, str) else float(value))
         image.GetFieldData().AddArray(entry)

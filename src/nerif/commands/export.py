@@ -59,7 +59,8 @@ def run(settings: Export) -> None:
     if any(a < w - 1e-6 for a, w in zip(lower, whole.lower, strict=True)) or any(
         b > w + 1e-6 for b, w in zip(upper, whole.upper, strict=True)
     ):
-        raise InputError(f"lower, upper: expected a part of the box {whole.lower} to {whole.upper} mm, got {lower} to {upper}")
+        whole_box = f"{whole.lower} to {whole.upper} mm"
+        raise InputError(f"lower, upper: expected a part of the box {whole_box}, got {lower} to {upper}")
     grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
     excess = Volume(index.sample(grid), grid, attributes={"n_ambient": n_ambient})
     export(settings.out, [derive(excess, q, settings.gas) for q in settings.quantities])

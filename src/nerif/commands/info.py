@@ -62,7 +62,8 @@ def _measurement(path: Path, m: Measurement) -> None:
     say(f"  n_ambient      {m.n_ambient:.8g}{light}")
     say(f"  ambient faces  {' '.join(m.ambient_faces) or 'none'}")
     noise = "unknown" if sigma is None else f"rms {float(sigma.square().mean().sqrt()):.4g} px"
-    say(f"  rays           {len(rays)} cross the box; rms displacement {float(d.square().mean().sqrt()):.4g} px; sigma {noise}")
+    rms = float(d.square().mean().sqrt())
+    say(f"  rays           {len(rays)} cross the box; rms displacement {rms:.4g} px; sigma {noise}")
     say(f"  masked         {m.bad_pixels} pixels with NaN or infinite displacement")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
     say("  view            size [px]      f [px]   centre to camera [mm]   to background [mm]   usable   rms [px]")
@@ -83,7 +84,8 @@ def _measurement(path: Path, m: Measurement) -> None:
 def _volume(path: Path, v: Volume) -> None:
     say(f"{path}: volume of {v.quantity} [{v.unit}] on {' x '.join(map(str, v.grid.shape))} voxels (z, y, x)")
     say(f"  box            {_corners(v.grid.box.lower, v.grid.box.upper)}")
-    say(f"  values         {float(v.values.min()):.6g} to {float(v.values.max()):.6g}, mean {float(v.values.mean()):.6g}")
+    low, high, mean = (float(x) for x in (v.values.min(), v.values.max(), v.values.mean()))
+    say(f"  values         {low:.6g} to {high:.6g}, mean {mean:.6g}")
     for name, value in v.attributes.items():
         say(f"  {name:<14} {value}")
 

@@ -140,7 +140,7 @@ def _scalars(settings: Reconstruct) -> AbstractContextManager[list[OnStep]]:
                     for name, value in {**step.losses, "rays_per_second": step.rays_per_second}.items():
                         writer.add_scalar(name, value, step.step)
 
-            yield [write]  # type: ignore[list-item]
+            yield [write]
 
     return board() if settings.tensorboard else nothing()
 

@@ -72,9 +72,13 @@ def run(settings: Simulate) -> None:
     from rich.progress import track
 
     views = iter(track(range(len(cameras)), "tracing rays", console=Console(stderr=True), transient=True))
+
+    def shown(done: int) -> None:
+        next(views, None)
+
     measurement = simulate(
         phantom, cameras, box, settings.n_ambient, settings.noise, settings.seed, settings.steps,
-        settings.wavelength_nm, settings.ambient_faces, on_view=lambda _: next(views, None),
+        settings.wavelength_nm, settings.ambient_faces, on_view=shown,
     )  # fmt: skip
     next(views, None)
     grid = Grid.of_resolution(box, settings.truth_voxels)
@@ -83,7 +87,7 @@ def run(settings: Simulate) -> None:
     write_netcdf(truth_path(settings.out), [truth])
     rays, d, _ = measurement.rays()
     rms = float(d.square().mean().sqrt())
-    say(f"{settings.out}: {len(cameras)} views, {len(rays)} rays cross the box, rms displacement {rms:.3f} px a component")
+    say(f"{settings.out}: {len(cameras)} views, {len(rays)} rays cross the box, rms displacement {rms:.3f} px")
     say(f"{truth_path(settings.out)}: the truth on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
 
 

@@ -16,9 +16,7 @@ def encoded_width(octaves: int) -> int:
     return 3 * (2 * octaves + 1)
 
 
-def encode(
-    p: Float[Tensor, "n 3"], octaves: int, gains: Float[Tensor, " k"] | None = None
-) -> Float[Tensor, "n e"]:
+def encode(p: Float[Tensor, "n 3"], octaves: int, gains: Float[Tensor, " k"] | None = None) -> Float[Tensor, "n e"]:
     """Return (p, sin(2^k pi p), cos(2^k pi p)), k = 0 .. octaves - 1, each octave times its gain.
 
     Parameters

@@ -97,7 +97,8 @@ class Network(nn.Module):
         inputs = [e] + [w + (e if i == shape.skip else 0) for i in range(1, shape.depth + 1)]
         self.layers = nn.ModuleList(nn.Linear(inputs[i], w) for i in range(shape.depth))
         outputs = 4 if shape.gradient_head else 1
-        self.heads = nn.ModuleList(nn.Linear(inputs[-1], shape.head_width) for _ in range(outputs if shape.head_width else 0))
+        hidden_heads = outputs if shape.head_width else 0
+        self.heads = nn.ModuleList(nn.Linear(inputs[-1], shape.head_width) for _ in range(hidden_heads))
         self.outputs = nn.ModuleList(nn.Linear(shape.head_width or inputs[-1], 1) for _ in range(outputs))
         self.register_buffer("gains", 2.0 ** (-shape.octave_decay * torch.arange(shape.octaves)), persistent=False)
 
@@ -125,7 +126,7 @@ class Network(nn.Module):
             if i == self.shape.skip:
                 to_encoding = cotangent[:, self.shape.width :]
                 cotangent = cotangent[:, : self.shape.width]
-            cotangent = (cotangent * slopes[i - 1]) @ self.layers[i - 1].weight
+            cotangent = (cotangent * slopes[i - 1]) @ _linear(self.layers[i - 1]).weight
         if to_encoding is not None:
             cotangent = cotangent + to_encoding
         gains = self.gains.to(encoded)
@@ -147,17 +148,23 @@ class Network(nn.Module):
         self, index: int, h: Tensor, activate: Callable[[Tensor], tuple[Tensor, Tensor]]
     ) -> tuple[Tensor, Tensor]:
         """Output `index` and its derivative with respect to h."""
-        output = self.outputs[index]
+        output = _linear(self.outputs[index])
         if not self.shape.head_width:
             return output(h)[:, 0], output.weight.expand(h.shape[0], -1)
-        inner, slope = activate(self.heads[index](h))
-        return output(inner)[:, 0], (slope * output.weight) @ self.heads[index].weight
+        head = _linear(self.heads[index])
+        inner, slope = activate(head(h))
+        return output(inner)[:, 0], (slope * output.weight) @ head.weight
 
     def _gradient_heads(self, h: Tensor) -> Tensor:
         if not self.shape.gradient_head:
             raise InputError("gradient_head: this network was made without gradient heads, so they cannot be asked")
         activate = ACTIVATIONS[self.shape.activation]
         return torch.stack([self._head(i, h, activate)[0] for i in (1, 2, 3)], dim=1)
+
+
+def _linear(module: nn.Module) -> nn.Linear:
+    assert isinstance(module, nn.Linear)
+    return module
 
 
 class NeuralField(Field):

@@ -1,8 +1,8 @@
 """Phantoms: analytic fields with exact gradients, to simulate measurements of which the truth is known.
 
-    gaussians    randomly placed Gaussian balls (paper, Phantom 1)
-    flame        a turbulent Bunsen flame (in the place of the paper's Phantoms 2-7)
-    octahedron   paper, Eq. (SRphantom), for the spatial resolution
+gaussians    randomly placed Gaussian balls (paper, Phantom 1)
+flame        a turbulent Bunsen flame (in the place of the paper's Phantoms 2-7)
+octahedron   paper, Eq. (SRphantom), for the spatial resolution
 """
 
 from __future__ import annotations
@@ -108,9 +108,7 @@ class Flame(Field):
         self.wave_vectors = (2 * math.pi / wavelength)[:, None] * unit  # 1/mm
         turnover = (2 * math.pi / self.lifetime) * (wavelength / self.longest) ** (-2 / 3)  # inertial range
         drift = turnover * (2 * uniform(self.waves) - 1)
-        self.phases = (
-            2 * math.pi * uniform(self.waves) - (self.wave_vectors[:, 2] * self.speed + drift) * time
-        )
+        self.phases = 2 * math.pi * uniform(self.waves) - (self.wave_vectors[:, 2] * self.speed + drift) * time
         # surface displacement falls as wavelength^(4/3): velocity ~ wavelength^(1/3) over a turnover time
         amplitude = wavelength ** (4 / 3)
         amplitude = amplitude / (0.5 * amplitude.square().sum()).sqrt()
@@ -118,9 +116,7 @@ class Flame(Field):
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
         shape = points.shape
-        value, gradient = zip(
-            *(self._evaluate(p) for p in torch.split(points.reshape(-1, 3), 1 << 14)), strict=True
-        )
+        value, gradient = zip(*(self._evaluate(p) for p in torch.split(points.reshape(-1, 3), 1 << 14)), strict=True)
         return torch.cat(value).reshape(shape[:-1]), torch.cat(gradient).reshape(shape)
 
     def _evaluate(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:

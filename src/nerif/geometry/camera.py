@@ -1,6 +1,6 @@
 """The camera: an OpenCV pinhole with five distortion coefficients, looking at a background plane.
 
-    x_cam = R x_world + t,   (x, y) = (X/Z, Y/Z) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
+x_cam = R x_world + t,   (x, y) = (X/Z, Y/Z) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Plane:
     offset : mm
     """
 
-    normal: Float[Tensor, "3"]
+    normal: Float[Tensor, 3]
     offset: float
 
 
@@ -53,10 +53,10 @@ class Camera:
 
     intrinsics: Matrix3
     rotation: Matrix3
-    translation: Float[Tensor, "3"]
+    translation: Float[Tensor, 3]
     image_size: tuple[int, int]
     background: Plane
-    distortion: Float[Tensor, "5"]
+    distortion: Float[Tensor, 5]
     name: str = "camera"
 
     def __post_init__(self) -> None:
@@ -86,7 +86,7 @@ class Camera:
             raise InputError(f"image size of view '{self.name}': expected (height, width) > 0, got {self.image_size}")
 
     @property
-    def centre(self) -> Float[Tensor, "3"]:
+    def centre(self) -> Float[Tensor, 3]:
         """Optical centre, mm, world frame."""
         return -self.rotation.T @ self.translation
 
@@ -134,9 +134,12 @@ class Camera:
         pixels = distorted @ k.T + self.intrinsics[:2, 2]
         zero = torch.zeros_like(depth[..., 0])
         one = torch.ones_like(zero)
-        perspective = torch.stack(
-            [torch.stack([one, zero, -ideal[..., 0]], -1), torch.stack([zero, one, -ideal[..., 1]], -1)], -2
-        ) / depth[..., None]
+        perspective = (
+            torch.stack(
+                [torch.stack([one, zero, -ideal[..., 0]], -1), torch.stack([zero, one, -ideal[..., 1]], -1)], -2
+            )
+            / depth[..., None]
+        )
         return pixels, k @ inner @ perspective @ self.rotation
 
     def _distort(self, ideal: Pixels) -> tuple[Pixels, Float[Tensor, "*batch 2 2"]]:

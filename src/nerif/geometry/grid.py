@@ -55,9 +55,7 @@ class Box:
         x, y, z = ((a + b) / 2 for a, b in zip(self.lower, self.upper, strict=True))
         return (x, y, z)
 
-    def face_points(
-        self, face: str, unit: Float[Tensor, "n 2"]
-    ) -> Float[Tensor, "n 3"]:
+    def face_points(self, face: str, unit: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
         """Map points of the unit square onto a face such as ``"x-"``, mm."""
         axis, side = FACES.index(face) // 2, FACES.index(face) % 2
         lower, edges = unit.new_tensor(self.lower), unit.new_tensor(self.edges)

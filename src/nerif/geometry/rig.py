@@ -68,9 +68,7 @@ class Ring:
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
         height, width = self.image_size
         f = self.focal_length / self.pixel_pitch
-        intrinsics = torch.tensor(
-            [[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64
-        )
+        intrinsics = torch.tensor([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64)
         return Camera(
             intrinsics=intrinsics,
             rotation=rotation,

@@ -56,9 +56,7 @@ def trace(
     return position, heading / heading.norm(dim=-1, keepdim=True)
 
 
-def background_points(
-    field: Field, rays: Rays, steps: int = 150, n_ambient: float = 1.0
-) -> Float[Tensor, "n 3"]:
+def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: float = 1.0) -> Float[Tensor, "n 3"]:
     """Return how far (mm) refraction moves the background point of each ray, seen across the undisturbed ray.
 
     The bent ray goes on straight to where it comes nearest to the background point of the straight one; the pixel

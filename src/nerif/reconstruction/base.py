@@ -5,9 +5,10 @@ A Reconstructor is a frozen record of settings; called with a Measurement it ret
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
@@ -73,7 +74,8 @@ def compose(*callbacks: OnStep) -> OnStep:
     """Return a callback that calls each in turn and asks to stop if one of them does."""
 
     def call(step: Step) -> bool:
-        return any([bool(c(step)) for c in callbacks])
+        asked = [bool(c(step)) for c in callbacks]  # each is called, also after one has asked to stop
+        return any(asked)
 
     return call
 
@@ -105,7 +107,7 @@ class Reconstruction:
     seconds: float = 0.0
     peak_memory_bytes: int = 0
     device: str = "cpu"
-    state: State | None = field(default=None, repr=False)
+    state: State | None = dataclasses.field(default=None, repr=False)
 
     def volume(self, grid: Grid) -> Volume:
         """Return the index excess at the voxel centres of a grid."""

@@ -92,7 +92,7 @@ def loss_terms(
     terms = {}
     if weights.automatic or weights.head or weights.consistency:
         heads = bool(weights.head or weights.consistency)
-        value, automatic, head = network(p, heads)  # type: ignore[operator]
+        _, automatic, head = network(p, heads)  # type: ignore[operator]
         if weights.automatic:
             terms["automatic"] = data(automatic)
         if head is not None:

@@ -295,7 +295,7 @@ class _Training:
         try:
             self.field.network.load_state_dict(network)
         except RuntimeError:
-            raise InputError("resume: the checkpoint is of a network of another shape; give the same settings") from None
+            raise InputError("resume: the checkpoint is of another network; give the same settings") from None
         moments: dict[int, dict[str, Tensor]] = {}
         for key, tensor in state.tensors.items():
             if key.startswith("adam."):
@@ -359,4 +359,3 @@ def _compiled(
     if settings.compile == "on" or (settings.compile == "auto" and device.type == "cuda"):
         return torch.compile(network.value_and_gradient, dynamic=True)
     return network.value_and_gradient
-

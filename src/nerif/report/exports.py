@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 from nerif.conventions import InputError
-from nerif.vti import write_vti
 from nerif.volume import Volume, write_netcdf
+from nerif.vti import write_vti
 
 __all__ = ["export", "write_csv"]
 

@@ -1,0 +1,62 @@
+"""Shared problems; every size differs from every other, so that a swapped axis shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from nerif.fields.base import Field
+from nerif.fields.phantoms import GaussianBalls
+from nerif.geometry import Box, Camera, Ring
+from nerif.measurement import Measurement
+from nerif.simulation import simulate
+
+torch.set_num_threads(1)  # tests run side by side
+
+
+@pytest.fixture(scope="session")
+def box() -> Box:
+    """A box of three different edges, mm."""
+    return Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
+
+
+@pytest.fixture(scope="session")
+def ball() -> Field:
+    """Two Gaussian balls well inside the box."""
+    return GaussianBalls(
+        torch.tensor([[1.0, -0.5, 0.4], [-2.0, 1.5, -0.8]], dtype=torch.float64),
+        torch.tensor([1.6, 1.3], dtype=torch.float64),
+        torch.tensor([-2.0e-4, -1.2e-4], dtype=torch.float64),
+    )
+
+
+@pytest.fixture(scope="session")
+def cameras() -> tuple[Camera, ...]:
+    """Five small views, taller or wider than square, looking slightly down."""
+    ring = Ring(
+        views=5, arc=(0.0, 144.0), elevation=8.0, image_size=(20, 26), pixel_pitch=0.11,
+        distance=700.0, background_distance=450.0,
+    )  # fmt: skip
+    return ring.cameras()
+
+
+@pytest.fixture(scope="session")
+def measurement(ball: Field, cameras: tuple[Camera, ...], box: Box) -> Measurement:
+    """What those views see of the balls, with 2 % noise."""
+    return simulate(ball, cameras, box, n_ambient=1.00027, noise=0.02, seed=5, steps=60)
+
+
+@pytest.fixture(scope="session")
+def rotation_about() -> Callable[[tuple[float, float, float], float], torch.Tensor]:
+    """Rotation matrices by Rodrigues' formula; angle in radians."""
+    return _rotation_about
+
+
+def _rotation_about(axis: tuple[float, float, float], angle: float) -> torch.Tensor:
+    k = torch.tensor(axis, dtype=torch.float64)
+    k = k / k.norm()
+    cross = torch.tensor([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)

@@ -1,0 +1,273 @@
+"""NeRIF on a small problem: it finds the field, says why it stopped, goes on where it left off, and recovers."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views, evaluate_volume
+from nerif.fields.mlp import NetworkShape
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
+from nerif.reconstruction import neural
+from nerif.reconstruction.losses import LossWeights, numerical_displacement
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.presets import PRESETS, preset
+from nerif.volume import Volume
+
+SMALL = NeRIF(
+    network=NetworkShape(depth=2, width=32, octaves=2),
+    samples=(12, 16),
+    sample_jitter=4,
+    points_per_batch=1024,
+    max_steps=30,
+    epochs=1000,
+    device="cpu",
+    precision="float32",
+)
+
+
+def test_finds_the_balls_without_seeing_them(measurement, ball):
+    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=500, points_per_batch=4096)(
+        measurement
+    )
+    grid = Grid.of_resolution(measurement.box, 30)
+    truth = Volume(ball.sample(grid), grid)
+    metrics = evaluate_volume(result.field, truth, measurement.n_ambient)
+    assert metrics["l2_variation"] < 0.12
+    assert metrics["cc"] > 0.99
+    assert min(v["cc"] for v in evaluate_views(result.field, measurement)) > 0.99
+    assert result.outcome.reason == "steps"
+
+
+def test_three_terms_of_the_paper_agree_on_a_fitted_field(measurement):
+    """After training with all of them, gradient heads, autograd and central differences predict the same."""
+    settings = replace(
+        SMALL,
+        network=NetworkShape(depth=3, width=48, octaves=2, skip=2, head_width=16, gradient_head=True),
+        weights=LossWeights(consistency=1, numerical=1, head=1, automatic=0),
+        norm="l2",
+        max_steps=400,
+        samples=(16, 24),
+        points_per_batch=2048,
+    )
+    result = settings(measurement)
+    assert set(result.history[-1]) >= {"consistency", "numerical", "head", "gauge", "loss"}
+    assert result.history[-1]["loss"] < 0.25 * result.history[0]["loss"]
+    field = result.field
+    grid = Grid.of_resolution(measurement.box, 12)
+    p = field.normalise(grid.points().reshape(-1, 3))
+    _, automatic, heads = field.network.value_and_gradient(p, heads=True)
+    step = 1e-2
+    shifts = step * torch.eye(3)
+    central = torch.stack([(field.network(p + s) - field.network(p - s)) / (2 * step) for s in shifts], dim=-1)
+    scale = automatic.norm()
+    assert float((automatic - central).norm() / scale) < 0.02
+    assert float((automatic - heads).norm() / scale) < 0.35
+
+
+def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(measurement):
+    result = replace(SMALL, max_steps=60)(measurement)
+    field, (rays, _, _) = result.field, measurement.rays()
+    rays = rays[:50]
+    s = rays.near[:, None] + torch.linspace(0.05, 0.95, 9) * (rays.far - rays.near)[:, None]
+    p = field.normalise(rays.at(s))
+    weight = torch.ones_like(s)
+    exact = torch.einsum(
+        "nij,nmj->ni", rays.sensitivity, field.network.value_and_gradient(p.reshape(-1, 3))[1].reshape(p.shape)
+    )
+    errors = []
+    for reach in (1.6, 0.8, 0.4):
+        d = numerical_displacement(field, rays, p, torch.full((50,), reach), weight)
+        errors.append(float((d - exact).norm()))
+    assert 3.5 < errors[0] / errors[1] < 4.5
+    assert 3.5 < errors[1] / errors[2] < 4.5
+
+
+def test_resumed_run_equals_one_that_was_not_interrupted(measurement):
+    whole = SMALL(measurement)
+
+    def stop_at_13(step: neural.Step) -> bool:
+        return step.step == 13
+
+    first = SMALL(measurement, on_step=stop_at_13)
+    assert first.outcome.reason == "interrupted"
+    assert first.state is not None
+    second = SMALL(measurement, resume=first.state)
+    assert second.outcome.reason == "steps"
+    points = torch.rand(50, 3) * 10 - 5
+    assert torch.equal(whole.field(points), second.field(points))
+    assert not torch.equal(whole.field(points), first.field(points))
+
+
+def test_same_seed_same_result_other_seed_another(measurement):
+    points = torch.rand(20, 3)
+    a, b, c = (replace(SMALL, seed=s, max_steps=8)(measurement).field(points) for s in (1, 1, 2))
+    assert torch.equal(a, b)
+    assert not torch.equal(a, c)
+
+
+def test_non_finite_loss_goes_back_to_the_last_good_state(measurement, monkeypatch):
+    real, calls = neural.loss_terms, []
+
+    def poisoned(*args, **kwargs):
+        calls.append(1)
+        terms = real(*args, **kwargs)
+        return {k: v * float("nan") for k, v in terms.items()} if len(calls) == 15 else terms
+
+    monkeypatch.setattr(neural, "loss_terms", poisoned)
+    monkeypatch.setattr(neural, "KEEP_EVERY", 10)
+    result = SMALL(measurement)
+    assert result.outcome.reason == "steps"
+    assert sum("taken_back" in record for record in result.history) == 1
+    assert bool(torch.isfinite(result.field(torch.rand(30, 3))).all())
+
+
+def test_loss_that_stays_non_finite_ends_with_the_last_good_state(measurement, monkeypatch):
+    real, calls = neural.loss_terms, []
+
+    def poisoned(*args, **kwargs):
+        calls.append(1)
+        terms = real(*args, **kwargs)
+        return {k: v * float("nan") for k, v in terms.items()} if len(calls) > 15 else terms
+
+    monkeypatch.setattr(neural, "loss_terms", poisoned)
+    monkeypatch.setattr(neural, "KEEP_EVERY", 10)
+    result = SMALL(measurement)
+    assert result.outcome.reason == "diverged"
+    assert "step 10" in result.outcome.message
+    assert bool(torch.isfinite(result.field(torch.rand(30, 3))).all())
+
+
+def test_each_limit_is_named(measurement):
+    assert replace(SMALL, epochs=0.5, max_steps=0)(measurement).outcome.reason == "epochs"
+    assert replace(SMALL, time_limit=1e-6)(measurement).outcome.reason == "time_limit"
+    assert replace(SMALL, stop_ratio=0.9, max_steps=400)(measurement).outcome.reason == "converged"
+
+
+def test_ambient_is_ambient_on_the_faces(measurement):
+    result = replace(SMALL, max_steps=300)(measurement)
+    unit = torch.rand(500, 2)
+    faces = torch.cat([measurement.box.face_points(f, unit) for f in measurement.ambient_faces])
+    values = result.field(faces)
+    assert abs(float(values.mean())) < 2e-6
+    assert float(values.abs().max()) < 4e-5
+
+
+def test_sigma_weighs_the_rays(measurement):
+    """A view that is all wrong, but says so in sigma, does no harm."""
+    wrong = measurement.displacement.clone()
+    wrong[2] = 0.5
+    sigma = measurement.sigma.clone()
+    sigma[2] = 1e3
+    honest = replace(measurement, displacement=wrong, sigma=sigma)
+    good = evaluate_views(replace(SMALL, max_steps=200)(honest).field, measurement)
+    blind = evaluate_views(replace(SMALL, max_steps=200)(replace(honest, sigma=None)).field, measurement)
+    others = [0, 1, 3, 4]
+    assert max(good[i]["rms_px"] for i in others) < 0.5 * max(blind[i]["rms_px"] for i in others)
+
+
+def test_invalid_pixels_do_not_count(measurement):
+    spoiled = measurement.displacement.clone()
+    valid = torch.ones(spoiled.shape[:3], dtype=torch.bool)
+    valid[1, 4:9] = False
+    one, other = spoiled.clone(), spoiled.clone()
+    other[1, 4:9] = float("nan")
+    points = torch.rand(10, 3)
+    a = replace(SMALL, max_steps=5)(replace(measurement, displacement=one, valid=valid)).field(points)
+    b = replace(SMALL, max_steps=5)(replace(measurement, displacement=other)).field(points)
+    assert torch.equal(a, b)
+
+
+def test_masks_widen_the_ambient_region(measurement, ball):
+    moving = (measurement.displacement.norm(dim=-1) > 0.01).float()[:, None]
+    mask = torch.nn.functional.max_pool2d(moving, 3, 1, 1)[:, 0] > 0
+    masked = replace(measurement, flow_mask=mask)
+    region = neural.AmbientRegion.of(masked, ())
+    points = region.sample(400, torch.Generator().manual_seed(0))
+    assert len(points) == 400
+    inside = ball(points.double()).abs() > 0.5 * 2e-4
+    assert not bool(inside.any())
+    result = replace(SMALL, ambient_faces=(), max_steps=20)(masked)
+    assert result.outcome.reason == "steps"
+
+
+def test_open_faces_drop_their_rays(measurement):
+    everything, _ = neural._targets(SMALL, measurement, torch.device("cpu"))
+    fewer, _ = neural._targets(replace(SMALL, open_faces=("z+",)), measurement, torch.device("cpu"))
+    through = everything.rays.exit_faces(measurement.box, ("z+",))
+    assert 0 < int(through.sum()) < len(everything.rays)
+    assert len(fewer.rays) == int((~through).sum())
+
+
+def test_no_displacement_gives_ambient(measurement):
+    still = replace(measurement, displacement=torch.zeros_like(measurement.displacement), sigma=None)
+    result = SMALL(still)
+    assert float(result.field(torch.rand(50, 3)).abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("precision", ["bf16", "tf32", "auto"])
+def test_other_precisions_train(measurement, precision):
+    result = replace(SMALL, precision=precision, max_steps=40)(measurement)
+    assert result.history[-1]["loss"] < result.history[0]["loss"]
+
+
+@pytest.mark.slow
+def test_compiled_network_trains_like_the_plain_one(measurement):
+    points = torch.rand(20, 3)
+    a, b = (replace(SMALL, compile=c, max_steps=5)(measurement).field(points) for c in ("on", "off"))
+    assert torch.allclose(a, b, atol=1e-8)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
+def test_trains_on_a_gpu(measurement):
+    result = replace(SMALL, device="cuda", precision="auto", max_steps=100)(measurement)
+    assert result.history[-1]["loss"] < result.history[0]["loss"]
+    assert result.peak_memory_bytes > 0
+
+
+def test_presets(measurement: Measurement):
+    paper = preset("paper")
+    assert (paper.network.depth, paper.network.width, paper.network.skip, paper.network.head_width) == (7, 256, 4, 64)
+    assert paper.samples == (60, 200)
+    assert (paper.learning_rate, paper.betas, paper.stop_ratio) == (1e-3, (0.9, 0.99), 0.005)
+    assert (paper.sampling, paper.norm, paper.schedule) == ("random", "l2", "constant")
+    w = paper.weights
+    assert (w.consistency, w.numerical, w.head, w.automatic) == (1, 1, 1, 0)
+    for name in PRESETS:
+        quick = replace(preset(name), points_per_batch=300, max_steps=2, samples=(12, 14), device="cpu", compile="off")
+        assert quick(measurement).outcome.reason == "steps"
+    assert asdict(preset("auto"))["network"]
+    with pytest.raises(InputError, match="paper"):
+        preset("papr")
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"norm": "l3"}, "norm"),
+        ({"model": "curved"}, "model"),
+        ({"epochs": 0}, "epochs"),
+        ({"learning_rate": -1}, "learning_rate"),
+        ({"time_limit": -1}, "time_limit"),
+        ({"samples": (5, 200)}, "samples"),
+        ({"points_per_batch": 20}, "points_per_batch"),
+        ({"ambient_faces": ("up",)}, "ambient_faces"),
+        ({"weights": LossWeights(head=1)}, "gradient_head"),
+        ({"device": "cuda:7"}, "device"),
+        ({"device": "abacus"}, "device"),
+        ({"open_faces": ("x-", "x+", "y-", "y+", "z-", "z+")}, "open_faces"),
+    ],
+)
+def test_settings_that_cannot_be_right(measurement, change, word):
+    with pytest.raises(InputError, match=word):
+        replace(SMALL, **change)(measurement)
+
+
+def test_no_gauge_is_refused(measurement):
+    with pytest.raises(InputError, match="ambient_faces"):
+        SMALL(replace(measurement, ambient_faces=()))
