@@ -32,7 +32,7 @@ class Project:
     """Measurement to write, NAME.nc."""
     cameras: Path | None = None
     """Measurement file whose cameras to use; without it, the ring described below."""
-    views: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
     """Names of the cameras of that file to use; none for all."""
     model: str = "lever_arm"
     """Forward model: lever_arm, paraxial or curved."""
@@ -51,9 +51,9 @@ def run(settings: Project) -> Measurement:
     index, box, n_ambient = read_field(settings.result)
     if settings.cameras is not None:
         given = Measurement.read(settings.cameras)
-        cameras = (given.select(settings.views) if settings.views else given).cameras
-    elif settings.views:
-        raise InputError("views: expected together with --cameras FILE, got no file")
+        cameras = (given.select(settings.names) if settings.names else given).cameras
+    elif settings.names:
+        raise InputError("names: expected together with --cameras FILE, got no file")
     else:
         cameras = settings.ring.cameras()
     model: ForwardModel

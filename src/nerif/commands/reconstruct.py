@@ -78,15 +78,12 @@ def run(settings: Reconstruct) -> Reconstruction:
     resume = read_state(settings.out) if settings.resume else None
     if not settings.resume:
         check_directory(settings.out, settings.force)
-        settings.out.mkdir(parents=True, exist_ok=True)
-        for name in OWN_FILES:
-            (settings.out / name).unlink(missing_ok=True)
-    (settings.out / RUN).write_text(_run_toml(settings))
-
+    begin = _begin(settings)
     with interruptible() as asked, _scalars(settings) as scalars, progress_bar("training") as bar:
-        callbacks: list[OnStep] = [bar, _checkpoints(settings), lambda _: asked[0], *scalars]  # type: ignore[list-item]
+        callbacks: list[OnStep] = [begin, bar, _checkpoints(settings), lambda _: asked[0], *scalars]  # type: ignore[list-item]
         result = settings.nerif(training, compose(*callbacks), resume)
     say(f"{result.outcome.reason}: {result.outcome.message}")
+    begin(None)
     _write(settings, measurement, result)
     return result
 
@@ -106,6 +103,23 @@ def derive_check(gas: GasSettings) -> None:
     from nerif.physics.gas_optics import gladstone_dale
 
     gladstone_dale(gas.composition, gas.wavelength_nm)
+
+
+def _begin(settings: Reconstruct) -> Callable[[Step | None], None]:
+    """Make the directory ready once the first step is done: input that is refused before leaves an old result alone."""
+    done: list[bool] = []
+
+    def prepare(step: Step | None) -> None:
+        if done:
+            return
+        settings.out.mkdir(parents=True, exist_ok=True)
+        if not settings.resume:
+            for name in OWN_FILES:
+                (settings.out / name).unlink(missing_ok=True)
+        (settings.out / RUN).write_text(_run_toml(settings))
+        done.append(True)
+
+    return prepare
 
 
 def _checkpoints(settings: Reconstruct) -> Callable[[Step], None]:

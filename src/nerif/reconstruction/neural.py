@@ -312,6 +312,7 @@ class _Training:
 
     def _result(self, outcome: Outcome) -> Reconstruction:
         state = self._capture()
+        self.field.network.eval().requires_grad_(False)
         self.field.offset = self._ambient_level()
         return Reconstruction(
             field=self.field,
