@@ -124,7 +124,18 @@ def test_project_into_the_same_and_other_cameras(work, tmp_path, capsys):
     ring = ["--names", "170deg", "--force"]
     assert "cameras" in refused(capsys, ["project", str(work / "r"), "-o", str(out), *ring])
     for model in ("curved", "paraxial"):
-        extra = ["--extra-angles", "33", "--image-size", "10", "12", "--pixel-pitch", "0.3", "--model", model, "--force"]
+        extra = [
+            "--extra-angles",
+            "33",
+            "--image-size",
+            "10",
+            "12",
+            "--pixel-pitch",
+            "0.3",
+            "--model",
+            model,
+            "--force",
+        ]
         assert main(["project", str(work / "r"), "-o", str(out), "--samples", "30", *extra]) == 0
         assert "33deg" in Measurement.read(out).names
 
@@ -149,7 +160,12 @@ def test_export(work, tmp_path, ending):
 
 def test_info_of_each_kind(work, capsys):
     before = sorted(os.listdir(work))
-    for path, word in (("m.nc", "4 views"), ("m.truth.nc", "index_excess"), ("r", "reconstruction"), ("r/volume.vti", "volume")):
+    for path, word in (
+        ("m.nc", "4 views"),
+        ("m.truth.nc", "index_excess"),
+        ("r", "reconstruction"),
+        ("r/volume.vti", "volume"),
+    ):
         assert main(["info", str(work / path)]) == 0
         assert word in capsys.readouterr().out
     assert sorted(os.listdir(work)) == before
@@ -300,7 +316,12 @@ def test_nothing_is_overwritten_without_force(work, tmp_path, capsys):
 def test_forced_run_with_bad_input_keeps_what_was_there(work, tmp_path, capsys):
     out = tmp_path / "r"
     shutil.copytree(work / "r", out)
-    for bad in (["--hold-out", "nobody"], ["--gas.composition", "phlogiston"], ["--device", "cuda:9"], ["--epochs", "-1"]):
+    for bad in (
+        ["--hold-out", "nobody"],
+        ["--gas.composition", "phlogiston"],
+        ["--device", "cuda:9"],
+        ["--epochs", "-1"],
+    ):
         refused(capsys, ["reconstruct", str(work / "m.nc"), "-o", str(out), "--force", *bad])
         assert (out / "field.safetensors").exists()
 
@@ -353,7 +374,9 @@ def test_settings_files_that_cannot_be_right(work, tmp_path, capsys, text, words
 
 def test_flags_win_over_the_file(work, tmp_path):
     config = tmp_path / "s.toml"
-    config.write_text('phantom = "octahedron"\nviews = 3\nimage-size = [9, 11]\npixel_pitch = 0.3\nsteps = 20\ntruth_voxels = 8\n')
+    config.write_text(
+        'phantom = "octahedron"\nviews = 3\nimage-size = [9, 11]\npixel_pitch = 0.3\nsteps = 20\ntruth_voxels = 8\n'
+    )
     assert main(["simulate", "--config", str(config), "--views", "2", "-o", str(tmp_path / "s.nc")]) == 0
     m = Measurement.read(tmp_path / "s.nc")
     assert m.displacement.shape == (2, 9, 11, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -77,7 +78,7 @@ def test_curved_rays_converge_to_lever_arm_at_second_order(cameras, cube):
         field = one_ball(amplitude, width=2.5)
         straight, curved = Deflection("lever_arm", 200, N_AMBIENT)(field, rays), CurvedRays(200, N_AMBIENT)(field, rays)
         differences.append(float((straight - curved).square().mean().sqrt()))
-    orders = [math.log2(a / b) for a, b in zip(differences, differences[1:], strict=False)]
+    orders = [math.log2(a / b) for a, b in pairwise(differences)]
     assert all(1.9 < order < 2.1 for order in orders), (differences, orders)
 
 
@@ -88,9 +89,7 @@ def test_paraxial_differs_by_the_lever_arm_alone(cameras, cube):
     lever, paraxial = (Deflection(m, 300)(middle, rays) for m in ("lever_arm", "paraxial"))
     away = one_ball(-2e-4, (9.0, 0.0, 0.0), 0.7)
     lever_away, paraxial_away = (Deflection(m, 300)(away, rays) for m in ("lever_arm", "paraxial"))
-    near, far = (
-        float((a - b).norm() / a.norm()) for a, b in ((lever, paraxial), (lever_away, paraxial_away))
-    )
+    near, far = (float((a - b).norm() / a.norm()) for a, b in ((lever, paraxial), (lever_away, paraxial_away)))
     assert near < 2e-3
     assert 5e-3 < far < 5e-2  # 9 mm of a lever arm of 450 mm
 
@@ -131,7 +130,7 @@ def test_runge_kutta_is_of_fourth_order(cameras, cube):
     field = one_ball(-5e-2, width=3.0)
     fine = trace(field, rays, 640)[1]
     errors = [float((trace(field, rays, n)[1] - fine).norm()) for n in (20, 40, 80)]
-    orders = [math.log2(a / b) for a, b in zip(errors, errors[1:], strict=False)]
+    orders = [math.log2(a / b) for a, b in pairwise(errors)]
     assert min(orders) > 3.7, orders
 
 

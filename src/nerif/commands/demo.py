@@ -52,11 +52,11 @@ def run(settings: Demo) -> None:
     settings.out.mkdir(parents=True, exist_ok=True)
     measured = settings.out / "measurement.nc"
     between = 95.625  # degrees, halfway between the fifth and the sixth of nine views
-    ring = Ring(
-        extra_angles=(between,), image_size=(settings.pixels,) * 2, pixel_pitch=0.02 * 200 / settings.pixels
-    )
+    ring = Ring(extra_angles=(between,), image_size=(settings.pixels,) * 2, pixel_pitch=0.02 * 200 / settings.pixels)
     simulate.run(
-        simulate.Simulate(out=measured, noise=settings.noise, seed=settings.seed, truth_voxels=80, force=True, ring=ring)
+        simulate.Simulate(
+            out=measured, noise=settings.noise, seed=settings.seed, truth_voxels=80, force=True, ring=ring
+        )
     )
     held_out = f"{between:g}deg"
     result = reconstruct.run(
@@ -85,7 +85,9 @@ def run(settings: Demo) -> None:
         settings.out / "held_out_view.png", held_out,
         measurement.displacement[i].numpy(), predicted.numpy(), measurement.usable[i].numpy(),
     )  # fmt: skip
-    say(f"Look at {settings.out}/slices.png and held_out_view.png; open volume.vti in ParaView; nerif info {settings.out}")
+    say(
+        f"Look at {settings.out}/slices.png and held_out_view.png; open volume.vti in ParaView; nerif info {settings.out}"
+    )
 
 
 def main(arguments: list[str]) -> None:

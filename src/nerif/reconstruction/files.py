@@ -55,7 +55,9 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         network.load_state_dict(tensors)
         lower, upper = about["box"]
         box = Box(tuple(lower), tuple(upper))
-        field = NeuralField(network.eval().requires_grad_(False), box, float(about["index_scale"]), float(about["offset"]))
+        field = NeuralField(
+            network.eval().requires_grad_(False), box, float(about["index_scale"]), float(about["offset"])
+        )
         return field, box, float(about["n_ambient"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise InputError(f"{path}: not a field of this version of nerif ({type(error).__name__}: {error})") from None
