@@ -85,9 +85,8 @@ def run(settings: Demo) -> None:
         settings.out / "held_out_view.png", held_out,
         measurement.displacement[i].numpy(), predicted.numpy(), measurement.usable[i].numpy(),
     )  # fmt: skip
-    say(
-        f"Look at {settings.out}/slices.png and held_out_view.png; open volume.vti in ParaView; nerif info {settings.out}"
-    )
+    say(f"Look at {settings.out}/slices.png and {settings.out}/held_out_view.png;")
+    say(f"open {settings.out}/volume.vti in ParaView; all figures: nerif info {settings.out}")
 
 
 def main(arguments: list[str]) -> None:

@@ -1,0 +1,140 @@
+"""Why the `fast` preset is what it is: speed of a training step by its parts, and error at equal time.
+
+    python benchmarks/choices.py --write benchmarks/results/choices-cpu.md
+
+Ratios within one run are what counts: the machine may be shared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import shlex
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from flame import N_AMBIENT, machine
+
+from nerif.evaluation import evaluate_volume
+from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.phantoms import Flame
+from nerif.geometry import Box, Grid, paper_rig
+from nerif.reconstruction.device import keep_freed_memory
+from nerif.reconstruction.losses import LossWeights
+from nerif.reconstruction.neural import NeRIF
+from nerif.simulation import add_noise, simulate
+from nerif.volume import Volume
+
+POINTS = 8192
+
+
+def rate(work: Callable[[], None], points: int) -> float:
+    """Median of seven timings of `work`, in thousand points a second."""
+    work()
+    seconds = []
+    for _ in range(7):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return points / statistics.median(seconds) / 1e3
+
+
+def steps(network: Network) -> dict[str, Callable[[], None]]:
+    """A training step's arithmetic: gradient at POINTS points, and its derivative in the weights."""
+    p = torch.rand(POINTS, 3) * 2 - 1
+
+    def exact(bf16: bool) -> None:
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bf16):
+            gradient = network.value_and_gradient(p)[1]
+        gradient.float().square().mean().backward()
+
+    def differences(bf16: bool) -> None:
+        shift = 0.02 * torch.eye(3)[:2]
+        points = torch.stack([p + s for s in (shift[0], -shift[0], shift[1], -shift[1])]).reshape(-1, 3)
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bf16):
+            n = network(points).float().reshape(4, -1)
+        ((n[0] - n[1]).square() + (n[2] - n[3]).square()).mean().backward()
+
+    return {
+        "exact gradient, float32": lambda: exact(False),
+        "exact gradient, bf16": lambda: exact(True),
+        "four displaced evaluations, float32": lambda: differences(False),
+        "four displaced evaluations, bf16": lambda: differences(True),
+    }
+
+
+def sampling_rates(network: Network) -> dict[str, float]:
+    """Evaluation on a grid by size of chunk."""
+    field = NeuralField(network, Box.cube(50.0), 1e-4)
+    points = torch.rand(1 << 17, 3) * 50 - 25
+
+    def run(chunk: int) -> None:
+        with torch.no_grad():
+            for part in points.split(chunk):
+                field(part)
+
+    return {f"values, chunks of {c}": rate(lambda c=c: run(c), len(points)) for c in (8192, 65536)}  # type: ignore[misc]
+
+
+def main() -> None:
+    """Run and print both tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--time-limit", type=float, default=45.0, help="seconds of training of each variant")
+    parser.add_argument("--write", type=Path)
+    arguments = parser.parse_args()
+    lines = [
+        f"Command: `python {shlex.join(sys.argv)}`  ",
+        f"Machine: {machine()}  ",
+        f"Date: {datetime.date.today().isoformat()}",
+        "",
+        f"Network of 4 layers of 128, {POINTS} points a step, median of 7; thousand points a second.",
+        "",
+        "| | malloc as it is | freed memory kept | ratio |",
+        "|---|---|---|---|",
+    ]
+    network = Network(NetworkShape())
+    before = {k: rate(w, POINTS) for k, w in steps(network).items()} | sampling_rates(network)
+    keep_freed_memory()
+    after = {k: rate(w, POINTS) for k, w in steps(network).items()} | sampling_rates(network)
+    lines += [f"| {k} | {before[k]:.0f} | {after[k]:.0f} | {after[k] / before[k]:.2f} |" for k in before]
+
+    cameras, box = paper_rig(64)
+    flame = Flame(box)
+    grid = Grid.of_resolution(box, 64)
+    truth = Volume(flame.sample(grid), grid)
+    measurement = add_noise(simulate(flame, cameras, box, N_AMBIENT), 0.05, seed=1)
+    base = NeRIF(time_limit=arguments.time_limit, epochs=1e6, device="cpu")
+    variants = {
+        "fast preset": base,
+        "one draw an interval (the paper's sampling)": replace(base, sampling="random"),
+        "float32 throughout": replace(base, precision="float32"),
+        "bf16 throughout": replace(base, full_precision_from=2.0),
+        "central differences alone": replace(base, weights=LossWeights(numerical=1, automatic=0)),
+        "mean length of residuals (the paper's norm)": replace(base, norm="l2"),
+    }
+    lines += [
+        "",
+        f"Flame, 9 views of 64 x 64, noise 0.05, {arguments.time_limit:g} s of training each:",
+        "",
+        "| | steps | L2 | L2 of variation | CC |",
+        "|---|---|---|---|---|",
+    ]
+    print("\n".join(lines), flush=True)
+    for name, settings in variants.items():
+        result = settings(measurement)
+        m = evaluate_volume(result.field, truth, N_AMBIENT)
+        steps_done = result.history[-1]["step"]
+        lines.append(f"| {name} | {steps_done:.0f} | {m['l2']:.3%} | {m['l2_variation']:.2%} | {m['cc']:.5f} |")
+        print(lines[-1], flush=True)
+    if arguments.write:
+        arguments.write.parent.mkdir(parents=True, exist_ok=True)
+        arguments.write.write_text("# Choices behind the fast preset\n\n" + "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
