@@ -87,7 +87,7 @@ class Flame(Field):
     base_radius, taper = 6.0, 0.28  # flame front: radius at the bottom (mm), closing per mm of height
     product_radius, widening = 12.0, 0.03  # outer edge of the products
     waves = 32
-    wrinkling = (0.7, 1.2)  # rms of a and b, mm
+    wrinkling = (0.7, 1.3)  # rms of a and b, mm
     lifetime = 1.0e-3  # s, in which a wrinkle of the longest wavelength loses its shape
 
     def __init__(self, box: Box, time: float = 0.0, seed: int = 0, contrast: float = 2.2e-4) -> None:
@@ -109,8 +109,8 @@ class Flame(Field):
         turnover = (2 * math.pi / self.lifetime) * (wavelength / self.longest) ** (-2 / 3)  # inertial range
         drift = turnover * (2 * uniform(self.waves) - 1)
         self.phases = 2 * math.pi * uniform(self.waves) - (self.wave_vectors[:, 2] * self.speed + drift) * time
-        # surface displacement falls as wavelength^(4/3): velocity ~ wavelength^(1/3) over a turnover time
-        amplitude = wavelength ** (4 / 3)
+        # velocity ~ wavelength^(1/3) over a turnover time ~ wavelength^(2/3): every scale is equally steep
+        amplitude = wavelength.clone()
         amplitude = amplitude / (0.5 * amplitude.square().sum()).sqrt()
         self.amplitudes = amplitude[:, None] * torch.tensor(self.wrinkling, dtype=torch.float64)
 
