@@ -81,7 +81,7 @@ class NeRIF(Reconstructor):
     """Where to compute: auto, cpu, cuda, cuda:1, ..."""
     precision: str = "auto"
     """One of auto, float32, tf32, bf16 (mixed; the last part of the run in float32)."""
-    full_precision_from: float = 0.7
+    full_precision_from: float = 0.85
     """Share of the run after which bf16 gives way to float32."""
     compile: str = "auto"
     """Compile the network: on, off, or auto (on CUDA only)."""

@@ -1,0 +1,111 @@
+"""The network: its written-out gradient against autograd, its shape against the paper, its units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.encoding import encode, encode_pullback, encoded_width
+from nerif.fields.mlp import ACTIVATIONS, Network, NetworkShape, NeuralField
+from nerif.geometry import Box
+
+BASE = NetworkShape(depth=3, width=11, octaves=2, skip=2, head_width=5, gradient_head=True)
+SHAPES = {
+    "paper-like": BASE,
+    "no skip": replace(BASE, skip=0),
+    "skip at the end": replace(BASE, skip=3),
+    "no heads": replace(BASE, head_width=0),
+    "value only": replace(BASE, head_width=0, gradient_head=False),
+    "weighted octaves": replace(BASE, octave_decay=0.7),
+    "no encoding": replace(BASE, octaves=0),
+}
+
+
+def network(shape: NetworkShape) -> Network:
+    torch.manual_seed(0)
+    return Network(shape).double()
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_written_out_gradient_is_that_of_autograd(shape, activation):
+    net = network(replace(shape, activation=activation))
+    p = (2 * torch.rand(17, 3, dtype=torch.float64) - 1).requires_grad_()
+    value, gradient, heads = net.value_and_gradient(p, heads=shape.gradient_head)
+    (expected,) = torch.autograd.grad(net(p).sum(), p)
+    assert torch.allclose(value, net(p), atol=1e-14)
+    assert float(expected.abs().max()) > 0
+    assert torch.allclose(gradient, expected, atol=1e-12)
+    if heads is not None:
+        assert torch.equal(heads, net.head_gradient(p))
+
+
+@pytest.mark.parametrize("activation", [a for a in ACTIVATIONS if a != "relu"])
+def test_a_loss_on_the_gradient_trains_the_same_weights_as_double_backward(activation):
+    net = network(replace(BASE, activation=activation))
+    p = (2 * torch.rand(17, 3, dtype=torch.float64) - 1).requires_grad_()
+    weights = list(net.layers.parameters())
+    ours = torch.autograd.grad(net.value_and_gradient(p)[1].square().sum(), weights, allow_unused=True)
+    (inner,) = torch.autograd.grad(net(p).sum(), p, create_graph=True)
+    theirs = torch.autograd.grad(inner.square().sum(), weights, allow_unused=True)
+    for a, b in zip(ours, theirs, strict=True):
+        assert a is not None
+        assert b is not None
+        assert torch.allclose(a, b, atol=1e-12)
+
+
+def test_encoding_is_the_paper_s():
+    p = torch.tensor([[0.3, -0.2, 0.7]], dtype=torch.float64)
+    e = encode(p, 3)[0]
+    assert e.shape == (encoded_width(3),) == (21,)
+    assert torch.equal(e[:3], p[0])
+    for k in range(3):
+        assert torch.allclose(e[3 + 3 * k : 6 + 3 * k], torch.sin(2**k * torch.pi * p[0]))
+        assert torch.allclose(e[12 + 3 * k : 15 + 3 * k], torch.cos(2**k * torch.pi * p[0]))
+
+
+def test_encoding_pullback_is_its_transposed_jacobian():
+    p = torch.rand(1, 3, dtype=torch.float64)
+    gains = torch.tensor([1.0, 0.5], dtype=torch.float64)
+    cotangent = torch.rand(1, 15, dtype=torch.float64)
+    jacobian = torch.autograd.functional.jacobian(lambda q: encode(q, 2, gains)[0], p)[:, 0]
+    got = encode_pullback(encode(p, 2, gains), cotangent, 2)
+    assert torch.allclose(got[0], cotangent[0] @ jacobian)
+
+
+def test_paper_s_network():
+    net = Network(NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64, gradient_head=True))
+    e = 3 * (2 * 5 + 1)
+    assert [layer.in_features for layer in net.layers] == [e, 256, 256, 256, 256 + e, 256, 256]
+    assert [layer.out_features for layer in net.layers] == [256] * 7
+    assert [(h.in_features, h.out_features) for h in net.heads] == [(256, 64)] * 4
+    assert [(o.in_features, o.out_features) for o in net.outputs] == [(64, 1)] * 4
+
+
+def test_units_of_the_field():
+    box = Box((-3.0, 1.0, -8.0), (5.0, 7.0, 4.0))
+    net = network(BASE)
+    field = NeuralField(net, box, index_scale=2e-4, offset=0.3)
+    points = torch.rand(4, 5, 3, dtype=torch.float64) * 3
+    expected = 2e-4 * (net((points.reshape(-1, 3) - torch.tensor(box.centre)) / 6.0) - 0.3).reshape(4, 5)
+    assert torch.allclose(field(points), expected, atol=1e-16)
+    value, gradient = field.value_and_gradient(points)
+    assert torch.allclose(value, expected, atol=1e-16)
+    h = 1e-5  # mm
+    along_y = torch.tensor([0.0, h, 0.0])
+    central = (field(points + along_y) - field(points - along_y)) / (2 * h)
+    assert torch.allclose(gradient[..., 1], central, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("change", [{"activation": "step"}, {"depth": 0}, {"width": 0}, {"octaves": -1}, {"skip": -1}])
+def test_shapes_that_cannot_be_right(change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        replace(BASE, **change)
+
+
+def test_gradient_heads_that_do_not_exist_cannot_be_asked():
+    with pytest.raises(InputError, match="gradient_head"):
+        network(SHAPES["value only"]).head_gradient(torch.zeros(1, 3, dtype=torch.float64))
