@@ -1,0 +1,152 @@
+"""The measurement: its file, what of it is used, and what is refused (more of that in test_cli.py)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from nerif.conventions import InputError
+from nerif.geometry import Ring
+from nerif.measurement import VARIABLES, Measurement
+from nerif.simulation import simulate
+
+
+@pytest.fixture
+def full(ball, box) -> Measurement:
+    """Views of different size, with everything that is optional."""
+    cameras = Ring(views=2, arc=(0, 60), image_size=(10, 14), pixel_pitch=0.2).cameras()
+    cameras += Ring(views=1, arc=(110, 110), image_size=(13, 9), pixel_pitch=0.2).cameras()
+    cameras = (
+        replace(cameras[0], distortion=torch.tensor([0.01, 0.02, 1e-3, 2e-3, 0.5], dtype=torch.float64)),
+        *cameras[1:],
+    )
+    m = simulate(ball, cameras, box, 1.00027, noise=0.1, steps=15, wavelength_nm=532.0, ambient_faces=("x-", "z+"))
+    valid = torch.rand(m.displacement.shape[:3], generator=torch.Generator().manual_seed(0)) > 0.2
+    return replace(m, valid=valid, flow_mask=~valid)
+
+
+def test_round_trip(full, tmp_path):
+    full.write(tmp_path / "m.nc")
+    back = Measurement.read(tmp_path / "m.nc")
+    for name in ("displacement", "sigma", "valid", "flow_mask"):
+        a, b = getattr(full, name), getattr(back, name)
+        assert a.dtype == b.dtype
+        assert torch.equal(a.nan_to_num(-9.0), b.nan_to_num(-9.0))
+    for name in ("box", "n_ambient", "wavelength_nm", "ambient_faces", "names"):
+        assert getattr(full, name) == getattr(back, name)
+    for a, b in zip(full.cameras, back.cameras, strict=True):
+        assert a.image_size == b.image_size
+        for name in ("intrinsics", "rotation", "translation", "distortion"):
+            assert torch.equal(getattr(a, name), getattr(b, name))
+        assert torch.allclose(a.background.normal, b.background.normal, atol=1e-15)
+        assert a.background.offset == pytest.approx(b.background.offset)
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_file_opens_with_plain_xarray_and_states_its_units(full, tmp_path):
+    full.write(tmp_path / "m.nc")
+    with xr.open_dataset(tmp_path / "m.nc") as dataset:
+        assert dataset.attrs["Conventions"] == "BOST-1.0"
+        assert dataset.attrs["ambient_faces"] == "x- z+"
+        assert set(dataset.data_vars) == set(VARIABLES)
+        for name, (dimensions, unit) in VARIABLES.items():
+            assert dataset[name].dims == dimensions
+            assert dataset[name].attrs["units"] == unit
+        assert list(dataset["component"].values) == ["u", "v"]
+
+
+def test_what_is_optional_may_be_missing(full, tmp_path):
+    m = replace(full.select(full.names[1:2]), sigma=None, valid=None, flow_mask=None, wavelength_nm=None)
+    m = replace(m, displacement=m.displacement[:, :10, :14])
+    m.write(tmp_path / "m.nc")
+    dataset = xr.load_dataset(tmp_path / "m.nc").drop_vars(["distortion", "image_size", "view", "component"])
+    del dataset.attrs["ambient_faces"]
+    dataset.to_netcdf(tmp_path / "bare.nc", engine="h5netcdf")
+    back = Measurement.read(tmp_path / "bare.nc")
+    assert back.sigma is back.valid is back.flow_mask is back.wavelength_nm is None
+    assert back.cameras[0].image_size == (10, 14)
+    assert back.ambient_faces == ("x-", "x+", "y-", "y+")
+
+
+def test_usable_pixels_and_rays(full):
+    spoilt = full.displacement.clone()
+    spoilt[0, 2, 3, 1] = float("nan")
+    sigma = full.sigma.clone()
+    sigma[1, 4, 5] = 0.0
+    m = replace(full, displacement=spoilt, sigma=sigma, valid=torch.ones_like(full.valid))
+    assert m.bad_pixels == 1
+    usable = m.usable
+    assert not bool(usable[0, 2, 3])
+    assert not bool(usable[1, 4, 5])
+    assert not bool(usable[0, 10:].any() | usable[2, :, 9:].any())
+    assert int(usable.sum()) == 2 * 140 + 117 - 2
+    rays, d, s = m.rays()
+    assert len(rays) == len(d) == len(s)
+    assert bool(rays.crosses.all())
+    assert rays.origin.dtype == torch.float32
+    # the k-th ray and the k-th displacement belong together
+    index = usable.nonzero()
+    camera = m.cameras[2]
+    mine = index[index[:, 0] == 2]
+    own = camera.rays(mine[:, [2, 1]].double()).clip(m.box)
+    count = int(own.crosses.sum())
+    assert torch.allclose(rays.direction[-count:], own.direction[own.crosses].float())
+    assert torch.equal(d[-count:], m.displacement[2][usable[2]][own.crosses])
+
+
+def test_select(full):
+    part = full.select([full.names[2], full.names[0]])
+    assert part.names == (full.names[0], full.names[2])
+    assert torch.equal(part.displacement.nan_to_num(), full.displacement[[0, 2]].nan_to_num())
+    assert torch.equal(part.valid, full.valid[[0, 2]])
+    with pytest.raises(InputError, match="nobody"):
+        full.select(["nobody"])
+    with pytest.raises(InputError, match="none"):
+        full.select([])
+
+
+def test_sizes_and_numbers_that_cannot_be_right(full):
+    for change, word in (
+        ({"displacement": full.displacement[:2]}, "displacement"),
+        ({"sigma": full.sigma[:, :5]}, "sigma"),
+        ({"valid": full.valid[:, :, :3]}, "valid"),
+        ({"n_ambient": 0.00027}, "n_ambient"),
+        ({"cameras": (full.cameras[0],) * 3}, "different names"),
+        ({"displacement": full.displacement[:, :9], "sigma": None, "valid": None, "flow_mask": None}, "image_size"),
+    ):
+        with pytest.raises(InputError, match=word):
+            replace(full, **change)
+
+
+@pytest.mark.parametrize("offset", [-5.0, 300.0], ids=["inside the box", "before the box"])
+def test_background_must_be_behind_the_box(full, offset):
+    camera = full.cameras[1]
+    moved = replace(camera, background=replace(camera.background, offset=offset))
+    with pytest.raises(InputError, match="background of view '60deg'"):
+        replace(full, cameras=(full.cameras[0], moved, full.cameras[2]))
+
+
+def test_wrong_attributes_name_themselves(full, tmp_path):
+    full.write(tmp_path / "m.nc")
+    for name, value in (("Conventions", "CF-1.8"), ("n_ambient", None), ("ambient_faces", "top")):
+        dataset = xr.load_dataset(tmp_path / "m.nc")
+        dataset.attrs.pop(name)
+        if value:
+            dataset.attrs[name] = value
+        dataset.to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
+        with pytest.raises(InputError, match=f"x.nc.*{name}"):
+            Measurement.read(tmp_path / "x.nc")
+
+
+def test_normal_that_is_no_unit_vector(full, tmp_path):
+    full.write(tmp_path / "m.nc")
+    dataset = xr.load_dataset(tmp_path / "m.nc")
+    dataset["background_normal"].values[1] *= 2
+    assert np.isfinite(dataset["background_normal"].values).all()
+    dataset.to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match="background_normal of view '60deg'"):
+        Measurement.read(tmp_path / "x.nc")

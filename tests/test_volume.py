@@ -1,0 +1,121 @@
+"""Volumes on disk: .nc, .vti and .csv, value for value."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from nerif.conventions import InputError
+from nerif.geometry import Box, Grid
+from nerif.report.exports import export
+from nerif.volume import Volume, read_volume, write_netcdf
+
+GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
+VALUES = torch.arange(60, dtype=torch.float32).reshape(5, 3, 4) * 1e-6
+
+
+@pytest.fixture
+def volumes() -> list[Volume]:
+    attributes: dict[str, float | str] = {"n_ambient": 1.00027, "gas": "air"}
+    return [
+        Volume(VALUES, GRID, attributes=attributes),
+        Volume(VALUES * 1e6 + 0.5, GRID, "density", "kg m-3", attributes),
+    ]
+
+
+@pytest.mark.parametrize("ending", ["nc", "vti"])
+def test_round_trip(volumes, tmp_path, ending):
+    path = tmp_path / f"v.{ending}"
+    export(path, volumes)
+    excess, density = read_volume(path), read_volume(path, "density")
+    assert excess.quantity == "index_excess"
+    assert torch.equal(excess.values, VALUES)
+    assert torch.equal(density.values, volumes[1].values)
+    assert density.unit == "kg m-3"
+    assert excess.grid.shape == GRID.shape
+    assert excess.grid.box.lower == pytest.approx(GRID.box.lower)
+    assert excess.grid.box.upper == pytest.approx(GRID.box.upper)
+    assert excess.attributes["n_ambient"] == 1.00027
+    assert excess.attributes["gas"] == "air"
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_vti_has_x_fastest_and_starts_at_the_first_voxel_centre(volumes, tmp_path):
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+    export(tmp_path / "v.vti", volumes)
+    reader = vtkXMLImageDataReader()
+    reader.SetFileName(str(tmp_path / "v.vti"))
+    reader.Update()
+    image = reader.GetOutput()
+    assert image.GetDimensions() == (4, 3, 5)
+    assert image.GetOrigin() == pytest.approx((-0.5, 3.0, -2.0))
+    assert image.GetSpacing() == pytest.approx((1.0, 2.0, 2.0))
+    flat = vtk_to_numpy(image.GetPointData().GetArray("index_excess"))
+    np.testing.assert_array_equal(flat, VALUES.numpy().ravel())
+    point = image.FindPoint(1.5, 5.0, 4.0)  # voxel x 2, y 1, z 3
+    assert image.GetPointData().GetArray("index_excess").GetValue(point) == pytest.approx(float(VALUES[3, 1, 2]))
+
+
+def test_netcdf_states_coordinates_and_units(volumes, tmp_path):
+    write_netcdf(tmp_path / "v.nc", volumes)
+    with xr.open_dataset(tmp_path / "v.nc") as dataset:
+        assert dataset["density"].dims == ("z", "y", "x")
+        assert dataset["density"].attrs["units"] == "kg m-3"
+        assert dataset["x"].attrs["units"] == "mm"
+        assert dataset["z"].values.tolist() == [-2, 0, 2, 4, 6]
+
+
+def test_csv(volumes, tmp_path):
+    export(tmp_path / "v.csv", volumes)
+    with (tmp_path / "v.csv").open() as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["x_mm", "y_mm", "z_mm", "index_excess [1]", "density [kg m-3]"]
+    assert len(rows) == 61
+    second = [float(x) for x in rows[2]]
+    assert second == pytest.approx([0.5, 3.0, -2.0, 1e-6, 1.5])
+
+
+def test_n_becomes_index_excess(tmp_path):
+    n = Volume(VALUES.double() + 1.00027, GRID, "n", attributes={"n_ambient": 1.00027})
+    write_netcdf(tmp_path / "n.nc", [n])
+    back = read_volume(tmp_path / "n.nc")
+    assert back.quantity == "index_excess"
+    assert float((back.values - VALUES).abs().max()) < 1e-12
+
+
+def test_a_volume_from_elsewhere(tmp_path):
+    """Coordinates are enough: the box is half a voxel wider on each side; dimensions may come in any order."""
+    values = np.random.default_rng(0).random((4, 3, 5)).astype(np.float32)
+    coordinates = {"x": np.linspace(0, 3, 4), "y": np.linspace(-1, 1, 3), "z": np.linspace(10, 12, 5)}
+    xr.Dataset({"cfd": (("x", "y", "z"), values)}, coords=coordinates).to_netcdf(tmp_path / "c.nc", engine="h5netcdf")
+    volume = read_volume(tmp_path / "c.nc")
+    assert volume.grid.shape == (5, 3, 4)
+    assert volume.grid.box.lower == pytest.approx((-0.5, -1.5, 9.75))
+    np.testing.assert_array_equal(volume.values.numpy(), values.transpose(2, 1, 0))
+
+
+def test_refusals(volumes, tmp_path):
+    spoilt = Volume(torch.where(VALUES > 3e-5, torch.nan, VALUES), GRID)
+    write_netcdf(tmp_path / "nan.nc", [spoilt])
+    (tmp_path / "text.vti").write_text("no image")
+    (tmp_path / "text.nc").write_text("no volume")
+    xr.Dataset({"a": ("x", [1.0])}).to_netcdf(tmp_path / "flat.nc", engine="h5netcdf")
+    export(tmp_path / "v.nc", volumes)
+    for name, word in (
+        ("nan.nc", "NaN"), ("text.vti", "not a VTK image"), ("text.nc", "not a readable"), ("flat.nc", "coordinates"),
+        ("absent.nc", "no such file"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=f"{name}.*{word}"):
+            read_volume(tmp_path / name)
+    with pytest.raises(InputError, match="temperature"):
+        read_volume(tmp_path / "v.nc", "temperature")
+    with pytest.raises(InputError, match="stl"):
+        export(tmp_path / "v.stl", volumes)
+    with pytest.raises(InputError, match="shape"):
+        Volume(VALUES.movedim(0, 2), GRID)
