@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+# ruff: noqa: E402
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
+import jaxtyping
 import pytest
 import torch
+from jaxtyping import install_import_hook
+
+CHECKED = ("conventions", "geometry", "measurement", "volume", "vti", "fields", "physics", "metrics", "simulation")
+CHECKED += ("reconstruction", "evaluation", "report")
+# shapes in annotations are checked on every call; the hook must be there before nerif is imported
+install_import_hook([f"nerif.{part}" for part in CHECKED], "typecheck.check")
 
 from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
@@ -15,6 +23,14 @@ from nerif.measurement import Measurement
 from nerif.simulation import simulate
 
 torch.set_num_threads(1)  # tests run side by side
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Shapes are not checked by annotation, as when users call: the error has to be ours."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

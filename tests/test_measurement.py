@@ -109,7 +109,7 @@ def test_select(full):
         full.select([])
 
 
-def test_sizes_and_numbers_that_cannot_be_right(full):
+def test_sizes_and_numbers_that_cannot_be_right(full, unchecked):
     for change, word in (
         ({"displacement": full.displacement[:2]}, "displacement"),
         ({"sigma": full.sigma[:, :5]}, "sigma"),
