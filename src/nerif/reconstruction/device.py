@@ -43,7 +43,7 @@ def autocast_dtype(precision: str, device: torch.device) -> torch.dtype | None:
     Sets whether CUDA's float32 products may be rounded to TF32.
     """
     if device.type == "cuda":
-        torch.backends.cuda.matmul.allow_tf32 = precision != "float32"
+        torch.set_float32_matmul_precision("highest" if precision == "float32" else "high")
         fast = torch.cuda.is_bf16_supported()
     else:
         fast = bool(torch.cpu._is_avx512_bf16_supported())

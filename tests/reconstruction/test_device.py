@@ -1,0 +1,58 @@
+"""Devices and precisions, as far as they can be told without a GPU."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.reconstruction.device import autocast_dtype, keep_freed_memory, peak_memory, resolve_device
+from nerif.reconstruction.presets import PRESETS, preset
+
+
+def test_auto_takes_the_gpu_where_there_is_one(monkeypatch):
+    for there, kind, settings in ((True, "cuda", "best"), (False, "cpu", "fast")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert resolve_device("auto").type == kind
+        assert preset("auto") == PRESETS[settings]
+
+
+def test_gpu_that_is_not_there(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert resolve_device("cuda:1") == torch.device("cuda:1")
+    with pytest.raises(InputError, match=r"one of 2 GPUs.*cuda:2"):
+        resolve_device("cuda:2")
+    for name in ("tpu0", "meta"):
+        with pytest.raises(InputError, match=name):
+            resolve_device(name)
+
+
+@pytest.mark.parametrize(
+    ("precision", "tf32", "low"),
+    [("auto", True, True), ("bf16", True, True), ("tf32", True, False), ("float32", False, False)],
+)
+def test_precision_on_a_gpu(monkeypatch, precision, tf32, low):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
+    before = torch.get_float32_matmul_precision()
+    try:
+        assert (autocast_dtype(precision, torch.device("cuda")) is torch.bfloat16) is low
+        assert torch.get_float32_matmul_precision() == ("high" if tf32 else "highest")
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def test_bf16_on_a_cpu_only_where_the_hardware_has_it(monkeypatch):
+    cpu = torch.device("cpu")
+    for there in (True, False):
+        monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda there=there: there)
+        assert (autocast_dtype("auto", cpu) is torch.bfloat16) is there
+        assert autocast_dtype("bf16", cpu) is torch.bfloat16
+        assert autocast_dtype("float32", cpu) is None
+
+
+def test_peak_memory_counts_this_process():
+    before = peak_memory(torch.device("cpu"))
+    block = torch.ones(64 << 20, dtype=torch.uint8)
+    assert peak_memory(torch.device("cpu")) >= max(before, block.numel())
+    keep_freed_memory()  # must do no harm where it is called twice, or on another libc
+    keep_freed_memory()

@@ -1,0 +1,61 @@
+"""Evaluation: metrics of a field that is known, and JSON that any program can read."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.conventions import Points, Values, Vectors
+from nerif.evaluation import evaluate_views, evaluate_volume, update_json
+from nerif.fields.base import Field
+from nerif.geometry import Grid
+from nerif.volume import Volume
+
+
+class Scaled(Field):
+    """Another field times a factor."""
+
+    def __init__(self, inner: Field, factor: float) -> None:
+        self.inner, self.factor = inner, factor
+
+    def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
+        value, gradient = self.inner.value_and_gradient(points)
+        return self.factor * value, self.factor * gradient
+
+
+def test_the_true_field_leaves_the_noise_alone(measurement, ball):
+    views = evaluate_views(ball, measurement, held_out=("144deg",))
+    assert [v["held_out"] for v in views] == [False] * 4 + [True]
+    for v in views:
+        assert v["rms_over_sigma"] == pytest.approx(1, abs=0.12)
+        assert v["cc"] > 0.999
+
+
+def test_a_field_ten_per_cent_too_strong(measurement, ball):
+    grid = Grid.of_resolution(measurement.box, 20)
+    truth = Volume(ball.sample(grid), grid)
+    metrics = evaluate_volume(Scaled(ball, 1.1), truth, measurement.n_ambient)
+    assert metrics["l2_variation"] == pytest.approx(0.1, rel=1e-4)
+    assert metrics["cc"] == pytest.approx(1, abs=1e-6)
+    assert len(metrics["slices"]) == min(10, grid.shape[0])
+
+
+def test_json_is_plain_and_kept(tmp_path):
+    path = tmp_path / "m.json"
+    update_json(path, {"a": 1.5, "bad": math.nan, "views": [{"x": math.inf, "y": (1, 2)}]})
+    update_json(path, {"b": "text"})
+    assert json.loads(path.read_text()) == {"a": 1.5, "bad": None, "views": [{"x": None, "y": [1, 2]}], "b": "text"}
+
+
+def test_predictions_on_views_without_valid_pixels_are_not_numbers(measurement, ball):
+    valid = torch.ones(measurement.displacement.shape[:3], dtype=torch.bool)
+    camera = measurement.cameras[0]
+    crosses = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).crosses.reshape(camera.image_size)
+    valid[0] = ~crosses  # what is left misses the box
+    views = evaluate_views(ball, replace(measurement, valid=valid))
+    assert math.isnan(views[0]["rms_px"])
+    assert views[1]["cc"] > 0.99
