@@ -15,6 +15,7 @@ from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction import neural
+from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.losses import LossWeights, numerical_displacement
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
@@ -89,7 +90,7 @@ def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(
     assert 3.5 < errors[1] / errors[2] < 4.5
 
 
-def test_resumed_run_equals_one_that_was_not_interrupted(measurement):
+def test_resumed_run_equals_one_that_was_not_interrupted(measurement, tmp_path):
     whole = SMALL(measurement)
 
     def stop_at_13(step: neural.Step) -> bool:
@@ -98,7 +99,8 @@ def test_resumed_run_equals_one_that_was_not_interrupted(measurement):
     first = SMALL(measurement, on_step=stop_at_13)
     assert first.outcome.reason == "interrupted"
     assert first.state is not None
-    second = SMALL(measurement, resume=first.state)
+    write_state(tmp_path, first.state)
+    second = SMALL(measurement, resume=read_state(tmp_path))
     assert second.outcome.reason == "steps"
     points = torch.rand(50, 3) * 10 - 5
     assert torch.equal(whole.field(points), second.field(points))
@@ -125,6 +127,7 @@ def test_non_finite_loss_goes_back_to_the_last_good_state(measurement, monkeypat
     result = SMALL(measurement)
     assert result.outcome.reason == "steps"
     assert sum("taken_back" in record for record in result.history) == 1
+    assert "taken back 1 time" in result.outcome.message
     assert bool(torch.isfinite(result.field(torch.rand(30, 3))).all())
 
 

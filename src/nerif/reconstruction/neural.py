@@ -312,6 +312,9 @@ class _Training:
 
     def _result(self, outcome: Outcome) -> Reconstruction:
         state = self._capture()
+        if self.retries and outcome.reason != "diverged":
+            taken_back = f"; taken back {self.retries} time(s) to the last good state after a non-finite loss"
+            outcome = Outcome(outcome.reason, outcome.message + taken_back)
         self.field.network.eval().requires_grad_(False)
         self.field.offset = self._ambient_level()
         return Reconstruction(

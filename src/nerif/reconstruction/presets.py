@@ -20,7 +20,7 @@ PRESETS: dict[str, NeRIF] = {
     "best": NeRIF(
         network=NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64),
         samples=(48, 128),
-        points_per_batch=1 << 18,
+        points_per_batch=1 << 17,
         learning_rate=2e-3,
         epochs=60,
     ),
@@ -31,7 +31,7 @@ PRESETS: dict[str, NeRIF] = {
         norm="l2",
         samples=(60, 200),
         sampling="random",
-        points_per_batch=1 << 18,
+        points_per_batch=1 << 15,
         learning_rate=1e-3,
         schedule="constant",
         epochs=200,
