@@ -8,7 +8,9 @@ terms are the paper's. The last but one is its noise-free twin, the last the gau
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -19,7 +21,7 @@ from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
 from nerif.physics.deflection import integration_weights
 
-__all__ = ["LossWeights", "Target", "loss_terms"]
+__all__ = ["Evaluator", "LossWeights", "Target", "loss_terms"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,19 @@ class LossWeights:
             raise InputError("loss weights: expected a positive numerical, head or automatic weight, got none")
 
 
+@runtime_checkable
+class Evaluator(Protocol):
+    """What the loss asks of a network; see fields/mlp.py."""
+
+    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Return the n head."""
+
+    def value_and_gradient(
+        self, p: Float[Tensor, "n 3"], heads: bool
+    ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
+        """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
+
+
 @dataclass(frozen=True)
 class Target:
     """Rays and what they measured.
@@ -63,7 +78,7 @@ class Target:
 
 def loss_terms(
     field: NeuralField,
-    network: object,
+    network: Evaluator,
     target: Target,
     s: Float[Tensor, "n m"],
     step: Float[Tensor, " n"],
@@ -72,7 +87,9 @@ def loss_terms(
     norm: str,
     n_ambient: float,
 ) -> dict[str, Tensor]:
-    """Return the terms with positive weight by name, not yet weighted; `network` evaluates value_and_gradient.
+    """Return the terms with positive weight by name, not yet weighted.
+
+    The network alone may run in low precision; the path integral is summed in float32.
 
     Parameters
     ----------
@@ -92,7 +109,7 @@ def loss_terms(
     terms = {}
     if weights.automatic or weights.head or weights.consistency:
         heads = bool(weights.head or weights.consistency)
-        _, automatic, head = network(p, heads)  # type: ignore[operator]
+        _, automatic, head = network.value_and_gradient(p, heads)
         if weights.automatic:
             terms["automatic"] = data(automatic)
         if head is not None:
@@ -101,16 +118,16 @@ def loss_terms(
             if weights.consistency:
                 terms["consistency"] = reduce(automatic.float() - head.float(), norm)
     if weights.numerical:
-        d = numerical_displacement(field, rays, p.reshape(*shape, 3), step / 2, weight)
+        d = numerical_displacement(network.value, rays, p.reshape(*shape, 3), step / (2 * field.half_edge), weight)
         terms["numerical"] = reduce((d - target.displacement) * target.inverse_scale, norm)
     return terms
 
 
 def numerical_displacement(
-    field: NeuralField,
+    value: Callable[[Float[Tensor, "n 3"]], Float[Tensor, " n"]],
     rays: Rays,
     p: Float[Tensor, "n m 3"],
-    delta: Float[Tensor, " n"],
+    reach: Float[Tensor, " n"],
     weight: Float[Tensor, "n m"],
 ) -> Float[Tensor, "n 2"]:
     """Return the displacement by central differences of n (paper, Eq. (samplegrad)), px.
@@ -119,17 +136,17 @@ def numerical_displacement(
 
     Parameters
     ----------
+    value : the n head
     p : sample points in the coordinates of the network
-    delta : reach of the differences to either side, mm
+    reach : of the differences to either side, in the same coordinates
     weight : lever arm times step in the units of the network
     """
     length = rays.sensitivity.norm(dim=-1)  # px/mm
     along = rays.sensitivity / length[..., None]
-    reach = delta / field.half_edge
     offset = (reach[:, None, None] * along)[:, None]  # n 1 2 3
     centre = p[:, :, None, :]
     points = torch.stack([centre + offset, centre - offset])  # 2 n m 2 3
-    n = field.network(points.reshape(-1, 3)).float().reshape(points.shape[:-1])
+    n = value(points.reshape(-1, 3)).float().reshape(points.shape[:-1])
     slope = (n[0] - n[1]) / (2 * reach[:, None, None])  # n m 2
     return (weight[..., None] * slope).sum(dim=1) * length
 

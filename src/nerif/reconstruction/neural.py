@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -122,7 +121,6 @@ class _Training:
     def __init__(self, settings: NeRIF, measurement: Measurement, resume: State | None) -> None:
         self.settings, self.measurement = settings, measurement
         self.device = resolve_device(settings.device)
-        self.low_precision = autocast_dtype(settings.precision, self.device)
         self.generator = torch.Generator().manual_seed(settings.seed)
         faces = settings.ambient_faces or measurement.ambient_faces
         self.ambient = AmbientRegion.of(measurement, faces)
@@ -133,7 +131,7 @@ class _Training:
             network = Network(settings.network)
         self.field = NeuralField(network.to(self.device), measurement.box, index_scale)
         self.adam = torch.optim.Adam(network.parameters(), lr=settings.learning_rate, betas=settings.betas)
-        self.evaluate = _compiled(settings, network, self.device)
+        self.network = _MixedPrecision(settings, network, self.device)
         self.history: list[dict[str, float]] = []
         self.order = torch.empty(0, dtype=torch.long)
         self.step, self.rays_done, self.retries, self.rate = 0, 0, 0, 1.0
@@ -165,14 +163,14 @@ class _Training:
                 continue  # looking at a number waits for the GPU, so look now and then
             values = {name: float(term.detach()) for name, term in terms.items()}
             values["loss"] = float(loss.detach())
-            if not math.isfinite(values["loss"]):
+            if not math.isfinite(values["loss"]) or (outcome is not None and not self._finite()):
                 outcome = self._take_back()
                 continue
             self._follow(values["loss"])
             speed = (self.rays_done - rays_then) / max(time.perf_counter() - clock, 1e-9)
             if self.step % LOG_EVERY == 0 or self.step == 1 or outcome is not None:
                 self._log(values, speed)
-            if self.step % KEEP_EVERY == 0:
+            if self.step % KEEP_EVERY == 0 and self._finite():
                 self.good = self._capture()
             if on_step is not None and on_step(self._tell(values, speed)) and outcome is None:
                 outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
@@ -193,12 +191,11 @@ class _Training:
 
     def _terms(self, target: Target, s: Tensor, interval: Tensor) -> dict[str, Tensor]:
         settings = self.settings
-        bf16 = self.low_precision is not None and self.progress < settings.full_precision_from
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=bf16):
-            terms = loss_terms(
-                self.field, self.evaluate, target, s, interval,
-                settings.weights, settings.model, settings.norm, self.measurement.n_ambient,
-            )  # fmt: skip
+        self.network.low = self.progress < settings.full_precision_from
+        terms = loss_terms(
+            self.field, self.network, target, s, interval,
+            settings.weights, settings.model, settings.norm, self.measurement.n_ambient,
+        )  # fmt: skip
         points = self.ambient.sample(GAUGE_POINTS, self.generator).to(self.device)
         terms["gauge"] = self.field.network(self.field.normalise(points)).square().mean()
         return terms
@@ -252,6 +249,10 @@ class _Training:
         if math.isnan(self.initial_loss):
             self.initial_loss = self.running = loss
         self.running += 0.1 * (loss - self.running)
+
+    def _finite(self) -> bool:
+        """Whether the weights are: a finite loss can have a gradient that is not."""
+        return all(bool(torch.isfinite(w).all()) for w in self.field.network.parameters())
 
     def _take_back(self) -> Outcome | None:
         """Return to the last good state with half the learning rate."""
@@ -357,9 +358,28 @@ def _targets(settings: NeRIF, measurement: Measurement, device: torch.device) ->
     return Target(rays.to(device), displacement.to(device), inverse_scale.to(device)), index_scale
 
 
-def _compiled(
-    settings: NeRIF, network: Network, device: torch.device
-) -> Callable[[Float[Tensor, "n 3"], bool], tuple[Tensor, Tensor, Tensor | None]]:
-    if settings.compile == "on" or (settings.compile == "auto" and device.type == "cuda"):
-        return torch.compile(network.value_and_gradient, dynamic=True)
-    return network.value_and_gradient
+class _MixedPrecision:
+    """The network, compiled where that is asked for, in bf16 while `low` is set and the settings allow it."""
+
+    def __init__(self, settings: NeRIF, network: Network, device: torch.device) -> None:
+        self.network, self.device, self.low = network, device, True
+        self.dtype = autocast_dtype(settings.precision, device)
+        self.both = network.value_and_gradient
+        if settings.compile == "on" or (settings.compile == "auto" and device.type == "cuda"):
+            self.both = torch.compile(network.value_and_gradient, dynamic=True)
+
+    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Return the n head."""
+        with self._precision():
+            return self.network(p)
+
+    def value_and_gradient(
+        self, p: Float[Tensor, "n 3"], heads: bool
+    ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
+        """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
+        with self._precision():
+            return self.both(p, heads)
+
+    def _precision(self) -> torch.autocast:
+        bf16 = self.low and self.dtype is not None
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=bf16)
