@@ -298,6 +298,20 @@ def test_truncated_foreign_and_missing_files(work, tmp_path, capsys):
     assert not (tmp_path / "r").exists()
 
 
+def test_damaged_results_name_their_file(work, tmp_path, capsys):
+    out = tmp_path / "r"
+    shutil.copytree(work / "r", out)
+    (out / "metrics.json").write_text("{")
+    for arguments in (["info", str(out)], ["evaluate", str(out), "--truth", str(work / "m.truth.nc")]):
+        assert "metrics.json" in refused(capsys, arguments)
+    weights = out / "field.safetensors"
+    weights.write_bytes(weights.read_bytes()[:200])
+    assert "field.safetensors" in refused(capsys, ["info", str(out)])
+    checkpoint = out / "checkpoint.safetensors"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:200])
+    assert "checkpoint.safetensors" in refused(capsys, ["reconstruct", "--resume", "-o", str(out)])
+
+
 def test_nothing_is_overwritten_without_force(work, tmp_path, capsys):
     before = {p: p.stat().st_mtime_ns for p in work.rglob("*") if p.is_file()}
     m, r = str(work / "m.nc"), str(work / "r")
@@ -338,6 +352,9 @@ def test_forced_run_with_bad_input_keeps_what_was_there(work, tmp_path, capsys):
         (["simulate", "-o", "s.nc", "--phantom", "cloud"], ["cloud", "flame"]),
         (["simulate", "-o", "s.nc", "--phantom", "absent.nc"], ["absent.nc"]),
         (["simulate", "-o", "s.txt"], [".nc"]),
+        (["simulate", "-o", "s.nc", "--ambient-faces", "top", *TINY], ["ambient_faces", "top"]),
+        (["simulate", "-o", "s.nc", "--n-ambient", "0", *TINY], ["n_ambient"]),
+        (["simulate", "-o", "s.nc", "--background-distance", "10", *TINY], ["background of view '0deg'"]),
         (["simulate", "-o", "nowhere/s.nc"], ["nowhere"]),
         (["simulate", "-o", "s.nc", "--noise", "-1", *TINY], ["noise"]),
         (["evaluate", "nowhere", "--truth", "t.nc"], ["nowhere"]),

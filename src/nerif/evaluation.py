@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Camera
 from nerif.measurement import Measurement
@@ -69,7 +70,10 @@ def evaluate_volume(
 
 def update_json(path: Path, entries: dict[str, Any]) -> dict[str, Any]:
     """Add entries to a JSON file, atomically, and return all it holds; NaN and infinity are written as null."""
-    known = json.loads(path.read_text()) if path.is_file() else {}
+    try:
+        known = json.loads(path.read_text()) if path.is_file() else {}
+    except ValueError:
+        raise InputError(f"{path}: not a JSON file, or truncated; remove it and evaluate again") from None
     known |= entries
     temporary = path.with_name(path.name + ".part")
     temporary.write_text(json.dumps(_plain(known), indent=2, allow_nan=False) + "\n")

@@ -92,6 +92,7 @@ class Measurement:
                 )
         if not 0.9 < self.n_ambient < 4:
             raise InputError(f"n_ambient: expected a refractive index such as 1.00027, got {self.n_ambient}")
+        parse_faces(self.ambient_faces)
         good = self.usable.flatten(1).sum(dim=1)
         for name, count in zip(self.names, good.tolist(), strict=True):
             if count == 0:

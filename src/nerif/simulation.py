@@ -87,13 +87,8 @@ def simulate(
     """
     height = max(c.image_size[0] for c in cameras)
     width = max(c.image_size[1] for c in cameras)
-    displacement = torch.full((len(cameras), height, width, 2), float("nan"))
-    with torch.no_grad():
-        for i, camera in enumerate(cameras):
-            h, w = camera.image_size
-            displacement[i, :h, :w] = view_displacement(field, camera, box, n_ambient, steps)
-            if on_view is not None:
-                on_view(i + 1)
+    displacement = torch.zeros(len(cameras), height, width, 2)
+    # made first with nothing in it: a rig that cannot be right is refused before the long work
     measurement = Measurement(
         cameras=tuple(cameras),
         displacement=displacement,
@@ -102,4 +97,11 @@ def simulate(
         wavelength_nm=wavelength_nm,
         ambient_faces=ambient_faces,
     )
-    return add_noise(measurement, noise, seed)
+    displacement = torch.full_like(displacement, float("nan"))
+    with torch.no_grad():
+        for i, camera in enumerate(cameras):
+            h, w = camera.image_size
+            displacement[i, :h, :w] = view_displacement(field, camera, box, n_ambient, steps)
+            if on_view is not None:
+                on_view(i + 1)
+    return add_noise(replace(measurement, displacement=displacement), noise, seed)

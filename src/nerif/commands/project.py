@@ -47,6 +47,8 @@ def run(settings: Project) -> Measurement:
     """Write the predicted measurement and return it."""
     if settings.out.suffix != ".nc":
         raise InputError(f"out: expected a name ending in .nc, got '{settings.out.name}'")
+    if settings.model not in ("lever_arm", "paraxial", "curved"):
+        raise InputError(f"model: expected lever_arm, paraxial or curved, got '{settings.model}'")
     check_file(settings.out, settings.force)
     index, box, n_ambient = read_field(settings.result)
     if settings.cameras is not None:
