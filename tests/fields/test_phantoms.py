@@ -17,7 +17,7 @@ SLAB = Box((-20.0, -25.0, -15.0), (24.0, 21.0, 33.0))
 
 def voxels() -> VoxelField:
     values = torch.rand(5, 6, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    return VoxelField(values, Grid(SLAB, (5, 6, 7)))
+    return VoxelField.through(values, Grid(SLAB, (5, 6, 7)))
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_voxel_field_is_of_fourth_order():
     errors = []
     for n in (20, 40):
         grid = Grid.of_resolution(SLAB, n)
-        field = VoxelField(smooth(grid.points(torch.float64)), grid)
+        field = VoxelField.through(smooth(grid.points(torch.float64)), grid)
         errors.append(float((field(points) - smooth(points)).norm()))
     assert errors[0] / errors[1] > 8
 

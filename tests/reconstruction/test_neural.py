@@ -19,6 +19,7 @@ from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.losses import LossWeights, numerical_displacement
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
+from nerif.reconstruction.target import Target
 from nerif.volume import Volume
 
 SMALL = NeRIF(
@@ -201,8 +202,8 @@ def test_masks_widen_the_ambient_region(measurement, ball):
 
 
 def test_open_faces_drop_their_rays(measurement):
-    everything, _ = neural._targets(SMALL, measurement, torch.device("cpu"))
-    fewer, _ = neural._targets(replace(SMALL, open_faces=("z+",)), measurement, torch.device("cpu"))
+    everything = Target.of(measurement)
+    fewer = Target.of(measurement, ("z+",))
     through = everything.rays.exit_faces(measurement.box, ("z+",))
     assert 0 < int(through.sum()) < len(everything.rays)
     assert len(fewer.rays) == int((~through).sum())

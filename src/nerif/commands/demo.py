@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands import evaluate, reconstruct, simulate
+from nerif.commands.methods import ReconstructNeRIF
 from nerif.commands.output import check_directory, say
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
@@ -60,7 +61,7 @@ def run(settings: Demo) -> None:
     )
     held_out = f"{between:g}deg"
     result = reconstruct.run(
-        reconstruct.Reconstruct(
+        ReconstructNeRIF(
             measurement=measured,
             out=settings.out,
             preset="fast",
@@ -68,7 +69,7 @@ def run(settings: Demo) -> None:
             voxels=80,
             force=True,
             gas=GasSettings(),
-            nerif=NeRIF(time_limit=settings.time_limit, epochs=1000, seed=settings.seed),
+            reconstructor=NeRIF(time_limit=settings.time_limit, epochs=1000, seed=settings.seed),
         )
     )
     truth_file = simulate.truth_path(measured)

@@ -77,7 +77,7 @@ def progress_bar(title: str) -> Iterator[object]:
 
         def update(step: Step) -> None:
             left = step.seconds * (1 / step.progress - 1) if step.progress > 0.001 else float("nan")
-            terms = " ".join(f"{k} {v:.2e}" for k, v in step.losses.items())
+            terms = " ".join(f"{k} {v:.3g}" for k, v in step.losses.items())
             figures = f"epoch {step.epoch:.1f} | {terms} | {step.rays_per_second:.3g} rays/s | {left:.0f} s left"
             bar.update(task, completed=step.progress, figures=figures)
             if not console.is_terminal and step.seconds - last[0] >= 15:

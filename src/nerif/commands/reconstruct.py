@@ -5,23 +5,24 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from nerif import __version__
+from nerif.commands.methods import METHODS, Reconstruct
 from nerif.commands.output import check_directory, interruptible, progress_bar, say
 from nerif.commands.settings import flag_value, merge, parse, read_toml, to_toml
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, update_json
+from nerif.fields.base import Field
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings, derive
 from nerif.reconstruction.base import OnStep, Reconstruction, Step, compose
-from nerif.reconstruction.files import CHECKPOINT, FIELD, read_state, write_field, write_state
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_state, write_field, write_state
 from nerif.reconstruction.presets import preset
 from nerif.report.exports import export
 
@@ -29,45 +30,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from contextlib import AbstractContextManager
 
-__all__ = ["Reconstruct", "main", "run"]
+__all__ = ["main", "run"]
 
 RUN, METRICS, HISTORY = "run.toml", "metrics.json", "history.csv"
 OWN_FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, "volume.nc", "volume.vti")
 
 
-@dataclass(frozen=True)
-class Reconstruct:
-    """Reconstruct the refractive-index field of a measurement and write a result directory."""
-
-    measurement: Annotated[Path, tyro.conf.Positional]
-    """Measurement file (.nc); with --resume it may be left out."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Result directory to write."""
-    preset: str = "auto"
-    """One of fast, best, paper; auto is best where there is a GPU, else fast. Single settings below win over it."""
-    hold_out: tuple[str, ...] = ()
-    """Views kept out of the reconstruction and re-projected from it."""
-    voxels: int = 100
-    """Voxels of the written volume along the longest edge of the box."""
-    force: bool = False
-    """Overwrite an existing result directory."""
-    resume: bool = False
-    """Go on with an interrupted run in --out; limits such as --epochs may be raised."""
-    checkpoint_every: float = 60.0
-    """Seconds between checkpoints."""
-    tensorboard: bool = False
-    """Write TensorBoard scalars to OUT/tensorboard."""
-    config: Path | None = None
-    """TOML file of settings (such as the run.toml of a result); flags win over it."""
-    gas: GasSettings = field(default_factory=GasSettings)
-    """What the density is computed for."""
-    nerif: Annotated[NeRIF, tyro.conf.arg(name="")] = field(default_factory=NeRIF)
-
-
 def run(settings: Reconstruct) -> Reconstruction:
     """Reconstruct, and write everything that docs/formats.md lists."""
-    if settings.voxels < 1:
-        raise InputError(f"voxels: expected at least 1, got {settings.voxels}")
+    if settings.volume_voxels < 1:
+        raise InputError(f"voxels: expected at least 1, got {settings.volume_voxels}")
     measurement = Measurement.read(settings.measurement)
     training = _without(measurement, settings.hold_out)
     if measurement.wavelength_nm is not None:
@@ -76,12 +48,13 @@ def run(settings: Reconstruct) -> Reconstruction:
     if measurement.bad_pixels:
         say(f"{settings.measurement}: {measurement.bad_pixels} pixels with NaN or infinite displacement left out")
     resume = read_state(settings.out) if settings.resume else None
+    start = _start(settings, measurement) if resume is None else None
     if not settings.resume:
         check_directory(settings.out, settings.force)
     begin = _begin(settings)
     with interruptible() as asked, _scalars(settings) as scalars, progress_bar("training") as bar:
         callbacks: list[OnStep] = [begin, bar, _checkpoints(settings), lambda _: asked[0], *scalars]  # type: ignore[list-item]
-        result = settings.nerif(training, compose(*callbacks), resume)
+        result = settings.reconstructor(training, compose(*callbacks), resume, start)
     say(f"{result.outcome.reason}: {result.outcome.message}")
     begin(None)
     _write(settings, measurement, result)
@@ -96,6 +69,19 @@ def _without(measurement: Measurement, names: tuple[str, ...]) -> Measurement:
     if not kept:
         raise InputError("hold_out: every view is held out, so none is left to reconstruct from")
     return measurement.select(kept)
+
+
+def _start(settings: Reconstruct, measurement: Measurement) -> Field | None:
+    """The field to start from, if one is named."""
+    if settings.start_from is None:
+        return None
+    start, box, _ = read_field(settings.start_from)
+    if box != measurement.box:
+        raise InputError(
+            f"{settings.start_from}: expected a reconstruction in the box of the measurement, "
+            f"{measurement.box.lower} to {measurement.box.upper} mm, got {box.lower} to {box.upper}"
+        )
+    return start
 
 
 def derive_check(gas: GasSettings) -> None:
@@ -161,6 +147,8 @@ def _scalars(settings: Reconstruct) -> AbstractContextManager[list[OnStep]]:
 
 def _run_toml(settings: Reconstruct, about: dict[str, Any] | None = None) -> str:
     kept = replace(settings, force=False, resume=False, config=None, measurement=settings.measurement.resolve())
+    if kept.start_from is not None:
+        kept = replace(kept, start_from=kept.start_from.resolve())
     head = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
     return head + to_toml(kept, {"nerif": __version__, **(about or {})})
 
@@ -187,7 +175,7 @@ def _write(settings: Reconstruct, measurement: Measurement, result: Reconstructi
     )
     about = {"torch": torch.__version__, "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
     (out / RUN).write_text(_run_toml(settings, about))
-    excess = result.volume(Grid.of_resolution(result.box, settings.voxels))
+    excess = result.volume(Grid.of_resolution(result.box, settings.volume_voxels))
     volumes = [derive(excess, quantity, settings.gas) for quantity in ("index_excess", "n", "density")]
     volumes[0] = replace(volumes[0], attributes=volumes[-1].attributes)
     for name in ("volume.nc", "volume.vti"):
@@ -220,9 +208,15 @@ def main(arguments: list[str]) -> None:
             raise InputError(f"{out}: expected an interrupted run to resume, got no {RUN} in it")
         config = str(Path(out) / RUN)
     values = read_toml(Path(config)) if config else {}
-    name = flag_value(arguments, "--preset") or values.get("preset", "auto")
-    # settings of a file are complete: there the preset has had its say already
-    default = Reconstruct(measurement=tyro.MISSING, out=tyro.MISSING, preset=name, nerif=preset(name))
+    method = flag_value(arguments, "--method") or values.get("method", "nerif")
+    if method not in METHODS:
+        raise InputError(f"method: expected one of {', '.join(METHODS)}, got '{method}'")
+    chosen: dict[str, Any] = {"method": method}
+    if method == "nerif":
+        name = flag_value(arguments, "--preset") or values.get("preset", "auto")
+        # settings of a file are complete: there the preset has had its say already
+        chosen |= {"preset": name, "reconstructor": preset(name)}
+    default = METHODS[method](measurement=tyro.MISSING, out=tyro.MISSING, **chosen)
     if config:
         default = merge(default, values, config)
-    run(parse(default, arguments, "nerif reconstruct", Reconstruct.__doc__ or ""))
+    run(parse(default, arguments, "nerif reconstruct", METHODS[method].__doc__ or ""))

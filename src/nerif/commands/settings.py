@@ -153,15 +153,14 @@ def to_toml(settings: Any, about: dict[str, Any] | None = None) -> str:
 
     def plain(value: Any) -> Any:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+            inner = ((f.name, plain(getattr(value, f.name))) for f in dataclasses.fields(value))
+            return {name: v for name, v in inner if v is not None}  # TOML has no word for nothing
         if isinstance(value, list | tuple):
             return [plain(v) for v in value]
         return str(value) if isinstance(value, Path) else value
 
     table: dict[str, Any] = {}
     for name, value in plain(settings).items():
-        if value is None:
-            continue
         table |= value if _inner_record(type(settings), name) else {name: value}
     # tables last, as TOML wants them
     table = dict(sorted(table.items(), key=lambda item: isinstance(item[1], dict)))

@@ -97,7 +97,7 @@ def _phantom(settings: Simulate) -> tuple[Field, Box]:
         volume = read_volume(path)
         if volume.quantity != "index_excess":
             raise InputError(f"{path}: expected index_excess or n in it, got '{volume.quantity}'")
-        return VoxelField(volume.values, volume.grid), volume.grid.box
+        return VoxelField.through(volume.values, volume.grid), volume.grid.box
     x, y, z = (e / 2 for e in settings.box)
     box = Box((-x, -y, -z), (x, y, z))
     return make_phantom(settings.phantom, box, settings.seed, settings.time), box

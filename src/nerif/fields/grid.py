@@ -1,42 +1,60 @@
-"""A field given by voxel values, interpolated by cubic B-splines: twice differentiable, exact gradient."""
+"""Fields given by one coefficient a voxel: B-splines of degree 1 (trilinear) or 3 (twice differentiable).
+
+    n(x) = sum_ijk c_ijk b(x / hx - i) b(y / hy - j) b(z / hz - k),      x measured from the first voxel centre
+
+Source: Unser, Splines: a perfect fit for signal and image processing, IEEE Signal Process. Mag. 16 (1999).
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError, Points, Values, Vectors
+from nerif.conventions import InputError, Points, Values, Vectors, parse_faces
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 
-__all__ = ["VoxelField"]
+__all__ = ["DEGREES", "Boundary", "VoxelField", "spline_weights"]
+
+DEGREES = {"linear": 1, "cubic": 3}
 
 
 class VoxelField(Field):
-    """Interpolates voxel-centre values by a cubic B-spline that passes through each of them.
-
-    n(x) = sum_ijk c_ijk beta(x/hx - i) beta(y/hy - j) beta(z/hz - k)
-
-    Half a voxel beyond the outermost centres the field is continued by mirroring; further out it is that of the
-    nearest point of the box.
+    """A B-spline over the voxels of a grid; beyond the box it is that of the nearest point of the box.
 
     Parameters
     ----------
-    values : (z, y, x) index excess at the voxel centres
+    coefficients : (z + 2 p, y + 2 p, x + 2 p) at the voxel centres, p = (degree + 1) / 2 layers beyond each face
     grid : Grid
-
-    Source: Unser, Splines: a perfect fit for signal and image processing, IEEE Signal Process. Mag. 16 (1999).
+    degree : 1, where the coefficients are the values, or 3
     """
 
-    def __init__(self, values: Float[Tensor, "z y x"], grid: Grid) -> None:
+    def __init__(self, coefficients: Float[Tensor, "zp yp xp"], grid: Grid, degree: int) -> None:
+        if degree not in DEGREES.values():
+            raise InputError(f"degree: expected one of {', '.join(map(str, DEGREES.values()))}, got {degree}")
+        self.grid, self.degree, self.layers = grid, degree, (degree + 1) // 2
+        shape = tuple(n + 2 * self.layers for n in grid.shape)
+        if tuple(coefficients.shape) != shape:
+            raise InputError(f"coefficients: expected the shape {shape} (z, y, x), got {tuple(coefficients.shape)}")
+        self.coefficients = coefficients
+
+    @classmethod
+    def through(cls, values: Float[Tensor, "z y x"], grid: Grid) -> VoxelField:
+        """Return the cubic spline that passes through `values` at the voxel centres, mirrored about the outermost."""
         if tuple(values.shape) != grid.shape:
             raise InputError(f"volume: expected values of shape {grid.shape} (z, y, x), got {tuple(values.shape)}")
-        self.grid = grid
         coefficients = values.to(torch.float64)
         for axis in range(3):
             coefficients = _prefilter(coefficients, axis)
-        self.coefficients = coefficients.to(values.dtype)
+            coefficients = coefficients.index_select(axis, _mirrored(values.shape[axis], 2).to(values.device))
+        return cls(coefficients.to(values.dtype), grid, 3)
+
+    def to(self, device: torch.device | str) -> VoxelField:
+        """Return the same field with its coefficients on another device."""
+        return VoxelField(self.coefficients.to(device), self.grid, self.degree)
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
         box, shape = self.grid.box, points.shape
@@ -44,16 +62,18 @@ class VoxelField(Field):
         inside = torch.minimum(torch.maximum(p, p.new_tensor(box.lower)), p.new_tensor(box.upper))
         position = (inside - p.new_tensor(box.lower)) / p.new_tensor(self.grid.spacing) - 0.5
         cell = position.floor()
-        weights, slopes = _cubic_weights(position - cell)  # (n, 3, 4): axis x, y, z; the four neighbours
+        weights, slopes = spline_weights(position - cell, self.degree)  # (n, 3, degree + 1): axis x, y, z
         slopes = slopes / p.new_tensor(self.grid.spacing)[:, None] * (inside == p)[..., None]
-        nz, ny, nx = self.grid.shape
-        neighbour = cell.long()[..., None] + torch.arange(-1, 3, device=p.device)
-        ix, iy, iz = (_mirror(neighbour[:, a], n) for a, n in ((0, nx), (1, ny), (2, nz)))
+        _, ny, nx = self.coefficients.shape
+        count = self.degree + 1
+        # the first coefficient that counts, among those of all layers
+        ix, iy, iz = (cell.long() + self.layers - self.degree // 2).unbind(-1)
+        along_x = ix[:, None] + torch.arange(count, device=p.device)
         flat = self.coefficients.to(p).reshape(-1)
         value, gx, gy, gz = (torch.zeros_like(p[:, 0]) for _ in range(4))
-        for k in range(4):
-            for j in range(4):
-                line = flat[((iz[:, k] * ny + iy[:, j]) * nx)[:, None] + ix]  # (n, 4) along x
+        for k in range(count):
+            for j in range(count):
+                line = flat[(((iz + k) * ny + iy + j) * nx)[:, None] + along_x]  # (n, degree + 1) along x
                 along, slope = (line * weights[:, 0]).sum(-1), (line * slopes[:, 0]).sum(-1)
                 wy, wz = weights[:, 1, j], weights[:, 2, k]
                 value += along * wy * wz
@@ -63,30 +83,76 @@ class VoxelField(Field):
         return value.reshape(shape[:-1]), torch.stack([gx, gy, gz], dim=-1).reshape(shape)
 
 
-def _prefilter(values: Tensor, axis: int) -> Tensor:
-    """Coefficients c of the spline with (c[i-1] + 4 c[i] + c[i+1]) / 6 = values[i], mirrored at the ends."""
-    n = values.shape[axis]
-    if n == 1:
+@dataclass(frozen=True)
+class Boundary:
+    """How coefficients go on beyond the faces of the box, and with that the gauge.
+
+    Where the index is ambient on a face they are mirrored with the sign changed, so that the field is 0 on that face;
+    on any other face they are mirrored as they are, so that it ends with zero slope.
+
+    Parameters
+    ----------
+    ambient_faces : names such as "x-"
+    """
+
+    ambient_faces: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        parse_faces(self.ambient_faces)
+
+    def _sign(self, axis: int, side: str) -> float:
+        return -1.0 if "zyx"[axis] + side in self.ambient_faces else 1.0
+
+    def extend(self, values: Float[Tensor, "z y x"], layers: int) -> Float[Tensor, "zp yp xp"]:
+        """Return the values with `layers` more beyond each face."""
+        if min(values.shape) < layers:
+            raise InputError(f"grid: expected at least {layers} voxels along each edge, got {tuple(values.shape)}")
+        for axis in range(3):
+            first, last = values.narrow(axis, 0, layers), values.narrow(axis, values.shape[axis] - layers, layers)
+            before, after = first.flip(axis) * self._sign(axis, "-"), last.flip(axis) * self._sign(axis, "+")
+            values = torch.cat([before, values, after], dim=axis)
         return values
-    matrix = torch.zeros(n, n, dtype=values.dtype, device=values.device)
-    matrix.diagonal().fill_(4 / 6)
-    matrix.diagonal(1).fill_(1 / 6)
-    matrix.diagonal(-1).fill_(1 / 6)
-    matrix[0, 1] = matrix[-1, -2] = 2 / 6
-    moved = values.movedim(axis, 0)
-    return torch.linalg.solve(matrix, moved.reshape(n, -1)).reshape(moved.shape).movedim(0, axis)
+
+    def fold(self, extended: Float[Tensor, "zp yp xp"], layers: int) -> Float[Tensor, "z y x"]:
+        """Return the adjoint of `extend`: what lies beyond a face is added to the voxel it mirrors."""
+        for axis in range(3):
+            n = extended.shape[axis] - 2 * layers
+            before, after = extended.narrow(axis, 0, layers), extended.narrow(axis, n + layers, layers)
+            extended = extended.narrow(axis, layers, n).clone()
+            extended.narrow(axis, 0, layers).add_(before.flip(axis), alpha=self._sign(axis, "-"))
+            extended.narrow(axis, n - layers, layers).add_(after.flip(axis), alpha=self._sign(axis, "+"))
+        return extended
 
 
-def _cubic_weights(t: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights of the four neighbours of a point a fraction t beyond the second, and their slopes in t."""
+def spline_weights(t: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """Weights of the neighbours of a point a fraction t beyond the one before it, and their slopes in t.
+
+    The two nearest neighbours for degree 1, four for degree 3; they stand along a new last axis.
+    """
     s = 1 - t
+    if degree == 1:
+        return torch.stack([s, t], dim=-1), torch.stack([-torch.ones_like(t), torch.ones_like(t)], dim=-1)
     weights = torch.stack([s**3, 4 - 6 * t**2 + 3 * t**3, 4 - 6 * s**2 + 3 * s**3, t**3], dim=-1) / 6
     slopes = torch.stack([-(s**2), 3 * t**2 - 4 * t, 4 * s - 3 * s**2, t**2], dim=-1) / 2
     return weights, slopes
 
 
-def _mirror(index: Tensor, n: int) -> Tensor:
-    """Fold indices just beyond the ends back about the end samples."""
+def _prefilter(values: Tensor, axis: int) -> Tensor:
+    """Coefficients c of the spline with (c[i-1] + 4 c[i] + c[i+1]) / 6 = values[i], mirrored at the ends."""
+    n = values.shape[axis]
     if n == 1:
-        return torch.zeros_like(index)
-    return torch.where(index.abs() < n, index.abs(), 2 * (n - 1) - index.abs()).clamp(0, n - 1)
+        return values
+    moved = values.movedim(axis, 0)
+    core = moved.reshape(n, -1)
+    matrix = torch.zeros(n, n, dtype=values.dtype, device=values.device)
+    matrix.diagonal().fill_(4 / 6)
+    matrix.diagonal(1).fill_(1 / 6)
+    matrix.diagonal(-1).fill_(1 / 6)
+    matrix[0, 1] = matrix[-1, -2] = 2 / 6
+    return torch.linalg.solve(matrix, core).reshape(moved.shape).movedim(0, axis)
+
+
+def _mirrored(n: int, layers: int) -> Tensor:
+    """Indices 0 ... n - 1 with `layers` more at both ends, folded back about the end samples."""
+    index = torch.arange(-layers, n + layers).abs()
+    return torch.where(index < n, index, 2 * (n - 1) - index).clamp(0, n - 1)

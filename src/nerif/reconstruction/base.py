@@ -27,7 +27,7 @@ class Outcome:
 
     Parameters
     ----------
-    reason : one word: converged, epochs, steps, time_limit, interrupted or diverged
+    reason : one word: converged, discrepancy, epochs, steps, iterations, time_limit, interrupted or diverged
     message : one sentence, with the remedy where there is one
     """
 
@@ -119,6 +119,10 @@ class Reconstructor(ABC):
 
     @abstractmethod
     def __call__(
-        self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None
+        self,
+        measurement: Measurement,
+        on_step: OnStep | None = None,
+        resume: State | None = None,
+        start: Field | None = None,
     ) -> Reconstruction:
-        """Reconstruct the field of a measurement, from the start or from an earlier State."""
+        """Reconstruct the field of a measurement: from nothing, from an earlier State, or from another field."""

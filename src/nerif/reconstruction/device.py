@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 import platform
 import sys
+from pathlib import Path
 
 import torch
 
 from nerif.conventions import InputError
 
-__all__ = ["autocast_dtype", "keep_freed_memory", "peak_memory", "resolve_device"]
+__all__ = ["autocast_dtype", "available_memory", "keep_freed_memory", "peak_memory", "resolve_device"]
 
 
 def resolve_device(name: str) -> torch.device:
@@ -50,6 +51,21 @@ def autocast_dtype(precision: str, device: torch.device) -> torch.dtype | None:
     if precision == "bf16" or (precision == "auto" and fast):
         return torch.bfloat16
     return None
+
+
+def available_memory(device: torch.device) -> int:
+    """Return the free memory in bytes: of a GPU, or of the machine and what a container or job leaves of it."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    import psutil
+
+    free = int(psutil.virtual_memory().available)
+    try:
+        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+        return free if limit == "max" else min(free, max(0, int(limit) - used))
+    except (OSError, ValueError):  # no such limit here
+        return free
 
 
 def peak_memory(device: torch.device) -> int:

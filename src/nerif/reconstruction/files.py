@@ -11,8 +11,9 @@ import torch
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
+from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
-from nerif.geometry import Box
+from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import Reconstruction, State
 
 __all__ = ["CHECKPOINT", "FIELD", "read_field", "read_state", "write_field", "write_state"]
@@ -21,20 +22,20 @@ FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
 
 
 def write_field(directory: Path, result: Reconstruction) -> None:
-    """Write the weights of a reconstructed network and all that is needed to evaluate it, atomically."""
+    """Write a field, and all that is needed to evaluate it, atomically."""
     field = result.field
-    assert isinstance(field, NeuralField)
-    about = {
-        "kind": "neural",
-        "network": vars(field.network.shape),
-        "box": [field.box.lower, field.box.upper],
-        "index_scale": field.index_scale,
-        "offset": field.offset,
-        "n_ambient": result.n_ambient,
-        "outcome": vars(result.outcome),
-    }
-    tensors = {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}
-    _save(directory / FIELD, tensors, about)
+    about: dict[str, Any] = {"n_ambient": result.n_ambient, "outcome": vars(result.outcome)}
+    if isinstance(field, VoxelField):
+        box = field.grid.box
+        about |= {"kind": "voxels", "shape": field.grid.shape, "degree": field.degree}
+        tensors = {"coefficients": field.coefficients.cpu().contiguous()}
+    else:
+        assert isinstance(field, NeuralField)
+        box = field.box
+        about |= {"kind": "neural", "network": vars(field.network.shape)}
+        about |= {"index_scale": field.index_scale, "offset": field.offset}
+        tensors = {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}
+    _save(directory / FIELD, tensors, {**about, "box": [box.lower, box.upper]})
 
 
 def read_field(directory: Path) -> tuple[Field, Box, float]:
@@ -51,15 +52,16 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         raise InputError(f"{directory}: expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first")
     tensors, about = _load(path)
     try:
+        lower, upper = about["box"]
+        box, n_ambient = Box(tuple(lower), tuple(upper)), float(about["n_ambient"])
+        if about["kind"] == "voxels":
+            grid = Grid(box, tuple(about["shape"]))
+            return VoxelField(tensors["coefficients"], grid, int(about["degree"])), box, n_ambient
         network = Network(NetworkShape(**about["network"]))
         network.load_state_dict(tensors)
-        lower, upper = about["box"]
-        box = Box(tuple(lower), tuple(upper))
-        field = NeuralField(
-            network.eval().requires_grad_(False), box, float(about["index_scale"]), float(about["offset"])
-        )
-        return field, box, float(about["n_ambient"])
-    except (KeyError, TypeError, RuntimeError) as error:
+        network.eval().requires_grad_(False)
+        return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: not a field of this version of nerif ({type(error).__name__}: {error})") from None
 
 

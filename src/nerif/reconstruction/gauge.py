@@ -15,7 +15,16 @@ from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
 
-__all__ = ["AmbientRegion", "visual_hull"]
+__all__ = ["AmbientRegion", "check_gauge", "visual_hull"]
+
+
+def check_gauge(measurement: Measurement, faces: tuple[str, ...], hull: bool = True) -> None:
+    """Refuse a reconstruction of which nothing is known to be ambient."""
+    if not faces and not (hull and measurement.flow_mask is not None):
+        raise InputError(
+            "ambient_faces: expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
+            "fix the index only up to a constant"
+        )
 
 
 def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
@@ -64,11 +73,7 @@ class AmbientRegion:
         empty = torch.zeros(0, 3)
         if measurement.flow_mask is not None:
             empty = grid.points()[~visual_hull(measurement, grid)]
-        if not faces and not len(empty):
-            raise InputError(
-                "ambient_faces: expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
-                "fix the index only up to a constant"
-            )
+        check_gauge(measurement, faces, bool(len(empty)))
         return cls(measurement.box, faces, empty, grid.spacing)
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:

@@ -20,8 +20,9 @@ from nerif.conventions import InputError
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
 from nerif.physics.deflection import integration_weights
+from nerif.reconstruction.target import Target
 
-__all__ = ["Evaluator", "LossWeights", "Target", "loss_terms"]
+__all__ = ["Evaluator", "LossWeights", "loss_terms"]
 
 
 @dataclass(frozen=True)
@@ -58,22 +59,6 @@ class Evaluator(Protocol):
         self, p: Float[Tensor, "n 3"], heads: bool
     ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
         """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """Rays and what they measured.
-
-    Parameters
-    ----------
-    rays : Rays
-    displacement : (n, 2) px
-    inverse_scale : (n, 2) 1/px; residuals are multiplied by it: 1/sigma, scaled so that a zero field has loss 1
-    """
-
-    rays: Rays
-    displacement: Float[Tensor, "n 2"]
-    inverse_scale: Float[Tensor, "n 2"]
 
 
 def loss_terms(

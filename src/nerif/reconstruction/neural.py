@@ -12,13 +12,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError, parse_faces
+from nerif.fields.base import Field
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.measurement import Measurement
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.device import autocast_dtype, peak_memory, resolve_device
 from nerif.reconstruction.gauge import AmbientRegion
-from nerif.reconstruction.losses import LossWeights, Target, loss_terms
+from nerif.reconstruction.losses import LossWeights, loss_terms
 from nerif.reconstruction.sampling import sample_count, sample_rays
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.warm_start import fit_network
 
 __all__ = ["NeRIF"]
 
@@ -70,6 +73,10 @@ class NeRIF(Reconstructor):
     """Stop after so many seconds; 0 for no limit."""
     stop_ratio: float = 0.0
     """Stop when the loss is below this share of the initial loss; 0 never (paper: 0.005)."""
+    fit_steps: int = 400
+    """Steps in which the network is fitted to the field it starts from (--start-from)."""
+    rate_after_fit: float = 0.3
+    """Share of the learning rate that a run goes on with from such a start."""
     ambient_faces: tuple[str, ...] = ()
     """Faces on which the index is ambient; empty: those of the measurement."""
     open_faces: tuple[str, ...] = ()
@@ -89,7 +96,7 @@ class NeRIF(Reconstructor):
         for name, allowed in CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
-        for name in ("epochs", "learning_rate", "points_per_batch"):
+        for name in ("epochs", "learning_rate", "points_per_batch", "fit_steps", "rate_after_fit"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("max_steps", "time_limit", "stop_ratio", "sample_jitter"):
@@ -110,26 +117,32 @@ class NeRIF(Reconstructor):
         parse_faces(self.open_faces, "open_faces")
 
     def __call__(
-        self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None
+        self,
+        measurement: Measurement,
+        on_step: OnStep | None = None,
+        resume: State | None = None,
+        start: Field | None = None,
     ) -> Reconstruction:
-        return _Training(self, measurement, resume).run(on_step)
+        return _Training(self, measurement, resume, start).run(on_step)
 
 
 class _Training:
     """One run: the data, the network, Adam, and the loop."""
 
-    def __init__(self, settings: NeRIF, measurement: Measurement, resume: State | None) -> None:
+    def __init__(
+        self, settings: NeRIF, measurement: Measurement, resume: State | None, start: Field | None = None
+    ) -> None:
         self.settings, self.measurement = settings, measurement
         self.device = resolve_device(settings.device)
         self.generator = torch.Generator().manual_seed(settings.seed)
         faces = settings.ambient_faces or measurement.ambient_faces
         self.ambient = AmbientRegion.of(measurement, faces)
-        self.target, index_scale = _targets(settings, measurement, self.device)
-        self.count = len(self.target.rays)
+        self.target = Target.of(measurement, settings.open_faces).to(self.device)
+        self.count = len(self.target)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
             network = Network(settings.network)
-        self.field = NeuralField(network.to(self.device), measurement.box, index_scale)
+        self.field = NeuralField(network.to(self.device), measurement.box, self.target.index_scale)
         self.adam = torch.optim.Adam(network.parameters(), lr=settings.learning_rate, betas=settings.betas)
         self.network = _MixedPrecision(settings, network, self.device)
         self.history: list[dict[str, float]] = []
@@ -139,6 +152,8 @@ class _Training:
         self.spent, self.started = 0.0, time.perf_counter()
         if resume is not None:
             self._restore(resume)
+        elif start is not None:
+            self._fit(start)
         self.good = self._capture()
 
     # -- the loop ------------------------------------------------------------------------------------------------
@@ -176,6 +191,22 @@ class _Training:
                 outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
         return self._result(outcome)
 
+    def _fit(self, start: Field) -> None:
+        """Fit the network to the field that the run starts from; the steps after it are smaller."""
+        settings, half = self.settings, 0.5 * self.settings.time_limit or math.inf
+
+        def log(step: int, loss: float) -> bool:
+            if step % LOG_EVERY == 0 or step == 1:
+                self.history.append({**self._where(), "fit_step": float(step), "fit_loss": loss})
+            return self.seconds >= half
+
+        self.network.low = True
+        fit_network(
+            self.field, self.network, start, settings.fit_steps, settings.points_per_batch, settings.learning_rate,
+            self.generator, log,
+        )  # fmt: skip
+        self.rate = settings.rate_after_fit
+
     def _batch(self) -> tuple[Target, int]:
         """The next rays of this epoch's random order, and the number of samples each gets."""
         settings = self.settings
@@ -185,9 +216,7 @@ class _Training:
             self.order = torch.cat([self.order, torch.randperm(self.count, generator=self.generator)])
         index, self.order = self.order[:rays], self.order[rays:]
         self.rays_done += rays
-        t = self.target
-        index = index.to(self.device)
-        return Target(t.rays[index], t.displacement[index], t.inverse_scale[index]), count
+        return self.target[index.to(self.device)], count
 
     def _terms(self, target: Target, s: Tensor, interval: Tensor) -> dict[str, Tensor]:
         settings = self.settings
@@ -336,26 +365,6 @@ class _Training:
         """Mean network output over the ambient region: the constant that the data leave open."""
         points = self.ambient.sample(1 << 14, torch.Generator().manual_seed(0)).to(self.device)
         return float(self.field.network(self.field.normalise(points)).mean())
-
-
-def _targets(settings: NeRIF, measurement: Measurement, device: torch.device) -> tuple[Target, float]:
-    """The usable rays with their data, and the index excess that makes displacements of the size measured."""
-    rays, displacement, sigma = measurement.rays()
-    keep = ~rays.exit_faces(measurement.box, settings.open_faces)
-    if not bool(keep.any()):
-        raise InputError("open_faces: every ray crosses one of them, so none is left; name fewer faces")
-    rays, displacement = rays[keep], displacement[keep]
-    rms = float(displacement.square().mean().sqrt())
-    if rms == 0:
-        rms = 1.0  # no displacement at all: the answer is the ambient index, in whatever scale
-    lever = rays.background - 0.5 * (rays.near + rays.far)
-    pixels_per_radian = lever * rays.sensitivity.norm(dim=(1, 2)) / math.sqrt(2)
-    index_scale = float((displacement / pixels_per_radian[:, None]).square().mean().sqrt()) or 1e-6
-    inverse_scale = torch.full_like(displacement, 1 / rms)
-    if sigma is not None:
-        inverse = 1 / sigma[keep]
-        inverse_scale = inverse / float((displacement * inverse).square().mean().sqrt() or 1.0)
-    return Target(rays.to(device), displacement.to(device), inverse_scale.to(device)), index_scale
 
 
 class _MixedPrecision:

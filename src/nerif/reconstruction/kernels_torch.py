@@ -1,0 +1,82 @@
+"""The path integral through a voxel grid and its adjoint in plain PyTorch: for CUDA, and to compare with.
+
+See kernels_numba.py for the same on all cores of a CPU. Along ray r the samples m = 0 ... count - 1 stand at
+
+    x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array),   w_m = lever_0 + m lever_1
+
+and d = matrix sum_m w_m grad n(x_m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.fields.grid import spline_weights
+
+__all__ = ["adjoint", "forward"]
+
+POINTS = {"cpu": 1 << 14, "cuda": 1 << 22}
+"""Samples taken at a time: what stays in the cache of a CPU, and fills a GPU."""
+
+
+def forward(degree: int, padded: Tensor, rays: tuple[Tensor, ...], displacement: Float[Tensor, "n 2"]) -> None:
+    """Write the displacement of each ray through the padded coefficients (z, y, x)."""
+    flat, shape = padded.reshape(-1), padded.shape
+    for part, (start, stride, lever, matrix, count) in _chunks(rays):
+        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, lever, count)
+        gx, gy, gz = (torch.zeros_like(w) for _ in range(3))
+        for k in range(degree + 1):
+            for j in range(degree + 1):
+                line = flat[_line(index, k, j, shape, degree)]
+                along, slope = (line * bx).sum(-1), (line * sx).sum(-1)
+                gx += slope * by[..., j] * bz[..., k]
+                gy += along * sy[..., j] * bz[..., k]
+                gz += along * by[..., j] * sz[..., k]
+        q = torch.stack([(w * g).sum(-1) for g in (gx, gy, gz)], dim=-1)
+        displacement[part] = torch.einsum("nij,nj->ni", matrix, q)
+
+
+def adjoint(degree: int, displacement: Float[Tensor, "n 2"], rays: tuple[Tensor, ...], padded: Tensor) -> None:
+    """Add to the padded coefficients (z, y, x) what the adjoint makes of displacements."""
+    flat, shape = padded.reshape(-1), padded.shape
+    for part, (start, stride, lever, matrix, count) in _chunks(rays):
+        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, lever, count)
+        ax, ay, az = (w * q[:, None] for q in torch.einsum("nij,ni->nj", matrix, displacement[part]).unbind(-1))
+        for k in range(degree + 1):
+            for j in range(degree + 1):
+                slope = ax * by[..., j] * bz[..., k]
+                along = ay * sy[..., j] * bz[..., k] + az * by[..., j] * sz[..., k]
+                share = slope[..., None] * sx + along[..., None] * bx
+                flat.index_add_(0, _line(index, k, j, shape, degree).reshape(-1), share.reshape(-1))
+
+
+def _chunks(rays: tuple[Tensor, ...]) -> Iterator[tuple[slice, list[Tensor]]]:
+    count = rays[-1]
+    longest = max(1, int(count.max())) if len(count) else 1
+    size = max(1, POINTS.get(count.device.type, 1 << 14) // longest)
+    for first in range(0, len(count), size):
+        part = slice(first, first + size)
+        yield part, [a[part] for a in rays]
+
+
+def _samples(
+    degree: int, start: Tensor, stride: Tensor, lever: Tensor, count: Tensor
+) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
+    """First neighbour, weights and slopes along x, y, z, and w of every sample; w = 0 beyond a ray's own count."""
+    m = torch.arange(max(1, int(count.max())), device=start.device)
+    step = torch.minimum(m, (count[:, None] - 1).clamp_min(0)).to(start)
+    x = start[:, None] + step[..., None] * stride[:, None]
+    cell = x.floor()
+    weights, slopes = spline_weights(x - cell, degree)
+    w = (lever[:, :1] + step * lever[:, 1:]) * (m < count[:, None])
+    return cell.long(), weights.unbind(-2), slopes.unbind(-2), w
+
+
+def _line(index: Tensor, k: int, j: int, shape: torch.Size, degree: int) -> Tensor:
+    """Flat indices of the neighbours along x, k planes and j rows on from the first."""
+    first = ((index[..., 2] + k) * shape[1] + index[..., 1] + j) * shape[2] + index[..., 0]
+    return first[..., None] + torch.arange(degree + 1, device=index.device)

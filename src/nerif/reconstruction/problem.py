@@ -1,0 +1,216 @@
+"""The linear least-squares problem that the classical methods share, on one grid and in numbers of order one.
+
+    min_x  |F x - b|^2 + weight R(x),     F = (1/sigma) A index_scale / sqrt(N),   b = (1/sigma) d / sqrt(N), |b| = 1
+
+x is the index excess over index_scale, one coefficient a voxel; N counts displacement components; lengths in the
+penalties are in units of the box (cube root of its volume), and sums over voxels are means, so that a weight means the
+same on every grid. Voxels that are not free are ambient: x = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.fields.grid import Boundary
+from nerif.geometry import Grid
+from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reconstruction.target import Target
+
+__all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients"]
+
+Bounds = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Where a method stands after an iteration.
+
+    Parameters
+    ----------
+    x : (z, y, x) scaled coefficients
+    residual : |F x - b|^2; 1 for the zero field
+    penalty : R(x)
+    """
+
+    x: Tensor
+    residual: float
+    penalty: float
+
+
+class Differences:
+    """The gradient of a voxel field in units of the box edge: differences between neighbours, and their adjoint.
+
+        (D_x c)_i = (edge / h_x) (c_i - c_{i-1}),     at the n + 1 faces of the n voxels along x
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : what lies beyond the faces of the box
+    """
+
+    def __init__(self, grid: Grid, boundary: Boundary) -> None:
+        self.boundary, self.shape = boundary, grid.shape
+        edge = math.prod(grid.box.edges) ** (1 / 3)
+        hx, hy, hz = grid.spacing
+        self.inverse = (edge / hz, edge / hy, edge / hx)
+
+    def __call__(self, x: Float[Tensor, "z y x"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the differences along z, y and x."""
+        padded = self.boundary.extend(x, 1)
+        along = []
+        for axis in range(3):
+            inner = padded
+            for other in range(3):
+                if other != axis:
+                    inner = inner.narrow(other, 1, self.shape[other])
+            along.append(torch.diff(inner, dim=axis) * self.inverse[axis])
+        return along[0], along[1], along[2]
+
+    def adjoint(self, along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y x"]:
+        """Return the adjoint of the differences (minus the divergence)."""
+        padded = along[0].new_zeros([n + 2 for n in self.shape])
+        for axis in range(3):
+            inner = padded
+            for other in range(3):
+                if other != axis:
+                    inner = inner.narrow(other, 1, self.shape[other])
+            n = self.shape[axis] + 1
+            inner.narrow(axis, 1, n).add_(along[axis], alpha=self.inverse[axis])
+            inner.narrow(axis, 0, n).sub_(along[axis], alpha=self.inverse[axis])
+        return self.boundary.fold(padded, 1)
+
+
+class Problem:
+    """The data and the operator on one grid; see the head of this file.
+
+    Parameters
+    ----------
+    operator : DeflectionOperator
+    target : Target, on the operator's device
+    free : (z, y, x) voxels that are not pinned to the ambient index, or None for all
+    bounds : lowest and highest index excess, or None
+    """
+
+    def __init__(
+        self,
+        operator: DeflectionOperator,
+        target: Target,
+        free: Bool[Tensor, "z y x"] | None = None,
+        bounds: Bounds | None = None,
+    ) -> None:
+        self.operator, self.target, self.scale = operator, target, target.index_scale
+        self.differences = Differences(operator.grid, operator.boundary)
+        self.voxels = math.prod(operator.grid.shape)
+        self._free = None if free is None else free.to(operator.device, operator.dtype)
+        self._inverse = (target.inverse_scale / math.sqrt(2 * len(target))).to(operator.device, operator.dtype)
+        self.data = self._inverse * target.displacement.to(operator.device, operator.dtype)
+        self.bounds = None if bounds is None else (bounds[0] / self.scale, bounds[1] / self.scale)
+
+    def forward(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "n 2"]:
+        """Return F x."""
+        return self.operator(self.pin(x) * self.scale) * self._inverse
+
+    def adjoint(self, y: Float[Tensor, "n 2"]) -> Float[Tensor, "z y x"]:
+        """Return F^T y."""
+        return self.pin(self.operator.T(y * self._inverse) * self.scale)
+
+    def pin(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
+        """Return x with 0, the ambient index, where it is not free."""
+        return x if self._free is None else x * self._free
+
+    def clip(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
+        """Return x within the bounds and pinned."""
+        return self.pin(x) if self.bounds is None else self.pin(x.clamp(*self.bounds))
+
+    def random(self) -> Float[Tensor, "z y x"]:
+        """Return a random field, the same every time: where the power method starts."""
+        x = torch.rand(self.operator.domain_shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        return self.pin(x.to(self.operator.device, self.operator.dtype))
+
+    def zero(self) -> Float[Tensor, "z y x"]:
+        """Return the ambient field."""
+        return torch.zeros(self.operator.domain_shape, dtype=self.operator.dtype, device=self.operator.device)
+
+
+class Penalty:
+    """A quadratic penalty R(x) = |L x|^2, a mean over voxels.
+
+    Parameters
+    ----------
+    problem : Problem
+    kind : "identity" (L = 1), "gradient" (L = edge grad) or "laplacian" (L = edge^2 div grad)
+    face_weights : for "gradient": weights of the squares at the faces along z, y, x; None for 1
+    """
+
+    KINDS = ("identity", "gradient", "laplacian")
+
+    def __init__(self, problem: Problem, kind: str, face_weights: tuple[Tensor, Tensor, Tensor] | None = None) -> None:
+        self.problem, self.kind = problem, kind
+        self.root = 1 / math.sqrt(problem.voxels)
+        self.roots = None if face_weights is None else tuple(w.sqrt() for w in face_weights)
+
+    def __call__(self, x: Float[Tensor, "z y x"]) -> tuple[Tensor, ...]:
+        """Return L x."""
+        if self.kind == "identity":
+            return (x * self.root,)
+        along = self.problem.differences(x)
+        if self.kind == "laplacian":
+            return (self.problem.differences.adjoint(along) * self.root,)
+        if self.roots is None:
+            return tuple(a * self.root for a in along)
+        return tuple(a * (w * self.root) for a, w in zip(along, self.roots, strict=True))
+
+    def adjoint(self, y: tuple[Tensor, ...]) -> Float[Tensor, "z y x"]:
+        """Return L^T y."""
+        if self.kind == "identity":
+            return y[0] * self.root
+        if self.kind == "laplacian":
+            return self.problem.differences.adjoint(self.problem.differences(y[0] * self.root))
+        if self.roots is None:
+            y = tuple(a * self.root for a in y)
+        else:
+            y = tuple(a * (w * self.root) for a, w in zip(y, self.roots, strict=True))
+        return self.problem.differences.adjoint((y[0], y[1], y[2]))
+
+
+def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
+    """Minimise |F x - b|^2 + weight |L x|^2 by conjugate gradients on the least-squares problem (CGLS), without end.
+
+        alpha = |s|^2 / (|F p|^2 + weight |L p|^2),    x <- x + alpha p,    r <- r - alpha F p
+        s = F^T r - weight L^T L x,                    p <- s + (|s|^2 / |s_last|^2) p
+
+    Where bounds are given, voxels at a bound towards which the objective falls are held there; the others may pass a
+    bound, so the caller clips and begins anew.
+
+    Source: Bjorck, Numerical Methods for Least Squares Problems (SIAM, 1996), Sec. 7.4.
+    """
+    r = problem.data - problem.forward(x)
+    q = tuple(-a for a in penalty(x))
+    s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q))
+    hold = torch.ones_like(x)
+    if problem.bounds is not None:
+        low, high = problem.bounds
+        hold = (~((x <= low) & (s < 0)) & ~((x >= high) & (s > 0))).to(x)
+    s = s * hold
+    p, gamma = s.clone(), float(s.square().sum())
+    while True:
+        if gamma > 0:
+            fp, lp = problem.forward(p), penalty(p)
+            alpha = gamma / (_square(fp) + weight * sum(_square(a) for a in lp))
+            x = x + alpha * p
+            r = r - alpha * fp
+            q = tuple(a - alpha * b for a, b in zip(q, lp, strict=True))
+        yield Iterate(x, _square(r), sum(_square(a) for a in q))
+        s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q)) * hold
+        last, gamma = gamma, float(s.square().sum())
+        p = s + (gamma / last if last > 0 else 0.0) * p
+
+
+def _square(x: Tensor) -> float:
+    return float(x.square().sum())

@@ -1,0 +1,386 @@
+"""What the classical methods share: a voxel grid, coarse to fine, and a loop that watches over the iterations.
+
+A method is a generator of iterates (tikhonov.py, landweber.py, total_variation.py); everything else is here.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as functional
+from jaxtyping import Bool
+from torch import Tensor
+
+from nerif.conventions import InputError, parse_faces
+from nerif.fields.base import Field
+from nerif.fields.grid import DEGREES, Boundary
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
+from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step
+from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
+from nerif.reconstruction.gauge import check_gauge, visual_hull
+from nerif.reconstruction.operator import MODELS, STEP, DeflectionOperator
+from nerif.reconstruction.problem import Iterate, Problem
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.weight import FIRST, choose_weight
+
+__all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
+
+COARSEST = 12  # voxels along the longest edge of the first grid, at least
+STALLED = 3  # iterations in a row that gain less than the tolerance
+VOLUMES = 22  # arrays the size of the grid that the hungriest method holds at once (tests/reconstruction)
+DATA = 8  # arrays the size of the data
+
+
+@dataclass(frozen=True)
+class VoxelReconstructor(Reconstructor):
+    """Settings of every classical method."""
+
+    voxels: int = 100
+    """Voxels along the longest edge of the box, of the reconstruction and of the written volume."""
+    basis: Literal["linear", "cubic"] = "linear"
+    """Between voxel centres: trilinear, or cubic B-splines (smoother, four to five times slower)."""
+    model: Literal["lever_arm", "paraxial"] = "lever_arm"
+    """Forward model."""
+    step: float = STEP
+    """Longest distance between samples along a ray, in voxels."""
+    coarse_to_fine: bool = True
+    """Start on a coarse grid and halve the voxels from solution to solution."""
+    tolerance: float = 1e-4
+    """Converged when three iterations in a row lower the objective by less than this share."""
+    time_limit: float = 0.0
+    """Stop after so many seconds; 0 for no limit."""
+    lower: float | None = None
+    """Lowest index excess, if known (of hot gas in air: -2.7e-4)."""
+    upper: float | None = None
+    """Highest index excess, if known (of hot gas in air: 0)."""
+    hull: bool = True
+    """Pin voxels outside the visual hull to the ambient index, where the measurement has flow masks."""
+    ambient_faces: tuple[str, ...] = ()
+    """Faces on which the index is ambient; empty: those of the measurement."""
+    open_faces: tuple[str, ...] = ()
+    """Faces through which flow leaves the box; rays that cross them are dropped."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1, ..."""
+    precision: Literal["float32", "float64"] = "float32"
+    """Of voxels and data."""
+    iterations: int = 50
+    """Most iterations on each grid and with each weight."""
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("basis", tuple(DEGREES)), ("model", MODELS), ("precision", ("float32", "float64"))):
+            if getattr(self, name) not in allowed:
+                raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
+        for name in ("voxels", "iterations"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if not self.step > 0:
+            raise InputError(f"step: expected above 0 voxels, got {self.step}")
+        for name in ("tolerance", "time_limit"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        low, high = self._bounds()
+        if not low <= 0 <= high or low == high:
+            raise InputError(
+                "lower, upper: expected bounds of the index excess around 0, the ambient, "
+                f"got {self.lower} to {self.upper}"
+            )
+        parse_faces(self.ambient_faces)
+        parse_faces(self.open_faces, "open_faces")
+
+    def _bounds(self) -> tuple[float, float]:
+        return (
+            -math.inf if self.lower is None else self.lower,
+            math.inf if self.upper is None else self.upper,
+        )
+
+    @property
+    def weight(self) -> float | None:
+        """Weight of the penalty, or None where it is to be chosen."""
+        return 0.0
+
+    @abstractmethod
+    def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
+        """Yield one iterate after another, from x, without end."""
+
+    def memory_bytes(self, measurement: Measurement, grid: Grid) -> int:
+        """Return what a run will need at most, beside what the process holds already."""
+        rays, size = int(measurement.usable.sum()), 4 if self.precision == "float32" else 8
+        dtype = torch.float32 if size == 4 else torch.float64
+        operator = DeflectionOperator.memory_bytes(rays, grid, self.basis, dtype)
+        preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
+        return operator + VOLUMES * math.prod(grid.shape) * size + DATA * 2 * rays * size + preparing
+
+    def __call__(
+        self,
+        measurement: Measurement,
+        on_step: OnStep | None = None,
+        resume: State | None = None,
+        start: Field | None = None,
+    ) -> Reconstruction:
+        return _Run(self, measurement, on_step, resume, start)()
+
+
+@dataclass(frozen=True)
+class WeightedVoxelReconstructor(VoxelReconstructor):
+    """Settings of a method with a penalty."""
+
+    regularisation: Literal["auto"] | float = "auto"
+    """Weight of the penalty, or auto: by the discrepancy principle where sigma is known, else by the L-curve."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.regularisation != "auto" and not (
+            isinstance(self.regularisation, int | float) and 0 <= self.regularisation < math.inf
+        ):
+            raise InputError(f"regularisation: expected auto or a weight of 0 or more, got {self.regularisation}")
+
+    @property
+    def weight(self) -> float | None:
+        return None if self.regularisation == "auto" else float(self.regularisation)
+
+
+class _Stop(Exception):
+    """Asked to stop, or out of time."""
+
+
+class _Run:
+    """One run: the grids, the iterations, and what is told of them."""
+
+    def __init__(
+        self,
+        settings: VoxelReconstructor,
+        measurement: Measurement,
+        on_step: OnStep | None,
+        resume: State | None,
+        start: Field | None,
+    ) -> None:
+        self.settings, self.measurement, self.on_step, self.field_before = settings, measurement, on_step, start
+        self.device = resolve_device(settings.device)
+        self.faces = settings.ambient_faces or measurement.ambient_faces
+        check_gauge(measurement, self.faces, settings.hull)
+        self.grids = _grids(measurement, settings, start)
+        needed, there = settings.memory_bytes(measurement, self.grids[-1]), available_memory(self.device)
+        if needed > there:
+            raise InputError(
+                f"voxels: a grid of {' x '.join(map(str, self.grids[-1].shape))} would need "
+                f"{needed / 2**30:.1f} GiB on {self.device}, which has {there / 2**30:.1f} GiB free; "
+                f"give fewer --voxels than {settings.voxels}"
+            )
+        self.free = (
+            visual_hull(measurement, self.grids[-1]) if settings.hull and measurement.flow_mask is not None else None
+        )
+        self.target = Target.of(measurement, settings.open_faces).to(self.device)
+        self.noise = None if self.target.chi_square_scale is None else 1 / self.target.chi_square_scale
+        self.history: list[dict[str, float]] = []
+        self.level, self.done, self.total = 0, 0, 0
+        self.weight = settings.weight
+        self.chosen = ""
+        self.x: Tensor | None = None
+        self.spent, self.started = 0.0, time.perf_counter()
+        if resume is not None:
+            self._restore(resume)
+
+    # -- the way from coarse to fine -------------------------------------------------------------------------------
+
+    def __call__(self) -> Reconstruction:
+        """Solve on one grid after the other, and return what there is when something says stop."""
+        outcome = None
+        try:
+            while True:
+                problem = self._problem(self.grids[self.level])
+                x = self._begin(problem)
+                if self.level < len(self.grids) - 1:
+                    self._solve(problem, x, FIRST if self.weight is None else self.weight)
+                    self.level, self.done = self.level + 1, 0
+                    continue
+                converged = self._finest(problem, x)
+                break
+        except _Stop as stop:
+            outcome = Outcome(*stop.args)
+        return self._result(outcome or self._outcome(converged))
+
+    def _finest(self, problem: Problem, x: Tensor) -> bool:
+        """Solve on the last grid, with the weight that the data ask for; whether it converged."""
+        if self.weight is None:
+
+            def solve(weight: float, x: Tensor) -> Iterate:
+                self.done = 0
+                return self._solve(problem, x, weight, 10 * self.settings.tolerance)[0]
+
+            choice = choose_weight(solve, x, self.noise)
+            self.weight, self.chosen, x, self.done = choice.weight, choice.reason, choice.x, 0
+        return self._solve(problem, x, self.weight)[1]
+
+    def _begin(self, problem: Problem) -> Tensor:
+        """Where to start on a grid: a checkpoint, a given field, the solution on the grid before, or nothing."""
+        shape = problem.operator.domain_shape
+        if self.x is not None and tuple(self.x.shape) == shape:
+            return self.x.to(problem.operator.device, problem.operator.dtype)
+        if self.x is not None:
+            before = self._operator(self.grids[self.level - 1])
+            field: Field = before.field(self.x * self.target.index_scale)
+        elif self.field_before is not None:
+            field = self.field_before
+        else:
+            return problem.zero()
+        values = field.sample(problem.operator.grid, self.device).to(problem.operator.device, problem.operator.dtype)
+        return problem.clip(values / self.target.index_scale)
+
+    def _operator(self, grid: Grid) -> DeflectionOperator:
+        settings = self.settings
+        return DeflectionOperator(
+            self.target.rays, grid, self.measurement.n_ambient, settings.model, settings.basis, Boundary(self.faces),
+            settings.step, self.device, getattr(torch, settings.precision),
+        )  # fmt: skip
+
+    def _problem(self, grid: Grid) -> Problem:
+        free = None if self.free is None else _coarser(self.free, grid)
+        low, high = self.settings._bounds()
+        bounded = math.isfinite(low) or math.isfinite(high)
+        return Problem(self._operator(grid), self.target, free, (low, high) if bounded else None)
+
+    # -- the loop ------------------------------------------------------------------------------------------------
+
+    def _solve(
+        self, problem: Problem, x: Tensor, weight: float, tolerance: float | None = None
+    ) -> tuple[Iterate, bool]:
+        """Iterate until it converges or the iterations are used up; which, is told."""
+        settings, last, stalled = self.settings, math.inf, 0
+        tolerance = settings.tolerance if tolerance is None else tolerance
+        for iterate in settings.iterate(problem, x, weight):
+            self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
+            objective = iterate.residual + weight * iterate.penalty
+            stalled = stalled + 1 if last - objective < tolerance * objective else 0
+            last = objective
+            self._tell(problem, iterate, weight, objective)
+            if not math.isfinite(objective):
+                raise _Stop("diverged", "the objective turned non-finite; look for extreme displacements or sigma")
+            converged = stalled >= STALLED
+            if settings.weight == 0.0 and self.noise is not None and iterate.residual <= self.noise:
+                self.chosen, converged = "residual is the noise (discrepancy principle)", True
+            if converged or self.done >= settings.iterations:
+                return iterate, converged
+        raise AssertionError("a method iterates without end")
+
+    def _tell(self, problem: Problem, iterate: Iterate, weight: float, objective: float) -> None:
+        """Record the iteration, tell the callback, and stop where that or the clock asks for it."""
+        voxels = float(max(problem.operator.domain_shape))
+        record = {
+            "step": float(self.total),
+            "seconds": self.seconds,
+            "voxels": voxels,
+            "weight": weight,
+            "residual": math.sqrt(iterate.residual),
+            "penalty": iterate.penalty,
+            "objective": objective,
+        }
+        if self.noise is not None:
+            record["residual_over_sigma"] = math.sqrt(iterate.residual / self.noise)
+        self.history.append(record)
+        losses = {k: v for k, v in record.items() if k in ("voxels", "weight", "residual", "residual_over_sigma")}
+        speed = len(self.target) * self.total / max(self.seconds, 1e-9)
+        limit = self.settings.time_limit
+        progress = self._progress()
+        step = Step(self.total, float(self.total), self.seconds, progress, losses, speed, self._capture)
+        if self.on_step is not None and self.on_step(step):
+            raise _Stop("interrupted", f"stopped on request at {voxels:.0f} voxels; --resume goes on from here")
+        if limit and self.seconds >= limit:
+            raise _Stop(
+                "time_limit", f"time limit of {limit:g} s reached at {voxels:.0f} voxels; more time may give more"
+            )
+
+    def _progress(self) -> float:
+        """Share of the work done, at worst: the cost of a grid goes with its voxels along an edge."""
+        work = [max(g.shape) * self.settings.iterations for g in self.grids]
+        trials = 8 if self.settings.weight is None else 1
+        work[-1] *= trials
+        here = max(self.grids[self.level].shape)
+        done = sum(work[: self.level]) + here * min(self._on_this_grid(), work[self.level] // here)
+        share = done / sum(work)
+        limit = self.settings.time_limit
+        return min(1.0, max(share, self.seconds / limit if limit else 0.0))
+
+    def _on_this_grid(self) -> int:
+        voxels = float(max(self.grids[self.level].shape))
+        return sum(1 for record in self.history if record["voxels"] == voxels)
+
+    @property
+    def seconds(self) -> float:
+        """Spent, earlier parts of a resumed run included."""
+        return self.spent + time.perf_counter() - self.started
+
+    # -- what is kept --------------------------------------------------------------------------------------------
+
+    def _capture(self) -> State:
+        assert self.x is not None
+        scalars: dict[str, Any] = {name: getattr(self, name) for name in ("level", "done", "total", "weight", "chosen")}
+        scalars |= {"method": type(self.settings).__name__, "seconds": self.seconds, "history": list(self.history)}
+        return State({"x": self.x.detach().clone()}, scalars)
+
+    def _restore(self, state: State) -> None:
+        scalars = dict(state.scalars)
+        shapes = [g.shape for g in self.grids]
+        level = scalars.get("level", -1)
+        if (
+            scalars.pop("method", None) != type(self.settings).__name__
+            or not 0 <= level < len(shapes)
+            or tuple(state.tensors["x"].shape) != shapes[level]
+        ):
+            raise InputError("resume: the checkpoint is of another method or grid; give the same settings")
+        self.x = state.tensors["x"].clone()
+        self.spent, self.started = scalars.pop("seconds"), time.perf_counter()
+        self.history = list(scalars.pop("history"))
+        for name, value in scalars.items():
+            setattr(self, name, value)
+        if self.settings.weight is not None:
+            self.weight = self.settings.weight
+
+    def _outcome(self, converged: bool) -> Outcome:
+        chosen = f"; weight {self.weight:.3g}: {self.chosen}" if self.settings.weight is None else ""
+        if converged and self.chosen and self.settings.weight is not None:
+            return Outcome("discrepancy", self.chosen)
+        if converged:
+            text = f"the objective falls by less than {self.settings.tolerance:g} an iteration"
+            return Outcome("converged", text + chosen)
+        text = f"all {self.settings.iterations} iterations done; more --iterations may give more"
+        return Outcome("iterations", text + chosen)
+
+    def _result(self, outcome: Outcome) -> Reconstruction:
+        assert self.x is not None
+        operator = self._operator(self.grids[self.level])
+        return Reconstruction(
+            field=operator.field(self.x * self.target.index_scale).to("cpu"),
+            box=self.measurement.box,
+            n_ambient=self.measurement.n_ambient,
+            history=self.history,
+            outcome=outcome,
+            settings=asdict(self.settings),
+            seconds=self.seconds,
+            peak_memory_bytes=peak_memory(self.device),
+            device=str(self.device),
+            state=self._capture(),
+        )
+
+
+def _grids(measurement: Measurement, settings: VoxelReconstructor, start: Field | None) -> list[Grid]:
+    """The grids to solve on, coarse to fine."""
+    finest = Grid.of_resolution(measurement.box, settings.voxels)
+    grids = [finest]
+    while settings.coarse_to_fine and start is None and max(grids[0].shape) >= 2 * COARSEST:
+        nz, ny, nx = grids[0].shape
+        grids.insert(0, Grid(finest.box, (max(4, nz // 2), max(4, ny // 2), max(4, nx // 2))))
+        if min(grids[0].shape) <= 4:
+            break
+    return grids
+
+
+def _coarser(free: Bool[Tensor, "z y x"], grid: Grid) -> Bool[Tensor, "Z Y X"]:
+    """Return a mask on a coarser grid: a voxel is free where any in its place is."""
+    return functional.adaptive_max_pool3d(free[None, None].float(), grid.shape)[0, 0] > 0

@@ -1,0 +1,64 @@
+"""Starting the network from a field that is there already, such as a classical reconstruction of the same data.
+
+min  mean (N - n)^2 / mean n^2  +  mean |grad N - grad n|^2 / mean |grad n|^2       over random points of the box
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from nerif.fields.base import Field
+from nerif.fields.mlp import NeuralField
+from nerif.reconstruction.losses import Evaluator
+
+__all__ = ["fit_network"]
+
+WARM_UP = 20  # steps
+
+
+def fit_network(
+    field: NeuralField,
+    network: Evaluator,
+    start: Field,
+    steps: int,
+    points_per_batch: int,
+    learning_rate: float,
+    generator: torch.Generator,
+    on_step: Callable[[int, float], bool] = lambda step, loss: False,
+) -> None:
+    """Fit the network of a field to another field, values and gradients, by Adam.
+
+    Parameters
+    ----------
+    field : whose network is fitted, in its own scale
+    network : evaluates that network (in the precision that the run asks for)
+    start : Field to fit to; evaluated where the points are, in chunks
+    steps, points_per_batch, learning_rate : of the fit; the rate falls to a tenth by a cosine
+    generator : draws the points
+    on_step : called with the step and the loss; True ends the fit
+    """
+    adam = torch.optim.Adam(field.network.parameters(), lr=learning_rate)
+    device = next(field.network.parameters()).device
+    lower, edges = torch.tensor(field.box.lower), torch.tensor(field.box.edges)
+    for step in range(steps):
+        points = (lower + edges * torch.rand(points_per_batch, 3, generator=generator)).to(device)
+        with torch.no_grad():
+            value, gradient = start.value_and_gradient(points)
+            value, gradient = value / field.index_scale, gradient * (field.half_edge / field.index_scale)
+            tiny = torch.finfo(value.dtype).tiny
+            value_scale = 1 / value.square().mean().clamp_min(tiny)
+            gradient_scale = 1 / gradient.square().sum(-1).mean().clamp_min(tiny)
+        guess, slope, _ = network.value_and_gradient(field.normalise(points), False)
+        loss = (guess.float() - value).square().mean() * value_scale
+        loss = loss + (slope.float() - gradient).square().sum(-1).mean() * gradient_scale
+        for group in adam.param_groups:
+            cosine = 0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * step / steps))
+            group["lr"] = learning_rate * cosine * min(1.0, (step + 1) / WARM_UP)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        if on_step(step + 1, float(loss.detach())):
+            break
