@@ -14,9 +14,10 @@ from nerif.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.geometry import Grid, Rays
 
-__all__ = ["STEP", "DeflectionOperator", "operator_norm"]
+__all__ = ["MODELS", "STEPS", "DeflectionOperator", "operator_norm"]
 
-STEP = 1.0  # voxels between samples
+STEPS = {"linear": 0.5, "cubic": 1.0}
+"""Voxels between samples: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
 MODELS = ("lever_arm", "paraxial")
 
 
@@ -37,7 +38,7 @@ class DeflectionOperator:
     model : "lever_arm" or "paraxial"
     basis : "linear" (coefficients are the values at voxel centres) or "cubic"
     boundary : how the coefficients go on beyond the box
-    step : longest distance between samples, in edges of a voxel
+    step : longest distance between samples, in edges of a voxel; None for that of STEPS
     device, dtype : where and in which precision c and d are
 
     Raises
@@ -57,7 +58,7 @@ class DeflectionOperator:
         model: str = "lever_arm",
         basis: str = "linear",
         boundary: Boundary | None = None,
-        step: float = STEP,
+        step: float | None = None,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
@@ -65,6 +66,7 @@ class DeflectionOperator:
             raise InputError(f"model: expected {' or '.join(MODELS)}, got '{model}'")
         if basis not in DEGREES:
             raise InputError(f"basis: expected {' or '.join(DEGREES)}, got '{basis}'")
+        step = STEPS[basis] if step is None else step
         if not step > 0:
             raise InputError(f"step: expected a length above 0 voxels, got {step}")
         if not bool(rays.crosses.any()):

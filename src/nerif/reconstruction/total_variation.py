@@ -33,6 +33,8 @@ class TotalVariation(WeightedVoxelReconstructor):
     """Gradient, in index_scale per box edge, below which the penalty is quadratic."""
     round: int = 20
     """Conjugate-gradient iterations between new weights."""
+    iterations: int = 60
+    """Most iterations on each grid and with each weight."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
