@@ -1,0 +1,89 @@
+"""Voxel fields: what they pass through, what they are on the faces of the box, and their gradient."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerif.conventions import FACES, InputError
+from nerif.fields.grid import Boundary, VoxelField, spline_weights
+from nerif.geometry import Box, Grid
+
+BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
+GRID = Grid(BOX, (5, 6, 7))
+
+
+def random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+@pytest.mark.parametrize("faces", [(), ("x-", "z+"), FACES])
+def test_fold_is_the_adjoint_of_extend(degree, faces):
+    layers, boundary = (degree + 1) // 2, Boundary(faces)
+    c, e = random(*GRID.shape), random(*(n + 2 * layers for n in GRID.shape), seed=1)
+    there, back = (boundary.extend(c, layers) * e).sum(), (c * boundary.fold(e, layers)).sum()
+    assert float(there - back) == pytest.approx(0, abs=1e-13)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_field_is_zero_on_ambient_faces_and_flat_at_the_others(degree):
+    faces = ("x-", "y+", "z-")
+    field = VoxelField(Boundary(faces).extend(random(*GRID.shape), (degree + 1) // 2), GRID, degree)
+    unit = 0.1 + 0.8 * random(40, 2, seed=2)
+    for face in FACES:
+        value, gradient = field.value_and_gradient(BOX.face_points(face, unit))
+        if face in faces:
+            assert float(value.abs().max()) < 1e-14
+        else:
+            assert float(value.abs().max()) > 0.1
+            if degree == 3:
+                assert float(gradient[:, "xyz".index(face[0])].abs().max()) < 1e-14
+
+
+def test_linear_field_has_its_coefficients_at_the_centres():
+    values = random(*GRID.shape)
+    field = VoxelField(Boundary().extend(values, 1), GRID, 1)
+    assert torch.allclose(field(GRID.points(torch.float64)), values, atol=1e-14)
+
+
+def test_spline_through_values_meets_them():
+    values = random(*GRID.shape)
+    assert torch.allclose(VoxelField.through(values, GRID)(GRID.points(torch.float64)), values, atol=1e-13)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_gradient_is_that_of_the_value(degree):
+    field = VoxelField(Boundary(("x+",)).extend(random(*GRID.shape), (degree + 1) // 2), GRID, degree)
+    points = torch.tensor(BOX.lower) + (0.03 + 0.94 * random(60, 3, seed=3)) * torch.tensor(BOX.edges)
+    points.requires_grad_(True)
+    value, gradient = field.value_and_gradient(points)
+    (autograd,) = torch.autograd.grad(value.sum(), points)
+    assert torch.allclose(gradient, autograd, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_weights_are_a_partition_of_one(degree):
+    weights, slopes = spline_weights(random(50), degree)
+    assert torch.allclose(weights.sum(-1), torch.ones(50, dtype=torch.float64))
+    assert torch.allclose(slopes.sum(-1), torch.zeros(50, dtype=torch.float64), atol=1e-15)
+
+
+def test_single_precision_and_another_device_keep_the_field():
+    field = VoxelField(Boundary().extend(random(*GRID.shape).float(), 2), GRID, 3)
+    assert field(GRID.points()).dtype == torch.float32
+    assert torch.equal(field.to("cpu")(GRID.points()), field(GRID.points()))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_cannot_be_right():
+    with pytest.raises(InputError, match=r"coefficients: expected the shape \(7, 8, 9\)"):
+        VoxelField(torch.zeros(5, 6, 7), GRID, 1)
+    with pytest.raises(InputError, match="degree: expected one of 1, 3, got 2"):
+        VoxelField(torch.zeros(5, 6, 7), GRID, 2)
+    with pytest.raises(InputError, match="values of shape"):
+        VoxelField.through(torch.zeros(4, 6, 7), GRID)
+    with pytest.raises(InputError, match="ambient_faces: expected faces out of"):
+        Boundary(("top",))
+    with pytest.raises(InputError, match="at least 2 voxels"):
+        Boundary().extend(torch.zeros(1, 6, 7), 2)

@@ -1,0 +1,198 @@
+"""The voxel operator: an exact adjoint, the same as the readable road through a Field, and physically right."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.grid import Boundary
+from nerif.geometry import Box, Camera, Grid, Plane, Rays
+from nerif.physics.deflection import Deflection
+from nerif.reconstruction import kernels_torch
+from nerif.reconstruction.operator import DeflectionOperator
+
+GRID = (9, 11, 13)
+FACES = Boundary(("x-", "y+", "z-"))
+
+
+def general_camera(rotation_about, axis, angle, background: float = 420.0) -> Camera:
+    """A camera 700 mm off that looks at the origin from anywhere, rolled about its axis."""
+    rotation = rotation_about(axis, angle)
+    outward = -rotation[2]
+    intrinsics = torch.tensor([[500.0, 0, 10.2], [0, 480.0, 8.1], [0, 0, 1]], dtype=torch.float64)
+    tilted = rotation_about((0.3, -0.8, 0.1), 0.15) @ outward
+    return Camera(
+        intrinsics=intrinsics, rotation=rotation, translation=-rotation @ (700 * outward), image_size=(17, 21),
+        background=Plane(tilted, -background), distortion=torch.zeros(5, dtype=torch.float64), name=f"{angle:g}",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def rays(rotation_about, box) -> Rays:
+    cameras = [
+        general_camera(rotation_about, axis, angle)
+        for axis, angle in (((1, 0.2, 0.3), 0.7), ((0.1, 1, -0.4), 2.1), ((0.5, -0.3, 1), 4.0), ((1, 0.4, -0.2), 5.5))
+    ]
+    every = Rays.concatenate([c.rays(c.pixel_grid().reshape(-1, 2)) for c in cameras]).clip(box)
+    return every[every.crosses]
+
+
+def operator(rays: Rays, box: Box, **settings) -> DeflectionOperator:
+    return DeflectionOperator(rays, Grid(box, GRID), **{"boundary": FACES, **settings})
+
+
+def random(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)).to(dtype)
+
+
+@pytest.mark.parametrize(("dtype", "limit"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+@pytest.mark.parametrize("model", ["lever_arm", "paraxial"])
+def test_adjoint_is_exact(rays, box, dtype, limit, basis, model):
+    """<A c, d> = <c, A^T d>, relative to the lengths of both."""
+    a = operator(rays, box, dtype=dtype, basis=basis, model=model)
+    c, d = random(*a.domain_shape, dtype=dtype), random(*a.range_shape, dtype=dtype, seed=1)
+    forward, adjoint = a(c), a.T(d)
+    there = float((forward.double() * d.double()).sum())
+    back = float((c.double() * adjoint.double()).sum())
+    assert abs(there - back) <= limit * float(forward.double().norm() * d.double().norm())
+    assert float(forward.norm()) > 0
+
+
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+@pytest.mark.parametrize("model", ["lever_arm", "paraxial"])
+def test_agrees_with_the_readable_twin(rays, box, basis, model):
+    """The forward model through the Field, ray by ray, and its gradient by autograd."""
+    some = rays[torch.arange(0, len(rays), 9)]
+    a = operator(some, box, dtype=torch.float64, basis=basis, model=model, step=0.7)
+    small = 1e-9  # next to which the n of 1 / n is one
+    c = (small * random(*a.domain_shape)).requires_grad_(True)
+    field, length = a.field(c), some.far - some.near
+    counts = (length.double() / (0.7 * min(a.grid.spacing))).ceil().int().tolist()
+    d = torch.cat([
+        Deflection(model, count)(field, some[i : i + 1].to(dtype=torch.float64)) for i, count in enumerate(counts)
+    ])  # fmt: skip
+    assert torch.allclose(a(c.detach()), d, rtol=1e-6, atol=1e-8 * float(d.detach().abs().max()))
+    weights = random(*a.range_shape, seed=2)
+    (gradient,) = torch.autograd.grad((weights * d).sum(), c)
+    assert float((a.T(weights) - gradient).norm() / gradient.norm()) < 1e-6
+
+
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+def test_compiled_and_plain_kernels_agree(rays, box, basis):
+    a = operator(rays, box, dtype=torch.float64, basis=basis)
+    c, d = random(*a.domain_shape), random(*a.range_shape, seed=1)
+    padded = a.boundary.extend(c, a.layers)
+    plain = torch.empty_like(d)
+    kernels_torch.forward(a.degree, padded, a._rays, plain)
+    assert torch.allclose(plain, a(c), rtol=1e-12, atol=1e-12 * float(plain.abs().max()))
+    spread = torch.zeros_like(padded)
+    kernels_torch.adjoint(a.degree, d, a._rays, spread)
+    adjoint = a.T(d)
+    assert torch.allclose(
+        a.boundary.fold(spread, a.layers), adjoint, rtol=1e-12, atol=1e-12 * float(adjoint.abs().max())
+    )
+
+
+def test_sum_does_not_depend_on_the_number_of_threads(rays, box):
+    a = operator(rays, box)
+    d, results = random(*a.range_shape, dtype=torch.float32), []
+    before = torch.get_num_threads()
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        results.append(a.T(d))
+    torch.set_num_threads(before)
+    assert torch.equal(*results)
+
+
+def test_norm_is_the_largest_singular_value(rays, box):
+    a = DeflectionOperator(rays[::7], Grid(box, (3, 4, 5)), dtype=torch.float64, boundary=FACES)
+    columns = []
+    for i in range(60):
+        unit = torch.zeros(60, dtype=torch.float64)
+        unit[i] = 1
+        columns.append(a(unit.reshape(3, 4, 5)).reshape(-1))
+    largest = float(torch.linalg.matrix_norm(torch.stack(columns, dim=1), 2))
+    assert 0.97 * largest < a.norm(100) <= largest * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+def test_quadrature_converges(measurement, ball, basis):
+    """Finer voxels come to what the cameras saw of a smooth field (curved rays, 2 % noise)."""
+    rays, d, _ = measurement.rays()
+    errors = []
+    for n in (12, 24, 48):
+        grid = Grid.of_resolution(measurement.box, n)
+        a = DeflectionOperator(rays, grid, measurement.n_ambient, basis=basis)
+        errors.append(float((a(ball.sample(grid)) - d).norm() / d.norm()))
+    assert all(fine < coarse for coarse, fine in pairwise(errors))
+    assert errors[-1] < 0.08
+
+
+def test_turning_rig_and_flow_by_a_right_angle_changes_nothing(measurement, ball):
+    rays, _, _ = measurement.rays()
+    (ax, ay, az), (bx, by, bz) = measurement.box.lower, measurement.box.upper
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y, y to -x
+    turned_box = Box((-by, ax, az), (-ay, bx, bz))
+    turned = Rays(
+        rays.origin @ turn.T, rays.direction @ turn.T, rays.sensitivity @ turn.T, rays.background, rays.near, rays.far
+    )
+    a = DeflectionOperator(rays, Grid(measurement.box, (6, 8, 10)), dtype=torch.float64)
+    b = DeflectionOperator(turned, Grid(turned_box, (6, 10, 8)), dtype=torch.float64)
+    c = random(6, 8, 10)
+    assert torch.allclose(b(c.permute(0, 2, 1).flip(2)), a(c), rtol=1e-5, atol=1e-6 * float(a(c).abs().max()))
+
+
+def test_a_constant_moves_nothing_and_a_slope_all_alike(rays, box):
+    """Without ambient faces a constant is invisible; of n = x the linear basis has the exact gradient inside."""
+    a = operator(rays, box, boundary=Boundary(), dtype=torch.float64)
+    assert float(a(torch.ones(GRID, dtype=torch.float64)).abs().max()) < 1e-9
+    grid = Grid(box, (4, 4, 4))
+    inner = Box((-8.9, -7.4, -5.9), (8.9, 7.4, 5.9))  # within the outermost centres, where mirroring begins
+    through = rays.clip(inner)
+    a = DeflectionOperator(through, grid, boundary=Boundary(), dtype=torch.float64, step=0.05)
+    x = grid.points(torch.float64)[..., 0]
+    lever = through.background - 0.5 * (through.near + through.far)
+    exact = through.sensitivity[:, :, 0] * (lever * (through.far - through.near))[:, None]
+    assert torch.allclose(a(x), exact.double(), rtol=1e-4, atol=1e-4 * float(exact.abs().max()))
+
+
+def test_memory_is_estimated_from_below_by_what_is_held(rays, box):
+    a = operator(rays, box, basis="cubic")
+    held = sum(t.numel() * t.element_size() for t in a._rays)
+    padded = math.prod(n + 4 for n in GRID) * 4
+    assert DeflectionOperator.memory_bytes(len(rays), a.grid, "cubic") == held + 2 * padded
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_cannot_be_right(rays, box):
+    missing = rays.clip(Box((900.0, 900.0, 900.0), (901.0, 901.0, 901.0)))
+    with pytest.raises(InputError, match="rays: expected rays that cross the box, got none"):
+        operator(missing, box)
+    with pytest.raises(InputError, match="model: expected lever_arm or paraxial, got 'curved'"):
+        operator(rays, box, model="curved")
+    with pytest.raises(InputError, match="basis: expected linear or cubic, got 'quintic'"):
+        operator(rays, box, basis="quintic")
+    with pytest.raises(InputError, match="step: expected a length above 0"):
+        operator(rays, box, step=0.0)
+    with pytest.raises(InputError, match="at least 2 along each edge"):
+        DeflectionOperator(rays, Grid(box, (1, 4, 5)), basis="cubic")
+    a = operator(rays, box)
+    with pytest.raises(InputError, match=r"coefficients: expected \(9, 11, 13\)"):
+        a(torch.zeros(9, 11, 12))
+    with pytest.raises(InputError, match="displacement: expected"):
+        a.T(torch.zeros(3, 2))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+def test_cuda_gives_what_the_cpu_gives(rays, box, basis):
+    here, there = (operator(rays, box, basis=basis, dtype=torch.float64, device=d) for d in ("cpu", "cuda"))
+    c, d = random(*here.domain_shape), random(*here.range_shape, seed=1)
+    assert torch.allclose(there(c).cpu(), here(c), rtol=1e-10, atol=1e-10 * float(here(c).abs().max()))
+    assert torch.allclose(there.T(d).cpu(), here.T(d), rtol=1e-10, atol=1e-10 * float(here.T(d).abs().max()))
