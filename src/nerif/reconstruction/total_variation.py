@@ -43,6 +43,10 @@ class TotalVariation(WeightedVoxelReconstructor):
         if self.round < 1:
             raise InputError(f"round: expected at least 1 iteration, got {self.round}")
 
+    @property
+    def patience(self) -> int:
+        return self.round  # the objective falls from round to round, not with every iteration
+
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         x = problem.clip(x)
         while True:

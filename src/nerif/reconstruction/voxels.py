@@ -33,7 +33,6 @@ from nerif.reconstruction.weight import FIRST, choose_weight
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 
 COARSEST = 12  # voxels along the longest edge of the first grid, at least
-STALLED = 3  # iterations in a row that gain less than the tolerance
 VOLUMES = 22  # arrays the size of the grid that the hungriest method holds at once (tests/reconstruction)
 DATA = 8  # arrays the size of the data
 
@@ -53,7 +52,7 @@ class VoxelReconstructor(Reconstructor):
     coarse_to_fine: bool = True
     """Start on a coarse grid and halve the voxels from solution to solution."""
     tolerance: float = 1e-4
-    """Converged when three iterations in a row lower the objective by less than this share."""
+    """Converged when the objective falls by less than this share an iteration, on the mean of a few."""
     time_limit: float = 0.0
     """Stop after so many seconds; 0 for no limit."""
     lower: float | None = None
@@ -104,6 +103,11 @@ class VoxelReconstructor(Reconstructor):
     def weight(self) -> float | None:
         """Weight of the penalty, or None where it is to be chosen."""
         return 0.0
+
+    @property
+    def patience(self) -> int:
+        """Iterations over which the fall of the objective is averaged."""
+        return 3
 
     @abstractmethod
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
@@ -252,17 +256,16 @@ class _Run:
         self, problem: Problem, x: Tensor, weight: float, tolerance: float | None = None
     ) -> tuple[Iterate, bool]:
         """Iterate until it converges or the iterations are used up; which, is told."""
-        settings, last, stalled = self.settings, math.inf, 0
+        settings, past = self.settings, [math.inf] * self.settings.patience
         tolerance = settings.tolerance if tolerance is None else tolerance
         for iterate in settings.iterate(problem, x, weight):
             self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
             objective = iterate.residual + weight * iterate.penalty
-            stalled = stalled + 1 if last - objective < tolerance * objective else 0
-            last = objective
+            before, past = past[0], [*past[1:], objective]
             self._tell(problem, iterate, weight, objective)
             if not math.isfinite(objective):
                 raise _Stop("diverged", "the objective turned non-finite; look for extreme displacements or sigma")
-            converged = stalled >= STALLED
+            converged = before - objective < tolerance * settings.patience * objective
             if settings.weight == 0.0 and self.noise is not None and iterate.residual <= self.noise:
                 self.chosen, converged = "residual is the noise (discrepancy principle)", True
             if converged or self.done >= settings.iterations:
