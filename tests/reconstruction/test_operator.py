@@ -42,7 +42,10 @@ def rays(rotation_about, box) -> Rays:
 
 
 def operator(rays: Rays, box: Box, **settings) -> DeflectionOperator:
-    return DeflectionOperator(rays, Grid(box, GRID), **{"boundary": FACES, **settings})
+    # a little larger than the box, lest rays from face to face have samples just where a linear gradient jumps
+    x, y, z = box.upper
+    larger = Box((-x - 0.31, -y - 0.73, -z - 0.22), (x + 0.47, y + 0.11, z + 0.93))
+    return DeflectionOperator(rays, Grid(larger, GRID), **{"boundary": FACES, **settings})
 
 
 def random(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> torch.Tensor:
@@ -76,7 +79,8 @@ def test_agrees_with_the_readable_twin(rays, box, basis, model):
     d = torch.cat([
         Deflection(model, count)(field, some[i : i + 1].to(dtype=torch.float64)) for i, count in enumerate(counts)
     ])  # fmt: skip
-    assert torch.allclose(a(c.detach()), d, rtol=1e-6, atol=1e-8 * float(d.detach().abs().max()))
+    d_fast, d_twin = a(c.detach()), d.detach()
+    assert torch.allclose(d_fast, d_twin, rtol=1e-6, atol=1e-8 * float(d_twin.abs().max()))
     weights = random(*a.range_shape, seed=2)
     (gradient,) = torch.autograd.grad((weights * d).sum(), c)
     assert float((a.T(weights) - gradient).norm() / gradient.norm()) < 1e-6

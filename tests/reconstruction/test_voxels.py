@@ -1,0 +1,254 @@
+"""The classical methods from end to end: they find the field, keep to gauge, hull and bounds, stop and resume."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views, evaluate_volume
+from nerif.fields.grid import VoxelField
+from nerif.geometry import Grid
+from nerif.reconstruction import voxels as voxels_module
+from nerif.reconstruction.base import Step
+from nerif.reconstruction.files import read_field, read_state, write_field, write_state
+from nerif.reconstruction.landweber import Landweber
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.total_variation import TotalVariation
+from nerif.volume import Volume
+
+METHODS = [
+    Tikhonov(voxels=24, device="cpu"),
+    Landweber(voxels=24, device="cpu"),
+    TotalVariation(voxels=24, device="cpu"),
+]
+NAMES = ["tikhonov", "landweber", "tv"]
+FIXED = Tikhonov(voxels=24, device="cpu", regularisation=1e-3, iterations=8, tolerance=0)
+
+
+def error(result, ball, n_ambient: float) -> dict[str, float]:
+    grid = Grid.of_resolution(result.box, 30)
+    return evaluate_volume(result.field, Volume(ball.sample(grid), grid), n_ambient)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+def test_finds_the_balls_and_comes_down_to_the_noise(measurement, ball, method):
+    result = method(measurement)
+    metrics = error(result, ball, measurement.n_ambient)
+    assert metrics["cc"] > 0.97
+    assert metrics["l2_variation"] < 0.25
+    assert isinstance(result.field, VoxelField)
+    assert result.history[-1]["residual_over_sigma"] == pytest.approx(1, abs=0.15)
+    assert "discrepancy principle" in result.outcome.message
+    assert [r["step"] for r in result.history] == list(range(1, len(result.history) + 1))
+    assert result.history[0]["voxels"] < result.history[-1]["voxels"] == 24  # coarse to fine
+    assert all(v["cc"] > 0.99 for v in evaluate_views(result.field, measurement))
+    assert result.seconds > 0
+    assert result.peak_memory_bytes > 0
+
+
+@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+def test_without_sigma_the_data_alone_decide(measurement, ball, method):
+    result = replace(method, iterations=40)(replace(measurement, sigma=None))
+    assert error(result, ball, measurement.n_ambient)["cc"] > 0.96
+    assert "residual_over_sigma" not in result.history[-1]
+    if not isinstance(method, Landweber):
+        assert "L-curve" in result.outcome.message
+
+
+def test_result_survives_the_disc(measurement, tmp_path):
+    result = FIXED(measurement)
+    write_field(tmp_path, result)
+    field, box, n_ambient = read_field(tmp_path)
+    points = Grid(box, (4, 5, 6)).points()
+    assert torch.equal(field(points), result.field(points))
+    assert (box, n_ambient) == (measurement.box, measurement.n_ambient)
+
+
+def test_gauge_is_zero_on_the_ambient_faces(measurement):
+    result = FIXED(replace(measurement, ambient_faces=("x-", "y+")))
+    unit = torch.rand(30, 2)
+    scale = float(result.field.sample(Grid(result.box, (8, 9, 10))).abs().max())
+    for face in ("x-", "y+"):
+        assert float(result.field(measurement.box.face_points(face, unit)).abs().max()) < 1e-3 * scale
+
+
+def test_sigma_tells_which_view_to_trust(measurement, ball):
+    """One view is spoilt; told so, the reconstruction is hardly worse, not told it is."""
+    spoilt = measurement.displacement.clone()
+    noise = torch.randn(spoilt[2].shape, generator=torch.Generator().manual_seed(3))
+    spoilt[2] += 2 * float(spoilt.nan_to_num().square().mean().sqrt()) * noise
+    sigma = measurement.sigma.clone()
+    sigma[2] *= 200
+    weighted = FIXED(replace(measurement, displacement=spoilt, sigma=sigma))
+    blind = FIXED(replace(measurement, displacement=spoilt, sigma=None))
+    l2 = [error(r, ball, measurement.n_ambient)["l2_variation"] for r in (weighted, blind)]
+    assert l2[0] < 0.6 * l2[1]
+
+
+def test_pixels_that_are_not_valid_do_not_count(measurement):
+    valid = torch.ones(measurement.displacement.shape[:3], dtype=torch.bool)
+    valid[:, :7] = False
+    spoilt = measurement.displacement.clone()
+    spoilt[:, :7] = 50.0
+    clean, masked = (
+        FIXED(replace(measurement, displacement=d, valid=valid)) for d in (measurement.displacement, spoilt)
+    )
+    assert torch.equal(clean.field.coefficients, masked.field.coefficients)
+
+
+def test_voxels_outside_the_visual_hull_are_ambient(measurement):
+    mask = torch.zeros(measurement.displacement.shape[:3], dtype=torch.bool)
+    mask[:, 5:15, 7:19] = True
+    linear = replace(FIXED, basis="linear")
+    hull = linear(replace(measurement, flow_mask=mask, ambient_faces=()))
+    whole = replace(linear, hull=False)(replace(measurement, flow_mask=mask))
+    values = hull.field.sample(hull.field.grid)
+    from nerif.reconstruction.gauge import visual_hull
+
+    inside = visual_hull(replace(measurement, flow_mask=mask), hull.field.grid)
+    assert float(values[~inside].abs().max()) < 1e-12
+    assert float(values[inside].abs().max()) > 1e-5
+    assert float(whole.field.sample(whole.field.grid)[~inside].abs().max()) > 1e-7
+
+
+def test_bounds_hold_everywhere(measurement):
+    result = replace(FIXED, lower=-1.0e-4, upper=0.0, iterations=30)(measurement)
+    values = result.field.sample(Grid(result.box, (21, 23, 29)))
+    assert float(values.min()) >= -1.0e-4 * 1.0001
+    assert float(values.max()) <= 1e-9
+
+
+def test_open_faces_drop_rays(measurement):
+    everything, fewer = FIXED(measurement), replace(FIXED, open_faces=("z+",))(measurement)
+    assert not torch.equal(everything.field.coefficients, fewer.field.coefficients)
+
+
+def test_coarse_start_is_ahead_of_none(measurement):
+    """After the same few iterations on the finest grid the residual is lower."""
+    fine, flat = (
+        replace(FIXED, coarse_to_fine=c, iterations=4, regularisation=1e-4)(measurement).history for c in (True, False)
+    )
+    assert fine[-1]["residual"] < flat[-1]["residual"]
+    assert {r["voxels"] for r in flat} == {24}
+
+
+def test_starting_from_a_field_skips_the_coarse_grids(measurement, ball):
+    result = replace(FIXED, iterations=1)(measurement, start=ball)
+    assert {r["voxels"] for r in result.history} == {24}
+    assert result.history[0]["residual"] < 0.3
+
+
+def test_double_precision_agrees_with_single(measurement):
+    single, double = FIXED(measurement), replace(FIXED, precision="float64")(measurement)
+    assert double.field.coefficients.dtype == torch.float64
+    difference = (single.field.coefficients - double.field.coefficients).norm() / double.field.coefficients.norm()
+    assert float(difference) < 1e-3
+
+
+@pytest.mark.parametrize("level", [12, 24])
+def test_interrupted_run_is_usable_and_goes_on(measurement, tmp_path, level):
+    def stop(step: Step) -> bool:
+        return step.losses["voxels"] == level and step.step % 4 == 3
+
+    first = FIXED(measurement, stop)
+    assert first.outcome.reason == "interrupted"
+    assert first.history[-1]["voxels"] == level
+    assert max(first.field.grid.shape) == level
+    write_state(tmp_path, first.state)
+    again = FIXED(measurement, resume=read_state(tmp_path))
+    assert again.outcome.reason == "iterations"
+    assert len(again.history) == 2 * FIXED.iterations  # each grid has had its iterations, none twice
+    assert again.seconds > first.seconds
+    through = FIXED(measurement)
+    assert again.history[-1]["residual"] == pytest.approx(through.history[-1]["residual"], rel=0.2)
+
+
+def test_resume_goes_on_with_more_iterations(measurement):
+    first = FIXED(measurement)
+    more = replace(FIXED, iterations=14)(measurement, resume=first.state)
+    assert len(more.history) == len(first.history) + 6
+    assert more.history[-1]["objective"] < first.history[-1]["objective"]
+
+
+def test_time_limit_stops_and_says_where(measurement):
+    result = replace(FIXED, iterations=100000, time_limit=0.3)(measurement)
+    assert result.outcome.reason == "time_limit"
+    assert "voxels" in result.outcome.message
+
+
+def test_progress_rises_to_the_end(measurement):
+    seen = []
+    Tikhonov(voxels=24, device="cpu", iterations=10)(measurement, lambda step: seen.append(step.progress))
+    assert all(0 < p <= 1 for p in seen)
+    assert seen == sorted(seen)
+
+
+def test_diverged_data_say_so(measurement):
+    spoilt = measurement.displacement.clone()
+    spoilt[0, 3, 4] = 3e38
+    result = FIXED(replace(measurement, displacement=spoilt, sigma=None))
+    assert result.outcome.reason == "diverged"
+
+
+def test_settings_are_recorded(measurement):
+    result = FIXED(measurement)
+    assert result.settings == dataclasses.asdict(FIXED)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("method", "changes", "words"),
+    [
+        (Tikhonov, {"regularisation": -1.0}, "regularisation: expected auto or a weight of 0 or more, got -1.0"),
+        (TotalVariation, {"regularisation": float("nan")}, "regularisation: expected auto"),
+        (Tikhonov, {"penalty": "hessian"}, "penalty: expected one of identity, gradient, laplacian, got 'hessian'"),
+        (Tikhonov, {"voxels": 0}, "voxels: expected at least 1, got 0"),
+        (Tikhonov, {"iterations": 0}, "iterations: expected at least 1, got 0"),
+        (Tikhonov, {"basis": "quadratic"}, "basis: expected one of linear, cubic, got 'quadratic'"),
+        (Tikhonov, {"model": "curved"}, "model: expected one of lever_arm, paraxial"),
+        (Tikhonov, {"step": 0.0}, "step: expected above 0 voxels, got 0.0"),
+        (Tikhonov, {"tolerance": -1.0}, "tolerance: expected 0 or more, got -1.0"),
+        (Tikhonov, {"lower": 1e-5}, "lower, upper: expected bounds of the index excess around 0"),
+        (Landweber, {"relaxation": 2.0}, "relaxation: expected above 0 and below 2"),
+        (Landweber, {"relaxation": 1.5}, "with momentum at most 1"),
+        (TotalVariation, {"softness": 0.0}, "softness: expected above 0, got 0.0"),
+        (TotalVariation, {"round": 0}, "round: expected at least 1 iteration, got 0"),
+    ],
+)
+def test_settings_that_cannot_be_right(method, changes, words):
+    with pytest.raises(InputError, match=words):
+        method(**changes)
+
+
+def test_data_that_cannot_be_reconstructed(measurement, monkeypatch):
+    with pytest.raises(InputError, match="ambient_faces: expected at least one face"):
+        FIXED(replace(measurement, ambient_faces=()))
+    with pytest.raises(InputError, match="flow_mask: the masks leave no voxel"):
+        FIXED(replace(measurement, flow_mask=torch.zeros(measurement.displacement.shape[:3], dtype=torch.bool)))
+    with pytest.raises(InputError, match="open_faces: every ray crosses one"):
+        replace(FIXED, open_faces=("x-", "x+", "y-", "y+", "z-", "z+"))(measurement)
+    with pytest.raises(InputError, match="resume: the checkpoint is of another method or grid"):
+        replace(FIXED, voxels=30)(measurement, resume=FIXED(measurement).state)
+    monkeypatch.setattr(voxels_module, "available_memory", lambda device: 3 << 20)
+    with pytest.raises(InputError, match=r"would need [\d.]+ GiB on cpu, which has 0.0 GiB free; give fewer --voxels"):
+        FIXED(measurement)
+
+
+def test_memory_is_not_underestimated(measurement):
+    """Arrays of the size of the grid that are alive at once, counted by torch, fit in the estimate."""
+    from torch.profiler import ProfilerActivity, profile
+
+    method = TotalVariation(voxels=32, device="cpu", regularisation=1e-2, iterations=3, coarse_to_fine=False)
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
+        method(measurement)
+    alive = highest = 0
+    for event in record.profiler.kineto_results.events():
+        if event.name() == "[memory]":
+            alive += event.nbytes()
+            highest = max(highest, alive)
+    grid = Grid.of_resolution(measurement.box, 32)
+    assert 0 < highest < method.memory_bytes(measurement, grid) < 8 * highest
