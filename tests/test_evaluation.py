@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from nerif.conventions import Points, Values, Vectors
-from nerif.evaluation import evaluate_views, evaluate_volume, update_json
+from nerif.evaluation import evaluate_views, evaluate_volume, predict_view, update_json
 from nerif.fields.base import Field
+from nerif.fields.grid import Boundary, VoxelField
 from nerif.geometry import Grid
+from nerif.physics.deflection import Deflection, project
 from nerif.volume import Volume
 
 
@@ -59,3 +61,17 @@ def test_predictions_on_views_without_valid_pixels_are_not_numbers(measurement, 
     views = evaluate_views(ball, replace(measurement, valid=valid))
     assert math.isnan(views[0]["rms_px"])
     assert views[1]["cc"] > 0.99
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+@pytest.mark.parametrize("model", ["lever_arm", "paraxial"])
+def test_voxels_are_projected_as_any_field(measurement, ball, degree, model):
+    """The compiled way through a voxel field and the way through the Field give the same view."""
+    grid = Grid(measurement.box, (14, 17, 20))
+    field = VoxelField(Boundary(measurement.ambient_faces).extend(ball.sample(grid), (degree + 1) // 2), grid, degree)
+    camera, forward = measurement.cameras[1], Deflection(model, 200, measurement.n_ambient)
+    fast = predict_view(field, camera, forward, measurement.box)
+    rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).to(dtype=torch.float32)
+    slow = project(forward, field, rays).reshape(fast.shape)
+    assert float((fast - slow).norm() / slow.norm()) < (0.02 if degree == 1 else 2e-3)
+    assert torch.equal(fast[~rays.crosses.reshape(fast.shape[:2])], torch.zeros(int((~rays.crosses).sum()), 2))

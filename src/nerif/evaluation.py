@@ -14,12 +14,15 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.geometry import Camera
+from nerif.fields.grid import DEGREES, VoxelField
+from nerif.geometry import Camera, Rays
 from nerif.measurement import Measurement
 from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
 from nerif.physics.deflection import Deflection, ForwardModel, project
+from nerif.reconstruction.operator import DeflectionOperator
 from nerif.volume import Volume
 
+VOXEL_STEP = 0.25  # voxels between samples
 REPROJECTION_SAMPLES = 128  # a ray; 0.1 % of the rms displacement on the flame
 
 __all__ = ["evaluate_views", "evaluate_volume", "predict_view", "update_json"]
@@ -30,7 +33,20 @@ def predict_view(
 ) -> Float[Tensor, "row column 2"]:
     """Return the displacement (px) that a camera would see of a field; 0 where a ray misses the box."""
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
+    if isinstance(field, VoxelField) and isinstance(model, Deflection) and bool(rays.crosses.any()):
+        return _through_voxels(field, rays, model, device).reshape(*camera.image_size, 2)
     return project(model, field, rays, device).reshape(*camera.image_size, 2)
+
+
+def _through_voxels(
+    field: VoxelField, rays: Rays, model: Deflection, device: torch.device | str
+) -> Float[Tensor, "n 2"]:
+    """What `project` gives, by the compiled operator: tens of times faster, and 1 / n to first order only."""
+    basis = next(name for name, degree in DEGREES.items() if degree == field.degree)
+    operator = DeflectionOperator(
+        rays, field.grid, model.n_ambient, model.model, basis, step=VOXEL_STEP, device=device
+    )  # fmt: skip
+    return operator.through(field.coefficients).cpu()
 
 
 def evaluate_views(

@@ -185,11 +185,25 @@ def test_what_cannot_be_right(rays, box):
         operator(rays, box, step=0.0)
     with pytest.raises(InputError, match="at least 2 along each edge"):
         DeflectionOperator(rays, Grid(box, (1, 4, 5)), basis="cubic")
+    with pytest.raises(InputError, match="rays: expected rays clipped to the box of the grid"):
+        DeflectionOperator(rays, Grid(Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), GRID))
     a = operator(rays, box)
     with pytest.raises(InputError, match=r"coefficients: expected \(9, 11, 13\)"):
         a(torch.zeros(9, 11, 12))
     with pytest.raises(InputError, match="displacement: expected"):
         a.T(torch.zeros(3, 2))
+
+
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+def test_rays_that_miss_the_box_see_nothing(rays, box, basis):
+    away = Rays(rays.origin + 500, rays.direction, rays.sensitivity, rays.background, rays.near, rays.far).clip(box)
+    both = Rays.concatenate([rays[:30], away[:10]])
+    a = operator(both, box, basis=basis, dtype=torch.float64)
+    c = random(*a.domain_shape)
+    assert torch.equal(a(c)[30:], torch.zeros(10, 2, dtype=torch.float64))
+    plain = torch.ones(40, 2, dtype=torch.float64)
+    kernels_torch.forward(a.degree, a.boundary.extend(c, a.layers), a._rays, plain)
+    assert torch.allclose(plain, a(c), atol=1e-12 * float(plain.abs().max()))
 
 
 @pytest.mark.cuda

@@ -44,7 +44,7 @@ class DeflectionOperator:
     Raises
     ------
     InputError
-        If no ray crosses the box, or a setting is not one of those named.
+        If no ray crosses the box, one is not clipped to it, or a setting is not one of those named.
 
     Source: docs/conventions.md (forward model); Joseph, IEEE Trans. Med. Imaging 1 (1982), for projection by
     interpolation.
@@ -95,6 +95,9 @@ class DeflectionOperator:
         start = (rays.origin + s[:, None] * rays.direction - lower) / spacing - 0.5
         start = start + (self.layers - self.degree // 2)  # counted from the first coefficient beyond the box
         stride = rays.direction * interval[:, None] / spacing
+        missing = ~rays.crosses[:, None]  # no sample of theirs is taken, but each has to have a place
+        start, stride = start.masked_fill(missing, 1.0), stride.masked_fill(missing, 0.0)
+        self._check_inside(start, start + (count - 1).clamp_min(0)[:, None] * stride)
         if model == "paraxial":
             lever = torch.stack([rays.background - 0.5 * (rays.near + rays.far), torch.zeros_like(s)], dim=-1)
         else:
@@ -103,11 +106,24 @@ class DeflectionOperator:
         kept = (a.to(self.device, self.dtype).contiguous() for a in (start, stride, lever, matrix))
         return (*kept, count.to(self.device, torch.int32))
 
+    def _check_inside(self, *positions: Tensor) -> None:
+        """Refuse samples beyond the coefficients: the kernels would read memory that is not theirs."""
+        most = torch.tensor([n + 2 * self.layers - self.degree for n in reversed(self.domain_shape)])
+        for p in positions:
+            if not bool(((p >= 0) & (p < most.to(p))).all()):
+                raise InputError(
+                    f"rays: expected rays clipped to the box of the grid, {self.grid.box}, got longer ones"
+                )
+
     def __call__(self, coefficients: Float[Tensor, "z y x"]) -> Float[Tensor, "n 2"]:
         """Return the displacement of every ray, px."""
         if tuple(coefficients.shape) != self.domain_shape:
             raise InputError(f"coefficients: expected {self.domain_shape}, got {tuple(coefficients.shape)}")
-        padded = self.boundary.extend(coefficients.to(self.device, self.dtype), self.layers).contiguous()
+        return self.through(self.boundary.extend(coefficients.to(self.device, self.dtype), self.layers))
+
+    def through(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n 2"]:
+        """Return the displacement, px, of every ray through coefficients that go on beyond the box already."""
+        padded = padded.to(self.device, self.dtype).contiguous()
         displacement = torch.empty(self.range_shape, dtype=self.dtype, device=self.device)
         if self.device.type == "cpu":
             kernels = _numba()
