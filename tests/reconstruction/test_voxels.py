@@ -12,6 +12,8 @@ from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
+from nerif.reconstruction import kernels_torch
+from nerif.reconstruction import operator as operator_module
 from nerif.reconstruction import voxels as voxels_module
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.files import read_field, read_state, write_field, write_state
@@ -261,3 +263,36 @@ def test_memory_is_not_underestimated(measurement):
             highest = max(highest, alive)
     grid = Grid.of_resolution(measurement.box, 32)
     assert 0 < highest < method.memory_bytes(measurement, grid) < 8 * highest
+
+
+class PlainKernels:
+    """What CUDA runs, in the place of what the CPU runs."""
+
+    @staticmethod
+    def forward(degree, padded, rays, displacement):
+        kernels_torch.forward(
+            degree, torch.from_numpy(padded), tuple(map(torch.from_numpy, rays)), torch.from_numpy(displacement)
+        )
+
+    @staticmethod
+    def adjoint(degree, displacement, rays, padded):
+        kernels_torch.adjoint(
+            degree, torch.from_numpy(displacement), tuple(map(torch.from_numpy, rays)), torch.from_numpy(padded)
+        )
+
+
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+def test_run_on_the_kernels_of_cuda_agrees(measurement, monkeypatch, basis):
+    settings = replace(FIXED, basis=basis, precision="float64", iterations=4, voxels=16)
+    compiled = settings(measurement)
+    monkeypatch.setattr(operator_module, "_numba", PlainKernels)
+    plain = settings(measurement)
+    assert torch.allclose(plain.field.coefficients, compiled.field.coefficients, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
+@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+def test_cuda_run_is_as_good(measurement, ball, method):
+    metrics = error(replace(method, device="cuda")(measurement), ball, measurement.n_ambient)
+    assert metrics["cc"] > LEAST_CC[type(method).__name__]

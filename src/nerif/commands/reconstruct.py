@@ -52,7 +52,11 @@ def run(settings: Reconstruct) -> Reconstruction:
     if not settings.resume:
         check_directory(settings.out, settings.force)
     begin = _begin(settings)
-    with interruptible() as asked, _scalars(settings) as scalars, progress_bar("training") as bar:
+    with (
+        interruptible() as asked,
+        _scalars(settings) as scalars,
+        progress_bar("training" if settings.method == "nerif" else "solving") as bar,
+    ):
         callbacks: list[OnStep] = [begin, bar, _checkpoints(settings), lambda _: asked[0], *scalars]  # type: ignore[list-item]
         result = settings.reconstructor(training, compose(*callbacks), resume, start)
     say(f"{result.outcome.reason}: {result.outcome.message}")

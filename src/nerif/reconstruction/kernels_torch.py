@@ -22,6 +22,8 @@ __all__ = ["adjoint", "forward"]
 POINTS = {"cpu": 1 << 14, "cuda": 1 << 22}
 """Samples taken at a time: what stays in the cache of a CPU, and fills a GPU."""
 
+CHUNK_BYTES = 1 << 30  # of the arrays that a chunk on a GPU takes, some 60 numbers a sample
+
 
 def forward(degree: int, padded: Tensor, rays: tuple[Tensor, ...], displacement: Float[Tensor, "n 2"]) -> None:
     """Write the displacement of each ray through the padded coefficients (z, y, x)."""

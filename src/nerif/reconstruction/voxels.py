@@ -22,6 +22,7 @@ from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES, Boundary
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
+from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
 from nerif.reconstruction.gauge import check_gauge, visual_hull
@@ -113,13 +114,14 @@ class VoxelReconstructor(Reconstructor):
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         """Yield one iterate after another, from x, without end."""
 
-    def memory_bytes(self, measurement: Measurement, grid: Grid) -> int:
+    def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
         """Return what a run will need at most, beside what the process holds already."""
         rays, size = int(measurement.usable.sum()), 4 if self.precision == "float32" else 8
         dtype = torch.float32 if size == 4 else torch.float64
         operator = DeflectionOperator.memory_bytes(rays, grid, self.basis, dtype)
         preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
-        return operator + VOLUMES * math.prod(grid.shape) * size + DATA * 2 * rays * size + preparing
+        chunk = kernels_torch.CHUNK_BYTES if device == "cuda" else 0
+        return operator + VOLUMES * math.prod(grid.shape) * size + DATA * 2 * rays * size + preparing + chunk
 
     def __call__(
         self,
@@ -170,7 +172,8 @@ class _Run:
         self.faces = settings.ambient_faces or measurement.ambient_faces
         check_gauge(measurement, self.faces, settings.hull)
         self.grids = _grids(measurement, settings, start)
-        needed, there = settings.memory_bytes(measurement, self.grids[-1]), available_memory(self.device)
+        needed = settings.memory_bytes(measurement, self.grids[-1], self.device.type)
+        there = available_memory(self.device)
         if needed > there:
             raise InputError(
                 f"voxels: a grid of {' x '.join(map(str, self.grids[-1].shape))} would need "
@@ -258,6 +261,8 @@ class _Run:
         """Iterate until it converges or the iterations are used up; which, is told."""
         settings, past = self.settings, [math.inf] * self.settings.patience
         tolerance = settings.tolerance if tolerance is None else tolerance
+        if settings.weight is not None:
+            self.chosen = ""
         for iterate in settings.iterate(problem, x, weight):
             self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
             objective = iterate.residual + weight * iterate.penalty
