@@ -262,7 +262,7 @@ def test_memory_is_not_underestimated(measurement):
             alive += event.nbytes()
             highest = max(highest, alive)
     grid = Grid.of_resolution(measurement.box, 32)
-    assert 0 < highest < method.memory_bytes(measurement, grid) < 8 * highest
+    assert 0 < highest < method.memory_bytes(measurement, grid) - voxels_module.COMPILER_BYTES < 8 * highest
 
 
 class PlainKernels:

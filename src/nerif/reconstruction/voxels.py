@@ -36,6 +36,7 @@ __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 COARSEST = 12  # voxels along the longest edge of the first grid, at least
 VOLUMES = 22  # arrays the size of the grid that the hungriest method holds at once (tests/reconstruction)
 DATA = 8  # arrays the size of the data
+COMPILER_BYTES = 1 << 28  # of Numba, whatever the grid (benchmarks/results/voxel-cost-cpu.md)
 
 
 @dataclass(frozen=True)
@@ -120,8 +121,8 @@ class VoxelReconstructor(Reconstructor):
         dtype = torch.float32 if size == 4 else torch.float64
         operator = DeflectionOperator.memory_bytes(rays, grid, self.basis, dtype)
         preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
-        chunk = kernels_torch.CHUNK_BYTES if device == "cuda" else 0
-        return operator + VOLUMES * math.prod(grid.shape) * size + DATA * 2 * rays * size + preparing + chunk
+        around = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
+        return operator + VOLUMES * math.prod(grid.shape) * size + DATA * 2 * rays * size + preparing + around
 
     def __call__(
         self,
