@@ -24,7 +24,8 @@ class TotalVariation(WeightedVoxelReconstructor):
     """Voxels with an isotropic total-variation penalty, by iteratively reweighted least squares.
 
     Each round weights the squared gradient by 1 / |grad x| of the round before and takes a few conjugate-gradient
-    iterations. It was measured against a primal-dual method: see benchmarks/results.
+    iterations. A primal-dual method (Chambolle & Pock) was tried beside it and came down more slowly
+    (docs/architecture.md).
 
     Source: Rudin, Osher & Fatemi, Physica D 60 (1992); Rodriguez & Wohlberg, IEEE Trans. Image Process. 18 (2009).
     """
