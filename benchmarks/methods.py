@@ -12,7 +12,6 @@ import datetime
 import multiprocessing
 import shlex
 import sys
-import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -75,14 +74,13 @@ def rows(arguments: argparse.Namespace) -> list[Row]:
     return found
 
 
-def run(row: Row, file: str, pixels: int, threads: int) -> str:
-    """Reconstruct one case from its file and return its line."""
+def run(row: Row, clean: Measurement, threads: int) -> str:
+    """Reconstruct one case and return its line."""
     torch.set_num_threads(threads)
     keep_freed_memory()
-    _, box = paper_rig(pixels)
-    grid = Grid.of_resolution(box, 100)
-    truth = Volume(make_phantom(row.phantom, box, 0).sample(grid), grid)
-    result = row.method(add_noise(Measurement.read(file), row.noise, seed=1))
+    grid = Grid.of_resolution(clean.box, 100)
+    truth = Volume(make_phantom(row.phantom, clean.box, 0).sample(grid), grid)
+    result = row.method(add_noise(clean, row.noise, seed=1))
     m = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
     return (
         f"| {row.phantom} | {row.noise:g} | {row.name} | {row.grid} | {m['l2']:.2%} | {m['l2_variation']:.2%} | "
@@ -116,23 +114,20 @@ def main() -> None:
     print("\n".join(lines), flush=True)
     threads = torch.get_num_threads()
     spawn = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory() as folder:
-        cameras, box = paper_rig(arguments.pixels)
-        for phantom in arguments.phantom:
-            clean = simulate(make_phantom(phantom, box, 0), cameras, box, N_AMBIENT)
-            clean.write(f"{folder}/{phantom}.nc")
-        for row in rows(arguments):
-            if arguments.only and row.name.split()[0] not in arguments.only:
-                continue
-            start = time.perf_counter()
-            with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-                line = pool.submit(run, row, f"{folder}/{row.phantom}.nc", arguments.pixels, threads).result()
-            lines.append(line)
-            print(line, file=sys.stdout, flush=True)
-            print(f"  {time.perf_counter() - start:.0f} s in all", file=sys.stderr, flush=True)
-            if arguments.write:
-                arguments.write.parent.mkdir(parents=True, exist_ok=True)
-                arguments.write.write_text("# Methods compared on the paper's rig\n\n" + "\n".join(lines) + "\n")
+    cameras, box = paper_rig(arguments.pixels)
+    clean = {p: simulate(make_phantom(p, box, 0), cameras, box, N_AMBIENT) for p in arguments.phantom}
+    for row in rows(arguments):
+        if arguments.only and row.name.split()[0] not in arguments.only:
+            continue
+        start = time.perf_counter()
+        with ProcessPoolExecutor(1, mp_context=spawn) as pool:
+            line = pool.submit(run, row, clean[row.phantom], threads).result()
+        lines.append(line)
+        print(line, file=sys.stdout, flush=True)
+        print(f"  {time.perf_counter() - start:.0f} s in all", file=sys.stderr, flush=True)
+        if arguments.write:
+            arguments.write.parent.mkdir(parents=True, exist_ok=True)
+            arguments.write.write_text("# Methods compared on the paper's rig\n\n" + "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

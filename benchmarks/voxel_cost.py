@@ -14,7 +14,6 @@ import datetime
 import multiprocessing
 import shlex
 import sys
-import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -37,11 +36,10 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def run(file: str, voxels: int, basis: str, iterations: int, device: str, threads: int) -> str:
+def run(measurement: Measurement, voxels: int, basis: str, iterations: int, device: str, threads: int) -> str:
     """Measure one grid and return its line; 0 voxels measure the base."""
     torch.set_num_threads(threads)
     keep_freed_memory()
-    measurement = Measurement.read(file)
     where = resolve_device(device)
     rays, displacement, _ = measurement.rays()
     if not voxels:
@@ -72,11 +70,10 @@ def run(file: str, voxels: int, basis: str, iterations: int, device: str, thread
     )
 
 
-def plain(file: str, voxels: int, basis: str, threads: int) -> tuple[float, float]:
+def plain(measurement: Measurement, voxels: int, basis: str, threads: int) -> tuple[float, float]:
     """Seconds of one application and its adjoint by the compiled and the plain kernels on the CPU."""
     torch.set_num_threads(threads)
     keep_freed_memory()
-    measurement = Measurement.read(file)
     rays, displacement, _ = measurement.rays()
     grid = Grid.of_resolution(measurement.box, voxels)
     operator = DeflectionOperator(rays, grid, N_AMBIENT, basis=basis)
@@ -110,35 +107,31 @@ def main() -> None:
         with ProcessPoolExecutor(1, mp_context=spawn) as pool:
             return pool.submit(function, *values).result()
 
-    with tempfile.TemporaryDirectory() as folder:
-        cameras, box = paper_rig(arguments.pixels)
-        measurement = simulate(make_phantom("flame", box, 0), cameras, box, N_AMBIENT, steps=40)
-        file = f"{folder}/flame.nc"
-        measurement.write(file)
-        base = int(alone(run, file, 0, "linear", 0, arguments.device, threads))
-        lines = [
-            f"Command: `python {shlex.join(sys.argv)}`  ",
-            f"Machine: {machine()}  ",
-            f"Date: {datetime.date.today().isoformat()}; {len(measurement.rays()[0])} rays; "
-            f"base {base / 2**30:.2f} GiB",
-            "",
-            "| " + " | ".join(COLUMNS) + " |",
-            "|" + "---|" * len(COLUMNS),
-        ]
-        print("\n".join(lines), flush=True)
+    cameras, box = paper_rig(arguments.pixels)
+    measurement = simulate(make_phantom("flame", box, 0), cameras, box, N_AMBIENT, steps=40)
+    base = int(alone(run, measurement, 0, "linear", 0, arguments.device, threads))
+    lines = [
+        f"Command: `python {shlex.join(sys.argv)}`  ",
+        f"Machine: {machine()}  ",
+        f"Date: {datetime.date.today().isoformat()}; {len(measurement.rays()[0])} rays; base {base / 2**30:.2f} GiB",
+        "",
+        "| " + " | ".join(COLUMNS) + " |",
+        "|" + "---|" * len(COLUMNS),
+    ]
+    print("\n".join(lines), flush=True)
+    for basis in arguments.basis:
+        for voxels in arguments.voxels:
+            line = alone(run, measurement, voxels, basis, arguments.iterations, arguments.device, threads)
+            memory = int(line.split(" | ")[-2])
+            line = line.replace(f"| {memory} |", f"| {memory / 2**30:.2f} |")
+            line = line.format(above=f"{(memory - base) / 2**30:.2f}")
+            lines.append(f"| {voxels}³ | {basis} | {line}")
+            print(lines[-1], flush=True)
+    if not torch.cuda.is_available():
         for basis in arguments.basis:
-            for voxels in arguments.voxels:
-                line = alone(run, file, voxels, basis, arguments.iterations, arguments.device, threads)
-                memory = int(line.split(" | ")[-2])
-                line = line.replace(f"| {memory} |", f"| {memory / 2**30:.2f} |")
-                line = line.format(above=f"{(memory - base) / 2**30:.2f}")
-                lines.append(f"| {voxels}³ | {basis} | {line}")
-                print(lines[-1], flush=True)
-        if not torch.cuda.is_available():
-            for basis in arguments.basis:
-                fast, slow = alone(plain, file, 64, basis, threads)
-                lines += ["", f"64³ {basis}, A and A^T once: compiled {fast:.2f} s, plain PyTorch {slow:.2f} s."]
-                print(lines[-1], flush=True)
+            fast, slow = alone(plain, measurement, 64, basis, threads)
+            lines += ["", f"64³ {basis}, A and A^T once: compiled {fast:.2f} s, plain PyTorch {slow:.2f} s."]
+            print(lines[-1], flush=True)
     if arguments.write:
         arguments.write.parent.mkdir(parents=True, exist_ok=True)
         arguments.write.write_text("# What the voxel operator costs\n\n" + "\n".join(lines) + "\n")

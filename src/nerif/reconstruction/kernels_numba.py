@@ -33,23 +33,26 @@ def adjoint(degree: int, displacement: np.ndarray, rays: tuple[np.ndarray, ...],
     _adjoint(padded, *rays, displacement, LINEAR if degree == 1 else CUBIC)
 
 
-def _weights(t: float, spline: Any) -> Any:
-    raise NotImplementedError  # chosen by the length of `spline` at compile time, below
+def _linear(t: Any, spline: Any) -> Any:
+    return (1 - t, t), (-1.0, 1.0)
+
+
+def _cubic(t: Any, spline: Any) -> Any:
+    s = 1 - t
+    near, far = 4 - 6 * t * t + 3 * t * t * t, 4 - 6 * s * s + 3 * s * s * s
+    weights = (s * s * s / 6, near / 6, far / 6, t * t * t / 6)
+    slopes = (-0.5 * s * s, 1.5 * t * t - 2 * t, 2 * s - 1.5 * s * s, 0.5 * t * t)
+    return weights, slopes
+
+
+def _weights(t: Any, spline: Any) -> Any:
+    """Weights of the neighbours, and their slopes, as fields.grid.spline_weights has them."""
+    return _linear(t, spline) if len(spline) == 2 else _cubic(t, spline)
 
 
 @overload(_weights, jit_options={"fastmath": FASTMATH})
-def _choose_weights(t: Any, spline: Any) -> Any:
-    def linear(t: Any, spline: Any) -> Any:
-        return (1 - t, t), (-1.0, 1.0)
-
-    def cubic(t: Any, spline: Any) -> Any:
-        s = 1 - t
-        near, far = 4 - 6 * t * t + 3 * t * t * t, 4 - 6 * s * s + 3 * s * s * s
-        weights = (s * s * s / 6, near / 6, far / 6, t * t * t / 6)
-        slopes = (-0.5 * s * s, 1.5 * t * t - 2 * t, 2 * s - 1.5 * s * s, 0.5 * t * t)
-        return weights, slopes
-
-    return linear if len(spline) == 2 else cubic
+def _compiled_weights(t: Any, spline: Any) -> Any:
+    return _linear if len(spline) == 2 else _cubic  # by the type of `spline`, so that no branch is left
 
 
 @njit(fastmath=FASTMATH)

@@ -152,15 +152,15 @@ class _Training:
         self.spent, self.started = 0.0, time.perf_counter()
         if resume is not None:
             self._restore(resume)
-        elif start is not None:
-            self._fit(start)
+            start = None
+        self.start = start
         self.good = self._capture()
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
     def run(self, on_step: OnStep | None) -> Reconstruction:
         """Train until something says stop, and return what there is."""
-        settings, outcome = self.settings, self._stop()
+        settings, outcome = self.settings, self._stop() or self._fit(on_step)
         clock, rays_then = time.perf_counter(), self.rays_done
         while outcome is None:
             target, count = self._batch()
@@ -191,21 +191,29 @@ class _Training:
                 outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
         return self._result(outcome)
 
-    def _fit(self, start: Field) -> None:
-        """Fit the network to the field that the run starts from; the steps after it are smaller."""
-        settings, half = self.settings, 0.5 * self.settings.time_limit or math.inf
+    def _fit(self, on_step: OnStep | None) -> Outcome | None:
+        """Fit the network to the field that the run starts from, if any; the steps after it are smaller."""
+        if self.start is None:
+            return None
+        settings, outcome = self.settings, None
 
         def log(step: int, loss: float) -> bool:
+            nonlocal outcome
+            values = {"fit_step": float(step), "fit_loss": loss}
             if step % LOG_EVERY == 0 or step == 1:
-                self.history.append({**self._where(), "fit_step": float(step), "fit_loss": loss})
-            return self.seconds >= half
+                self.history.append({**self._where(), **values})
+            outcome = self._stop()
+            if on_step is not None and on_step(self._tell(values, 0.0)) and outcome is None:
+                outcome = Outcome("interrupted", "stopped while fitting the start; --resume goes on from here")
+            return outcome is not None
 
         self.network.low = True
         fit_network(
-            self.field, self.network, start, settings.fit_steps, settings.points_per_batch, settings.learning_rate,
-            self.generator, log,
+            self.field, self.network, self.start, settings.fit_steps, settings.points_per_batch,
+            settings.learning_rate, self.generator, log,
         )  # fmt: skip
-        self.rate = settings.rate_after_fit
+        self.rate, self.good = settings.rate_after_fit, self._capture()
+        return outcome
 
     def _batch(self) -> tuple[Target, int]:
         """The next rays of this epoch's random order, and the number of samples each gets."""

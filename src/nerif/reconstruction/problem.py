@@ -63,27 +63,24 @@ class Differences:
     def __call__(self, x: Float[Tensor, "z y x"]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the differences along z, y and x."""
         padded = self.boundary.extend(x, 1)
-        along = []
-        for axis in range(3):
-            inner = padded
-            for other in range(3):
-                if other != axis:
-                    inner = inner.narrow(other, 1, self.shape[other])
-            along.append(torch.diff(inner, dim=axis) * self.inverse[axis])
-        return along[0], along[1], along[2]
+        z, y, x = (torch.diff(self._line(padded, axis), dim=axis) * self.inverse[axis] for axis in range(3))
+        return z, y, x
 
     def adjoint(self, along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y x"]:
         """Return the adjoint of the differences (minus the divergence)."""
         padded = along[0].new_zeros([n + 2 for n in self.shape])
         for axis in range(3):
-            inner = padded
-            for other in range(3):
-                if other != axis:
-                    inner = inner.narrow(other, 1, self.shape[other])
-            n = self.shape[axis] + 1
+            inner, n = self._line(padded, axis), self.shape[axis] + 1
             inner.narrow(axis, 1, n).add_(along[axis], alpha=self.inverse[axis])
             inner.narrow(axis, 0, n).sub_(along[axis], alpha=self.inverse[axis])
         return self.boundary.fold(padded, 1)
+
+    def _line(self, padded: Tensor, axis: int) -> Tensor:
+        """The part of a padded field that goes beyond the box along one axis only."""
+        for other in range(3):
+            if other != axis:
+                padded = padded.narrow(other, 1, self.shape[other])
+        return padded
 
 
 class Problem:

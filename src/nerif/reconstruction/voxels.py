@@ -86,7 +86,7 @@ class VoxelReconstructor(Reconstructor):
         for name in ("tolerance", "time_limit"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        low, high = self._bounds()
+        low, high = self.bounds or (-1.0, 1.0)
         if not low <= 0 <= high or low == high:
             raise InputError(
                 "lower, upper: expected bounds of the index excess around 0, the ambient, "
@@ -95,11 +95,12 @@ class VoxelReconstructor(Reconstructor):
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")
 
-    def _bounds(self) -> tuple[float, float]:
-        return (
-            -math.inf if self.lower is None else self.lower,
-            math.inf if self.upper is None else self.upper,
-        )
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Lowest and highest index excess, or None where neither is given."""
+        if self.lower is None and self.upper is None:
+            return None
+        return (-math.inf if self.lower is None else self.lower, math.inf if self.upper is None else self.upper)
 
     @property
     def weight(self) -> float | None:
@@ -172,7 +173,7 @@ class _Run:
         self.device = resolve_device(settings.device)
         self.faces = settings.ambient_faces or measurement.ambient_faces
         check_gauge(measurement, self.faces, settings.hull)
-        self.grids = _grids(measurement, settings, start)
+        self.grids = _grids(measurement, settings)
         needed = settings.memory_bytes(measurement, self.grids[-1], self.device.type)
         there = available_memory(self.device)
         if needed > there:
@@ -187,7 +188,8 @@ class _Run:
         self.target = Target.of(measurement, settings.open_faces).to(self.device)
         self.noise = None if self.target.chi_square_scale is None else 1 / self.target.chi_square_scale
         self.history: list[dict[str, float]] = []
-        self.level, self.done, self.total = 0, 0, 0
+        # a field to start from makes the coarse grids needless
+        self.level, self.done, self.total = 0 if start is None else len(self.grids) - 1, 0, 0
         self.weight = settings.weight
         self.chosen = ""
         self.x: Tensor | None = None
@@ -250,9 +252,7 @@ class _Run:
 
     def _problem(self, grid: Grid) -> Problem:
         free = None if self.free is None else _coarser(self.free, grid)
-        low, high = self.settings._bounds()
-        bounded = math.isfinite(low) or math.isfinite(high)
-        return Problem(self._operator(grid), self.target, free, (low, high) if bounded else None)
+        return Problem(self._operator(grid), self.target, free, self.settings.bounds)
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -264,13 +264,15 @@ class _Run:
         tolerance = settings.tolerance if tolerance is None else tolerance
         if settings.weight is not None:
             self.chosen = ""
+        self.x = x
         for iterate in settings.iterate(problem, x, weight):
-            self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
             objective = iterate.residual + weight * iterate.penalty
+            if not math.isfinite(objective):
+                message = "the objective turned non-finite, the field before that was kept"
+                raise _Stop("diverged", f"{message}; look for extreme displacements or sigma")
+            self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
             before, past = past[0], [*past[1:], objective]
             self._tell(problem, iterate, weight, objective)
-            if not math.isfinite(objective):
-                raise _Stop("diverged", "the objective turned non-finite; look for extreme displacements or sigma")
             converged = before - objective < tolerance * settings.patience * objective
             if settings.weight == 0.0 and self.noise is not None and iterate.residual <= self.noise:
                 self.chosen, converged = "residual is the noise (discrepancy principle)", True
@@ -378,11 +380,11 @@ class _Run:
         )
 
 
-def _grids(measurement: Measurement, settings: VoxelReconstructor, start: Field | None) -> list[Grid]:
+def _grids(measurement: Measurement, settings: VoxelReconstructor) -> list[Grid]:
     """The grids to solve on, coarse to fine."""
     finest = Grid.of_resolution(measurement.box, settings.voxels)
     grids = [finest]
-    while settings.coarse_to_fine and start is None and max(grids[0].shape) >= 2 * COARSEST:
+    while settings.coarse_to_fine and max(grids[0].shape) >= 2 * COARSEST:
         nz, ny, nx = grids[0].shape
         grids.insert(0, Grid(finest.box, (max(4, nz // 2), max(4, ny // 2), max(4, nx // 2))))
         if min(grids[0].shape) <= 4:
