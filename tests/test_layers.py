@@ -15,11 +15,13 @@ LAYERS = (
     ("conventions",),
     ("geometry",),
     ("measurement", "volume", "vti"),
+    ("imaging",),
     ("fields",),
     ("physics",),
-    ("metrics", "simulation"),
+    ("metrics", "simulation", "rendering"),
+    ("experiment",),
     ("reconstruction",),
-    ("evaluation",),
+    ("evaluation", "consistency", "mistakes"),
     ("report",),
     ("commands",),
     ("cli", "__main__"),
@@ -69,6 +71,13 @@ def test_files_stay_small(path):
     assert len(path.read_text().splitlines()) <= 450
 
 
+def test_fields_and_imaging_know_nothing_of_each_other():
+    for path in FILES:
+        part = path.relative_to(SOURCE).parts[0]
+        if part in ("imaging", "fields", "physics"):
+            assert not imports(path) & ({"imaging"} if part != "imaging" else {"fields", "physics"}), path
+
+
 HEAVY = (
     "xarray",
     "matplotlib",
@@ -81,6 +90,9 @@ HEAVY = (
     "scipy",
     "numba",
     "psutil",
+    "cv2",
+    "tifffile",
+    "imageio",
 )
 
 

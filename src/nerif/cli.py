@@ -10,6 +10,13 @@ from nerif import __version__
 __all__ = ["main"]
 
 VERBS = {
+    "design": "before the rig is built: expected displacement, sensitivity, blur and resolution",
+    "pattern": "print-ready backgrounds and calibration targets",
+    "calibrate": "target pictures, or another program's file, to calibrated cameras; draws the rig",
+    "displacement": "pictures of all views to a measurement",
+    "mask": "flow masks of a measurement, by threshold or drawn",
+    "check": "find swapped, flipped, mirrored and exchanged views of a measurement",
+    "render": "pictures of a rendered experiment, with its truth",
     "simulate": "trace curved rays through a phantom and write a measurement, with its truth",
     "reconstruct": "reconstruct the refractive-index field of a measurement",
     "project": "predict the displacement that any camera would see of a reconstruction",
@@ -26,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help"):
         print("usage: nerif VERB [options]      (nerif VERB --help tells all options, units and defaults)\n")
         print("Refractive index, density and temperature in 3-D from background-oriented schlieren pictures.\n")
-        print("\n".join(f"  {verb:<12} {text}" for verb, text in VERBS.items()))
+        print("\n".join(f"  {verb:<13} {text}" for verb, text in VERBS.items()))
         return 0
     if words[0] == "--version":
         print(f"nerif {__version__}")

@@ -1,0 +1,226 @@
+"""A whole rendered experiment: pictures of targets, background and flow of every view, as a laboratory would take them.
+
+The folder is one that nerif calibrate and nerif displacement read (imaging/views.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.fields.base import Field
+from nerif.geometry import Box, Camera
+from nerif.imaging.background import Background
+from nerif.imaging.bundle import Pose
+from nerif.imaging.targets import Target
+from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
+
+__all__ = ["Experiment", "background_poses", "background_scale", "place", "target_poses", "world_axes"]
+
+SIDES = {
+    (1, 0): ("z-", "x+", "y-"),
+    (-1, 0): ("z+", "x-", "y-"),
+    (0, 1): ("x-", "z-", "y-"),
+    (0, -1): ("x+", "z+", "y-"),
+}
+"""World axes along the axes of an upright target that faces the x or y direction of the world named by the key."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """How the pictures are taken."""
+
+    kind: str = "dots"
+    """Background: dots, wavelet or multiscale."""
+    dot: float = 3.0
+    """Size of a dot in the picture, px."""
+    references: int = 5
+    """Pictures without flow."""
+    sensor: Sensor = field(default_factory=Sensor)
+    f_number: float = 0.0
+    """Focal length over aperture; 0 is a pinhole."""
+    samples: int = 3
+    """Points along each edge of a pixel."""
+    target: str = "chessboard"
+    """Calibration target: chessboard, charuco or circles."""
+    columns: int = 10
+    """Squares (dots of circles) of the target along a row."""
+    rows: int = 7
+    """Squares along a column."""
+    pitch: float = 0.0
+    """Edge of a square, mm; 0 fills about 60 % of the picture at the origin."""
+    poses: int = 30
+    """Poses of the target free in space; 0 for no calibration pictures."""
+    backgrounds: int = 5
+    """Pictures of the target on each background."""
+    seed: int = 0
+    """Of patterns, poses and noise."""
+
+    def write(
+        self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,
+        focal_length: float, on_picture: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        """Render all pictures into VIEW/{target,background,reference,flow}/."""
+        lens = Lens(diameter=focal_length / self.f_number) if self.f_number > 0 else None
+        for i, camera in enumerate(cameras):
+            self._background_pictures(folder / camera.name, camera, i, phantom, box, n_ambient, lens, on_picture)
+        if self.poses:
+            self.write_targets(folder, cameras, on_picture)
+
+    def write_targets(
+        self, folder: Path, cameras: Sequence[Camera], on_picture: Callable[[], None] = lambda: None
+    ) -> None:
+        """Render the pictures of the target into VIEW/{target,background}/."""
+        target = self.target_for(cameras)
+        laid = target.scaled(background_scale(cameras))
+        for j, pose in enumerate(target_poses(cameras, target, self.poses, self.seed)):
+            for camera in cameras:
+                if _faces(pose, camera):
+                    self._target_picture(folder / camera.name / "target" / f"pose_{j:03d}.tif", camera, target, pose)
+                on_picture()
+        for camera in cameras:
+            for j, pose in enumerate(background_poses(camera, laid, self.backgrounds)):
+                self._target_picture(folder / camera.name / "background" / f"laid_{j:03d}.tif", camera, laid, pose)
+                on_picture()
+
+    def target_for(self, cameras: Sequence[Camera]) -> Target:
+        """Return the target, of a size that fits the pictures if none is given."""
+        pitch = self.pitch
+        if pitch == 0:
+            seen = (c.centre.norm() / c.intrinsics[0, 0] * torch.tensor(c.image_size) for c in cameras)
+            pitch = 0.75 * min(min(float(s[1]) / (self.columns + 1), float(s[0]) / (self.rows + 1)) for s in seen)
+        return Target(self.target, self.columns, self.rows, pitch)
+
+    def pictures(self, views: int) -> int:
+        """Number of pictures of `views` views (those of targets that face away counted)."""
+        return views * (self.references + 1 + (self.poses + self.backgrounds if self.poses else 0))
+
+    def _background_pictures(
+        self, folder: Path, camera: Camera, i: int, phantom: Field, box: Box, n_ambient: float, lens: Lens | None,
+        on_picture: Callable[[], None],
+    ) -> None:  # fmt: skip
+        width, height = pattern_size(camera)
+        pixel = width / 1.1 / camera.image_size[1]
+        pattern = Background(self.kind, width, height, dot=self.dot * pixel, seed=1000 * self.seed + i)
+        texel = self.dot * pixel / 12
+        texture = background_texture(camera, torch.from_numpy(pattern.raster(texel)), texel)
+        still = render(camera, texture, samples=self.samples, lens=lens)
+        for k in range(self.references):
+            self._save(folder / "reference" / f"reference_{k:03d}.tif", still)
+            on_picture()
+        flow = render(camera, texture, phantom, box, n_ambient, self.samples, lens)
+        self._save(folder / "flow" / "flow_000.tif", flow)
+        on_picture()
+
+    def _target_picture(self, path: Path, camera: Camera, target: Target, pose: Pose) -> None:
+        self._save(path, render(camera, place(target, pose, camera), samples=self.samples))
+
+    def _save(self, path: Path, light: Float[Tensor, "row column"]) -> None:
+        import zlib
+
+        import tifffile
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        seed = zlib.crc32("/".join(path.parts[-3:]).encode()) + self.seed  # the same pictures in any folder and order
+        counts = self.sensor.expose(light, seed)
+        # a 16-bit file tells that only so many bits of it are used
+        tags = [(281, "H", 1, 2**self.sensor.bits - 1, False)]
+        tifffile.imwrite(path, counts, extratags=tags)
+
+
+def background_scale(cameras: Sequence[Camera]) -> float:
+    """Return how much larger the target on the backgrounds has to be to look as large as at the origin."""
+    middle = [
+        torch.tensor([[(c.image_size[1] - 1) / 2, (c.image_size[0] - 1) / 2]], dtype=torch.float64) for c in cameras
+    ]
+    ratios = [float(c.rays(m).background[0] / c.centre.norm()) for c, m in zip(cameras, middle, strict=True)]
+    return round(min(ratios), 1)
+
+
+def world_axes(cameras: Sequence[Camera]) -> tuple[str, str, str]:
+    """Return the axes (as nerif calibrate takes them) of the first target pose: the rig's own world."""
+    return SIDES[_side(cameras)]
+
+
+def _side(cameras: Sequence[Camera]) -> tuple[int, int]:
+    """The horizontal axis of the world that points most towards the middle camera."""
+    middle = cameras[len(cameras) // 2].centre
+    x, y = float(middle[0]), float(middle[1])
+    if abs(x) > abs(y):
+        return (1 if x > 0 else -1, 0)
+    return (0, 1 if y > 0 else -1)
+
+
+def target_poses(cameras: Sequence[Camera], target: Target, count: int, seed: int) -> list[Pose]:
+    """Return poses (target to world) around the origin, turned towards the cameras; the first one stands straight.
+
+    The others face a point between two neighbouring cameras, tilted by up to 35 degrees and moved by up to a tenth of
+    the target's size, so that each is seen by several cameras.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if count < 4:
+        raise InputError(f"poses: expected 4 target poses or more, got {count}")
+    rng = np.random.default_rng(seed)
+    centres = np.stack([c.centre.numpy() for c in cameras])
+    side = _side(cameras)
+    poses = [Pose(_facing(np.array([*side, 0.0])), np.zeros(3))]
+    for k in range(count - 1):
+        at = (k + rng.random()) / (count - 1) * (len(centres) - 1)
+        i = min(int(at), max(len(centres) - 2, 0))
+        j = min(i + 1, len(centres) - 1)
+        towards = (1 - (at - i)) * centres[i] + (at - i) * centres[j]
+        tilt = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
+        shift = 0.1 * max(target.size) * rng.uniform(-1, 1, 3)
+        poses.append(Pose(_facing(towards / np.linalg.norm(towards)) @ tilt, shift))
+    return poses
+
+
+def background_poses(camera: Camera, target: Target, count: int) -> list[Pose]:
+    """Return poses of the target laid on a camera's background: in the middle, then towards the corners."""
+    from scipy.spatial.transform import Rotation
+
+    middle = background_texture(camera, torch.zeros(2, 2, dtype=torch.float64), 1.0)
+    frame = torch.stack([middle.right, middle.down, torch.linalg.cross(middle.right, middle.down)], dim=1).numpy()
+    centre = (middle.corner + middle.right + middle.down).numpy()
+    width, height = (s / 2.2 for s in pattern_size(camera))  # half of what the picture shows
+    room = np.maximum(0.9 * np.array([width, height]) - np.array(target.size) / 2, 0)
+    corners = [(0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, 0), (1, 0)]
+    poses = []
+    for k in range(count):
+        across, down = room * corners[k % len(corners)]
+        turn = Rotation.from_euler("z", 8 * (k % 3 - 1), degrees=True).as_matrix()
+        poses.append(Pose(frame @ turn, centre + across * frame[:, 0] + down * frame[:, 1]))
+    return poses
+
+
+def place(target: Target, pose: Pose, camera: Camera) -> Texture:
+    """Return a target in space as something to render, drawn finely enough for a camera."""
+    depth = float(camera.rotation[2].numpy() @ pose.translation + float(camera.translation[2]))
+    fine = depth / float(camera.intrinsics[0, 0]) / 3  # as the points of a pixel: finer edges would alias
+    values, texel = torch.from_numpy(target.raster(fine)), target.raster_pixel(fine)
+    right, down = (torch.from_numpy(pose.rotation[:, k].copy()) for k in range(2))
+    height, width = values.shape
+    corner = torch.from_numpy(pose.translation) - right * (width * texel / 2) - down * (height * texel / 2)
+    return Texture(values, texel, corner, right, down)
+
+
+def _facing(towards: np.ndarray) -> np.ndarray:
+    """Rotation of an upright target whose front faces a direction."""
+    z = -towards
+    x = np.cross([0.0, 0.0, -1.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _faces(pose: Pose, camera: Camera) -> bool:
+    """Whether a camera sees the front of a target at less than 55 degrees."""
+    line = camera.centre.numpy() - pose.translation
+    return bool(-pose.rotation[:, 2] @ line / np.linalg.norm(line) > np.cos(np.radians(55)))

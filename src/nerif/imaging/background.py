@@ -1,0 +1,194 @@
+"""Backgrounds to print: random dots, wavelet noise, multi-scale noise, as an array, PNG or PDF at true size.
+
+A pattern is a raster of reflectance, 0 black to 1 white. The dot size is the length of its smallest features on paper;
+seen by the camera it should cover 2 to 5 px (Raffel, Background-oriented schlieren techniques, Exp. Fluids 56 (2015)).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nerif.conventions import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["KINDS", "Background", "write_pattern"]
+
+KINDS = ("dots", "wavelet", "multiscale")
+MARGIN = 8.0  # mm of paper around a printed pattern, for its scale bar
+
+
+@dataclass(frozen=True)
+class Background:
+    """A printed background.
+
+    Parameters
+    ----------
+    kind : dots (random, not overlapping much), wavelet (band-limited noise), multiscale (noise on all scales)
+    width, height : of the pattern, mm
+    dot : diameter of a dot, or the smallest feature of a noise, mm
+    fill : share of the paper that dots cover
+    seed : of the pattern
+
+    Raises
+    ------
+    InputError
+        If the kind is unknown, a length is not positive, or fill is not between 0 and 0.6.
+
+    Source: wavelet noise as in Cook & DeRose, ACM Trans. Graph. 24 (2005) 803; used for schlieren by Atcheson et al.,
+    Exp. Fluids 46 (2009) 467, from where the idea of features on all scales comes too.
+    """
+
+    kind: str = "multiscale"
+    width: float = 200.0
+    height: float = 200.0
+    dot: float = 1.0
+    fill: float = 0.35
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"kind: expected one of {', '.join(KINDS)}, got '{self.kind}'")
+        for name in ("width", "height", "dot"):
+            if not 0 < getattr(self, name) < 1e5:
+                raise InputError(f"{name}: expected a positive length in mm, got {getattr(self, name)}")
+        if not 0 < self.fill <= 0.6:
+            raise InputError(f"fill: expected a share of the paper between 0 and 0.6, got {self.fill}")
+        if 4 * self.dot > min(self.width, self.height):
+            raise InputError(
+                f"dot: expected a quarter of the pattern ({min(self.width, self.height):g} mm) or less, got {self.dot}"
+            )
+
+    def raster(self, pixel: float) -> np.ndarray:
+        """Return the pattern as reflectance (row, column) from 0 to 1 on pixels of `pixel` mm.
+
+        Raises
+        ------
+        InputError
+            If a pixel is longer than half a dot, which it could not show.
+        """
+        if not 0 < pixel <= self.dot / 2:
+            raise InputError(f"pixel: expected half the dot size ({self.dot / 2:g} mm) or less, got {pixel} mm")
+        shape = (max(1, round(self.height / pixel)), max(1, round(self.width / pixel)))
+        if self.kind == "dots":
+            return self._draw_dots(shape, pixel)
+        noise = self._wavelet(shape, pixel) if self.kind == "wavelet" else self._multiscale(shape, pixel)
+        return np.asarray(np.clip(0.5 + noise / (4 * noise.std()), 0, 1))  # two standard deviations fill the range
+
+    def dots(self) -> np.ndarray:
+        """Return the centres (n, 2) of the dots, mm from the upper left corner; none nearer than 0.9 diameters."""
+        from scipy.spatial import cKDTree
+
+        wanted = round(self.fill * self.width * self.height / (np.pi * self.dot**2 / 4))
+        rng = np.random.default_rng(self.seed)
+        size = np.array([self.width, self.height])
+        centres = np.empty((0, 2))
+        for _ in range(60):  # draw, and drop the later one of any two that come too close
+            missing = wanted - len(centres)
+            if missing <= 0:
+                break
+            drawn = np.concatenate([centres, rng.random((missing, 2)) * size])
+            pairs = cKDTree(drawn).query_pairs(0.9 * self.dot, output_type="ndarray")
+            keep = np.ones(len(drawn), dtype=bool)
+            keep[pairs.max(axis=1)] = False
+            centres = drawn[keep]
+        return centres
+
+    def _draw_dots(self, shape: tuple[int, int], pixel: float) -> np.ndarray:
+        """Dots with edges one pixel soft."""
+        image = np.ones(shape)
+        radius = self.dot / 2 / pixel
+        reach = int(np.ceil(radius + 1))
+        offsets = np.arange(-reach, reach + 1)
+        for x, y in self.dots() / pixel - 0.5:
+            i, j = round(y), round(x)
+            rows, columns = i + offsets, j + offsets
+            rows, columns = rows[(rows >= 0) & (rows < shape[0])], columns[(columns >= 0) & (columns < shape[1])]
+            distance = np.hypot(rows[:, None] - y, columns[None, :] - x)
+            patch = image[rows[:, None], columns]
+            image[rows[:, None], columns] = np.minimum(patch, np.clip(distance - radius + 0.5, 0, 1))
+        return image
+
+    def _wavelet(self, shape: tuple[int, int], pixel: float) -> np.ndarray:
+        """One octave of noise: white noise less what a twice coarser lattice can hold."""
+        from scipy.ndimage import zoom
+
+        cells = [max(8, 2 * int(np.ceil(n * pixel / self.dot / 2)) + 8) for n in shape]
+        white = np.random.default_rng(self.seed).standard_normal(cells)
+        coarse = zoom(white, 0.5, order=3, mode="grid-wrap", grid_mode=True)
+        band = white - zoom(coarse, 2, order=3, mode="grid-wrap", grid_mode=True)
+        return _spread(band, shape, self.dot / pixel)
+
+    def _multiscale(self, shape: tuple[int, int], pixel: float) -> np.ndarray:
+        """Octaves of smoothed white noise from the dot size up to a quarter of the pattern, equally strong."""
+        total = np.zeros(shape)
+        size, octave = self.dot, 0
+        while octave == 0 or size <= min(self.width, self.height) / 4:
+            rng = np.random.default_rng([self.seed, octave])
+            cells = [int(np.ceil(n * pixel / size)) + 8 for n in shape]
+            noise = _spread(rng.standard_normal(cells), shape, size / pixel)
+            total += noise / noise.std()
+            size, octave = 2 * size, octave + 1
+        return total
+
+
+def _spread(cells: np.ndarray, shape: tuple[int, int], spacing: float) -> np.ndarray:
+    """Lay a lattice of values over the pixels by cubic splines; a border of cells is left over on each side."""
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = ((np.arange(n) + 0.5) / spacing + 3 for n in shape)
+    return np.asarray(map_coordinates(cells, np.meshgrid(rows, columns, indexing="ij"), order=3, mode="nearest"))
+
+
+def write_pattern(path: str | os.PathLike[str], raster: np.ndarray, pixel: float, label: str) -> None:
+    """Write a pattern at true size: PNG (with its resolution in the file) or PDF (with a scale bar to check the print).
+
+    Parameters
+    ----------
+    raster : (row, column) reflectance, 0 to 1
+    pixel : mm
+    label : printed below a PDF
+
+    Raises
+    ------
+    InputError
+        If the name ends in neither .png nor .pdf.
+    """
+    path = Path(path)
+    if path.suffix == ".png":
+        import imageio.v3 as iio
+
+        dots_per_inch = 25.4 / pixel
+        iio.imwrite(path, np.round(raster * 255).astype(np.uint8), dpi=(dots_per_inch, dots_per_inch))
+    elif path.suffix == ".pdf":
+        import matplotlib.pyplot as plt
+
+        figure = _page(raster, pixel, label)
+        figure.savefig(path)
+        plt.close(figure)
+    else:
+        raise InputError(f"{path}: expected a name ending in .png or .pdf")
+
+
+def _page(raster: np.ndarray, pixel: float, label: str) -> Figure:
+    """A page of the pattern's own size with a margin, one millimetre of data to a millimetre of paper."""
+    import matplotlib.pyplot as plt
+
+    height, width = (n * pixel for n in raster.shape)
+    page = width + 2 * MARGIN, height + 2 * MARGIN
+    figure = plt.figure(figsize=(page[0] / 25.4, page[1] / 25.4), dpi=25.4 / pixel)
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, page[0]), ylim=(page[1], 0), autoscale_on=False)
+    axes.axis("off")
+    extent = (MARGIN, MARGIN + width, MARGIN + height, MARGIN)
+    axes.imshow(raster, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="none", aspect="auto")
+    bar = next((b for b in (100.0, 50.0, 20.0, 10.0) if b <= width), width)
+    y = page[1] - 0.6 * MARGIN
+    axes.plot([MARGIN, MARGIN + bar], [y, y], color="black", linewidth=1, solid_capstyle="butt")
+    axes.text(MARGIN, y + 0.45 * MARGIN, f"{bar:g} mm   {label}", fontsize=6)
+    return figure

@@ -1,0 +1,219 @@
+"""The calibration file: cameras as TOML that a person can read, and mend.
+
+format = "nerif-calibration-1"
+[[camera]]
+name = "cam1"
+image_size = [200, 240]                 # height, width, px; may be left out
+intrinsics = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]    # px
+distortion = [k1, k2, p1, p2, k3]       # may be left out
+rotation = [[...], [...], [...]]        # world to camera
+translation = [tx, ty, tz]              # mm
+[camera.background]                     # normal . x = offset; may be left out
+normal = [nx, ny, nz]
+offset = -500.0                         # mm
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError, Matrix3
+from nerif.geometry import Camera, Plane
+
+__all__ = ["FORMAT", "CalibratedCamera", "checked", "five", "numbers", "read_cameras", "upright", "write_cameras"]
+
+FORMAT = "nerif-calibration-1"
+KEYS = ("name", "image_size", "intrinsics", "distortion", "rotation", "translation", "background")
+ANYWHERE = Plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.0)
+
+
+@dataclass(frozen=True)
+class CalibratedCamera:
+    """A camera as a calibration knows it: its background plane and image size may be unknown.
+
+    Parameters
+    ----------
+    name : of the view
+    intrinsics : (3, 3) K, px
+    rotation : (3, 3) world to camera
+    translation : (3,) world to camera, mm
+    distortion : (5,) k1, k2, p1, p2, k3
+    image_size : (height, width), px, or None
+    background : Plane, world frame, mm, or None
+    """
+
+    name: str
+    intrinsics: Matrix3
+    rotation: Matrix3
+    translation: Float[Tensor, 3]
+    distortion: Float[Tensor, 5]
+    image_size: tuple[int, int] | None = None
+    background: Plane | None = None
+
+    def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
+        """Return the whole camera.
+
+        Raises
+        ------
+        InputError
+            If image size or background plane are known neither here nor there.
+        """
+        image_size, background = image_size or self.image_size, background or self.background
+        if image_size is None:
+            raise InputError(f"view '{self.name}' has no image size in its calibration; give --image-size HEIGHT WIDTH")
+        if background is None:
+            raise InputError(
+                f"view '{self.name}' has no background plane: calibrate it with a target laid on the background, or "
+                "give nerif calibrate --background-distance"
+            )
+        return Camera(
+            self.intrinsics, self.rotation, self.translation, image_size, background, self.distortion, self.name
+        )
+
+    @classmethod
+    def from_camera(cls, camera: Camera) -> CalibratedCamera:
+        """Take over a whole camera."""
+        return cls(
+            camera.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion,
+            camera.image_size, camera.background,
+        )  # fmt: skip
+
+
+def checked(camera: CalibratedCamera, source: str) -> CalibratedCamera:
+    """Return the camera if it can be one, else raise an InputError that names the source."""
+    try:
+        camera.camera(camera.image_size or (1, 1), camera.background or ANYWHERE)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
+    return camera
+
+
+def numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
+    """Return an array of float64 of a given shape.
+
+    Raises
+    ------
+    InputError
+        If it is none; the message says what it should be.
+    """
+    try:
+        array = torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{what}: expected {' x '.join(map(str, shape)) or 'one'} numbers, got {value!r}") from None
+    if tuple(array.shape) != shape:
+        got = " x ".join(map(str, array.shape)) or "a single number"
+        raise InputError(f"{what}: expected {' x '.join(map(str, shape)) or 'one'} numbers, got {got}")
+    if not bool(torch.isfinite(array).all()):
+        raise InputError(f"{what}: expected finite numbers, got {value!r}")
+    return array
+
+
+def five(values: Any, where: str) -> Tensor:
+    """Return OpenCV's five coefficients of 4 to 14; InputError if those beyond are not 0."""
+    given = np.asarray(values, dtype=np.float64).ravel()
+    if np.any(given[5:] != 0):
+        raise InputError(
+            f"{where}: expected at most 5 distortion coefficients (k1 k2 p1 p2 k3), got {len(given)}; calibrate again "
+            "without the rational, thin-prism and tilted models"
+        )
+    return torch.from_numpy(np.concatenate([given[:5], np.zeros(max(0, 5 - len(given)))]))
+
+
+def upright(matrix: Any, where: str) -> Tensor:
+    """Return K as OpenCV writes it, transposed back if it is MATLAB's."""
+    k = numbers(matrix, (3, 3), where)
+    if bool(k[:2, 2].abs().max() == 0) and bool(k[2, :2].abs().max() > 0):
+        k = k.T.contiguous()
+    return k / k[2, 2] if float(k[2, 2]) not in (0.0, 1.0) else k
+
+
+def write_cameras(
+    path: str | os.PathLike[str], cameras: Sequence[CalibratedCamera], about: dict[str, Any] | None = None
+) -> None:
+    """Write cameras, and what else is worth keeping under [about], atomically and in full precision."""
+    import tomli_w
+
+    tables = []
+    for camera in cameras:
+        table: dict[str, Any] = {"name": camera.name}
+        if camera.image_size is not None:
+            table["image_size"] = list(camera.image_size)
+        for name in ("intrinsics", "distortion", "rotation", "translation"):
+            table[name] = getattr(camera, name).tolist()
+        if camera.background is not None:
+            table["background"] = {"normal": camera.background.normal.tolist(), "offset": camera.background.offset}
+        tables.append(table)
+    temporary = Path(f"{os.fspath(path)}.part")
+    temporary.write_text(tomli_w.dumps({"format": FORMAT, "camera": tables, **({"about": about} if about else {})}))
+    os.replace(temporary, path)
+
+
+def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
+    """Read a calibration file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, no TOML, of another format, or a camera in it cannot be one; names file, camera and key.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected a calibration") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise InputError(f"{path}: not a TOML file ({error})") from None
+    if table.get("format") != FORMAT:
+        raise InputError(f"{path}: expected format = '{FORMAT}', got {table.get('format')!r}")
+    tables = table.get("camera", [])
+    if not isinstance(tables, list) or not tables:
+        raise InputError(f"{path}: expected at least one table [[camera]], got none")
+    cameras = tuple(_camera(t, i, str(path)) for i, t in enumerate(tables))
+    names = [c.name for c in cameras]
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: expected cameras of different names, got {', '.join(names)}")
+    return cameras
+
+
+def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
+    name = str(table.get("name", f"camera {index}"))
+    where = f"{path}: camera '{name}'"
+    for key in table:
+        if key not in KEYS:
+            near = difflib.get_close_matches(key, KEYS, n=1, cutoff=0)[0]
+            raise InputError(f"{where}: unknown key '{key}'; the nearest known one is '{near}'")
+    for key in ("name", "intrinsics", "rotation", "translation"):
+        if key not in table:
+            raise InputError(f"{where}: '{key}' is missing")
+    size = numbers(table["image_size"], (2,), f"{where}: image_size") if "image_size" in table else None
+    plane = None
+    if "background" in table:
+        given = table["background"]
+        if not isinstance(given, dict) or set(given) != {"normal", "offset"}:
+            raise InputError(f"{where}: background: expected normal = [x, y, z] and offset = mm, got {given!r}")
+        normal = numbers(given["normal"], (3,), f"{where}: background normal")
+        length = float(normal.norm())
+        if not length > 0:
+            raise InputError(f"{where}: background normal: expected a direction, got {given['normal']}")
+        plane = Plane(normal / length, float(numbers(given["offset"], (), f"{where}: background offset")) / length)
+    camera = CalibratedCamera(
+        name=name,
+        intrinsics=numbers(table["intrinsics"], (3, 3), f"{where}: intrinsics"),
+        rotation=numbers(table["rotation"], (3, 3), f"{where}: rotation"),
+        translation=numbers(table["translation"], (3,), f"{where}: translation"),
+        distortion=numbers(table.get("distortion", [0.0] * 5), (5,), f"{where}: distortion"),
+        image_size=None if size is None else (int(size[0]), int(size[1])),
+        background=plane,
+    )
+    return checked(camera, path)

@@ -1,0 +1,1 @@
+from nerif.imaging.readers import Frames as Frames

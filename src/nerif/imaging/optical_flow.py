@@ -1,0 +1,81 @@
+"""Optical flow by well-kept libraries: one function a method, all with the same habit.
+
+Each takes the flow picture and the reference, both float32 on a scale of 0 to 255, and returns the movement w (px) of
+what is seen at p in the flow picture to where it is in the reference: flow(p) = reference(p + w(p)), so d = -w.
+
+Sources: DeepFlow: Weinzaepfel et al., ICCV 2013 (the paper's choice); DIS: Kroeger et al., ECCV 2016; TV-L1: Zach et
+al., DAGM 2007; ILK: Le Besnerais & Champagnat, ICIP 2005.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+__all__ = ["FLOWS", "warp"]
+
+
+def warp(image: np.ndarray, movement: np.ndarray) -> np.ndarray:
+    """Return image(p + movement(p)) by cubic splines, edge values beyond the edges."""
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    where = [rows + movement[..., 1], columns + movement[..., 0]]
+    return np.asarray(map_coordinates(image.astype(np.float32), where, order=3, mode="nearest"))
+
+
+def deepflow(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
+    """OpenCV's DeepFlow; its smoothness is a fixed one."""
+    import cv2
+
+    start: Any = None
+    return np.asarray(cv2.optflow.createOptFlow_DeepFlow().calc(flow, reference, start))
+
+
+def dis(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
+    """OpenCV's dense inverse search, down to single pixels; it takes eight bits."""
+    import cv2
+
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(0)
+    method.setPatchStride(2)
+    method.setVariationalRefinementIterations(20)
+    method.setVariationalRefinementAlpha(20.0 * smoothness)
+    first, second = (np.clip(np.round(i), 0, 255).astype(np.uint8) for i in (flow, reference))
+    start: Any = None
+    return np.asarray(method.calc(first, second, start))
+
+
+def tvl1(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
+    """scikit-image's TV-L1."""
+    from skimage.registration import optical_flow_tvl1
+
+    v, u = optical_flow_tvl1(flow / 255, reference / 255, attachment=5 / smoothness, num_warp=10)
+    return np.stack([u, v], axis=-1)
+
+
+def ilk(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
+    """scikit-image's iterative Lucas-Kanade, Gaussian windows."""
+    from skimage.registration import optical_flow_ilk
+
+    radius = max(2, round(6 * smoothness))
+    v, u = optical_flow_ilk(flow / 255, reference / 255, radius=radius, num_warp=10, gaussian=True)
+    return np.stack([u, v], axis=-1)
+
+
+def correlation(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
+    """Cross-correlation of interrogation windows, of 12 px at smoothness 1 (correlation.py)."""
+    from nerif.imaging.correlation import window_correlation
+
+    return window_correlation(flow, reference, window=max(8, 2 * round(6 * smoothness)))
+
+
+FLOWS: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {
+    "deepflow": deepflow,
+    "dis": dis,
+    "tvl1": tvl1,
+    "ilk": ilk,
+    "correlation": correlation,
+}

@@ -1,0 +1,2 @@
+from nerif.imaging.readers import Crop as Crop
+from nerif.imaging.readers import ImageSequence as ImageSequence

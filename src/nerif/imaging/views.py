@@ -1,0 +1,234 @@
+"""Where the pictures of an experiment are: a folder with a folder a view, or a file views.toml that says it.
+
+    experiment/
+      cam1/target/*.tif  background/*.tif  reference/*.tif  flow/*.tif
+      cam2/...
+
+A `views.toml` in the folder takes the place of that layout. What stands above the tables holds for every view:
+
+    reference = "reference.cihx"        # a file, a folder, a pattern; [0:50] behind it selects frames
+    flow = "run1.cihx[100:200]"
+    [views.left]
+    row = 0
+    column = 0
+    height = 512
+    width = 512
+    flip = "horizontal"                 # what is seen through a mirror
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from nerif.conventions import InputError
+from nerif.imaging.calibration import ViewPictures
+from nerif.imaging.frames import Frames
+from nerif.imaging.readers import check_exposure, effective_bits, good_frames, open_frames
+from nerif.imaging.sequences import Crop
+from nerif.imaging.targets import Detection, Target
+
+__all__ = ["SOURCES", "View", "find_targets", "find_views", "good_pictures"]
+
+SOURCES = ("target", "background", "reference", "flow", "mask", "region")
+"""What a view may have: target pictures, the target on the background, pictures without and with flow, drawn masks."""
+
+CROP = tuple(f.name for f in fields(Crop))
+
+
+@dataclass(frozen=True)
+class View:
+    """Where the pictures of one view are.
+
+    Parameters
+    ----------
+    name : of the view
+    folder : that the sources are relative to
+    sources : what open_frames takes, by the names of SOURCES
+    crop : the view's part of each frame
+    """
+
+    name: str
+    folder: Path
+    sources: dict[str, str]
+    crop: Crop | None = None
+
+    def open(self, source: str) -> Frames:
+        """Open the frames of a source.
+
+        Raises
+        ------
+        InputError
+            If the view has none, or they cannot be read.
+        """
+        if source not in self.sources:
+            raise InputError(
+                f"view '{self.name}': no {source} pictures; expected {self.folder / self.name / source}/ or a line "
+                f'{source} = "..." in {self.folder / "views.toml"}'
+            )
+        return open_frames(self.sources[source], self.folder)
+
+    def cropped(self, image: np.ndarray, name: str) -> np.ndarray:
+        """Return the view's part of a frame."""
+        return self.crop(image, name) if self.crop else image
+
+
+def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
+    """Find the views of an experiment.
+
+    Parameters
+    ----------
+    folder : of the experiment
+    only : names of the views wanted; all if empty
+
+    Raises
+    ------
+    InputError
+        If the folder is missing, holds no view, or `only` names one that is not there.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected one with a folder for each view")
+    file = folder / "views.toml"
+    views = _from_file(file) if file.is_file() else _from_folders(folder)
+    if not views:
+        raise InputError(
+            f"{folder}: no view found; expected folders such as {folder.name}/cam1/reference and "
+            f"{folder.name}/cam1/flow, or a file views.toml"
+        )
+    names = [v.name for v in views]
+    for name in only:
+        if name not in names:
+            raise InputError(f"views: expected some of {', '.join(names)}, got '{name}'")
+    return tuple(v for v in views if not only or v.name in only)
+
+
+def _from_folders(folder: Path) -> list[View]:
+    """Each folder that holds something named as one of SOURCES is a view."""
+    views = []
+    for inner in sorted((p for p in folder.iterdir() if p.is_dir()), key=_natural):
+        entries = {
+            source: str(entry.relative_to(folder))
+            for source in SOURCES
+            for entry in sorted(inner.iterdir())
+            if (entry.name if entry.is_dir() else entry.stem) == source and not entry.name.endswith(".mraw")
+        }
+        if entries:
+            views.append(View(inner.name, folder, entries))
+    return views
+
+
+def _natural(path: Path) -> tuple[list[float], str]:
+    """Sort key by which cam2 comes before cam10, and 9deg before 10.5deg."""
+    return [float(n) for n in re.findall(r"\d+(?:\.\d+)?", path.name)], path.name
+
+
+def _from_file(file: Path) -> list[View]:
+    try:
+        table = tomllib.loads(file.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: not a TOML file ({error})") from None
+    tables = table.pop("views", {})
+    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
+        raise InputError(f"{file}: expected a table [views.NAME] for each view")
+    views = []
+    for name, own in tables.items():
+        entries = {**table, **own}
+        for key, value in entries.items():
+            if key not in (*SOURCES, *CROP):
+                near = difflib.get_close_matches(key, (*SOURCES, *CROP), n=1, cutoff=0)[0]
+                raise InputError(f"{file}: unknown key '{key}'; the nearest known one is '{near}'")
+            wanted = str if key in (*SOURCES, "flip") else int
+            if not isinstance(value, wanted) or isinstance(value, bool):
+                raise InputError(f"{file}: '{key}' of view '{name}': expected {wanted.__name__}, got {value!r}")
+        crop = {k: v for k, v in entries.items() if k in CROP}
+        sources = {k: v for k, v in entries.items() if k in SOURCES}
+        views.append(View(name, file.parent, sources, Crop(**crop) if crop else None))
+    return views
+
+
+def good_pictures(view: View, source: str, say: Callable[[str], None], most: int = 0) -> list[np.ndarray]:
+    """Read the pictures of a source that can be used; what is wrong with the others is said.
+
+    Parameters
+    ----------
+    most : number of pictures to read, evenly spread; 0 for all
+
+    Raises
+    ------
+    InputError
+        If none can be used.
+    """
+    frames = view.open(source)
+    good, bad = good_frames(frames)
+    for line in bad:
+        say(f"left out: {line}")
+    if not good:
+        raise InputError(f"view '{view.name}': none of its {len(frames)} {source} pictures can be used; {bad[0]}")
+    if most and len(good) > most:
+        good = [good[i] for i in np.linspace(0, len(good) - 1, most).round().astype(int)]
+    bits, pictures = effective_bits(frames), []
+    for i in good:
+        name = frames.name(i)
+        picture = view.cropped(frames[i], name)
+        exposure = check_exposure(picture, bits, name)
+        if exposure:
+            say(f"note: {exposure}")
+        pictures.append(picture)
+    return pictures
+
+
+def find_targets(
+    view: View,
+    target: Target,
+    say: Callable[[str], None],
+    on_picture: Callable[[], None] = lambda: None,
+    on_background: Target | None = None,
+) -> ViewPictures:
+    """Find the target in all pictures of a view; say which pictures were of no use.
+
+    `on_background` is the target that lay on the background, if that was another one (a larger print, say).
+
+    Poses are named by the last number in the name of a picture, so that pose_007.png of one camera and cam2-7.tif of
+    another are the same pose; by the number of the frame in a stack or recording.
+    """
+    found: dict[str, dict[str, Detection]] = {"target": {}, "background": {}}
+    size = (0, 0)
+    for source in ("target", "background"):
+        if source not in view.sources:
+            if source == "target":
+                view.open(source)  # says what is missing
+            continue
+        frames = view.open(source)
+        good, bad = good_frames(frames)
+        for line in bad:
+            say(f"left out: {line}")
+        keys = _pose_keys([frames.name(i) for i in range(len(frames))])
+        for i in good:
+            picture = view.cropped(frames[i], frames.name(i))
+            if size not in ((0, 0), picture.shape):
+                raise InputError(
+                    f"{frames.name(i)}: expected a picture of {size[0]} x {size[1]} px as the others of view "
+                    f"'{view.name}', got {picture.shape[0]} x {picture.shape[1]}"
+                )
+            size = (picture.shape[0], picture.shape[1])
+            used = on_background or target if source == "background" else target
+            detection = used.detect(picture)
+            on_picture()
+            if detection is None:
+                say(f"left out: {frames.name(i)}: no {used.kind} of {used.columns} x {used.rows} found")
+            else:
+                found[source][keys[i]] = detection
+    return ViewPictures(view.name, size, found["target"], found["background"])
+
+
+def _pose_keys(names: list[str]) -> list[str]:
+    """The last number in each name, if these differ; else the position."""
+    numbers = [re.findall(r"\d+", Path(name).stem if " frame " not in name else name) for name in names]
+    last = [str(int(n[-1])) if n else "" for n in numbers]
+    return last if len(set(last)) == len(last) and all(last) else [str(i) for i in range(len(names))]

@@ -1,0 +1,259 @@
+"""Pictures that a camera would take: a textured plane seen through a field by curved rays, lens disc, pixels and noise.
+
+A pixel averages over its area and over the lens. Each ray is bent by the field and meets the plane at X; the picture
+is the mean of the texture at X. Without a field the same rays run straight: the reference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError, Points
+from nerif.fields.base import Field
+from nerif.geometry import Box, Camera, Plane, Rays
+from nerif.physics.ray_tracing import trace
+
+__all__ = ["Lens", "Sensor", "Texture", "background_texture", "render"]
+
+STEPS = 120  # Runge-Kutta steps through the box, as in simulation.py
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A printed plane in space.
+
+    Parameters
+    ----------
+    values : (row, column) reflectance, 0 to 1
+    texel : edge of a texel, mm
+    corner : (3,) outer corner of the first texel, mm, world frame
+    right, down : (3,) unit vectors along columns and rows
+    surround : reflectance beyond the edges
+    """
+
+    values: Float[Tensor, "row column"]
+    texel: float
+    corner: Float[Tensor, 3]
+    right: Float[Tensor, 3]
+    down: Float[Tensor, 3]
+    surround: float = 0.5
+
+    @property
+    def plane(self) -> Plane:
+        """The plane it lies on."""
+        normal = torch.linalg.cross(self.right, self.down)
+        return Plane(normal, float(normal @ self.corner))
+
+    def at(self, points: Points) -> Float[Tensor, "*batch"]:
+        """Return the reflectance at points (mm) of the plane, linear between texel centres."""
+        relative = (points - self.corner) / self.texel
+        column, row = relative @ self.right, relative @ self.down
+        height, width = self.values.shape
+        grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], dim=-1)
+        flat = torch.nn.functional.grid_sample(
+            (self.values - self.surround)[None, None].to(grid), grid.reshape(1, 1, -1, 2), align_corners=False
+        )
+        return flat.reshape(column.shape) + self.surround
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A thin lens of finite aperture; rays over its disc meet again on the plane in focus.
+
+    Parameters
+    ----------
+    diameter : of the aperture (focal length / f-number), mm; 0 is a pinhole
+    focus : depth of the plane in focus along the optical axis, mm; None is the background's
+    points : number of points on the disc
+    """
+
+    diameter: float = 0.0
+    focus: float | None = None
+    points: int = 19
+
+    def __post_init__(self) -> None:
+        if not self.diameter >= 0 or not (self.focus is None or self.focus > 0) or self.points < 1:
+            raise InputError(
+                f"lens: expected diameter >= 0 mm, focus > 0 mm and points >= 1, got {self.diameter}, {self.focus}, "
+                f"{self.points}"
+            )
+
+    def offsets(self) -> Float[Tensor, "n 2"]:
+        """Points spread evenly over the disc (sunflower spiral), mm; one for a pinhole."""
+        if self.diameter == 0:
+            return torch.zeros(1, 2, dtype=torch.float64)
+        i = torch.arange(self.points, dtype=torch.float64)
+        radius = self.diameter / 2 * torch.sqrt((i + 0.5) / self.points)
+        angle = i * math.pi * (3 - math.sqrt(5))
+        return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor: photons to counts.
+
+    Parameters
+    ----------
+    bits : of the counts, 8 to 16
+    exposure : share of full scale that white paper reaches
+    full_well : electrons at full scale; shot noise is its Poisson noise. 0 is no shot noise
+    read_noise : standard deviation, electrons
+    """
+
+    bits: int = 12
+    exposure: float = 0.8
+    full_well: float = 10000.0
+    read_noise: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.bits <= 16:
+            raise InputError(f"bits: expected 8 to 16, got {self.bits}")
+        if not self.exposure > 0 or not self.full_well >= 0 or not self.read_noise >= 0:
+            raise InputError("sensor: expected exposure > 0, full_well >= 0 and read_noise >= 0")
+
+    def expose(self, light: Float[Tensor, "row column"], seed: int) -> np.ndarray:
+        """Return counts of light from 0 (black) to 1 (white paper): shot noise, read noise, rounding, saturation."""
+        rng = np.random.default_rng(seed)
+        share = self.exposure * light.clamp_min(0).numpy()
+        if self.full_well > 0:
+            share = (rng.poisson(share * self.full_well) + self.read_noise * rng.standard_normal(share.shape)) / (
+                self.full_well
+            )
+        counts = np.clip(np.round(share * (2**self.bits - 1)), 0, 2**self.bits - 1)
+        return counts.astype(np.uint8 if self.bits == 8 else np.uint16)
+
+
+def background_texture(camera: Camera, values: Float[Tensor, "row column"], texel: float) -> Texture:
+    """Lay a pattern onto the background of a camera, upright and in the middle of its picture."""
+    height, width = camera.image_size
+    middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
+    ray = camera.rays(middle)
+    centre = ray.origin[0] + ray.background[0] * ray.direction[0]
+    normal = camera.background.normal.to(torch.float64)
+    normal = normal if float(normal @ ray.direction[0]) > 0 else -normal
+    right = torch.linalg.cross(camera.rotation[1], normal)
+    right = right / right.norm()
+    down = torch.linalg.cross(normal, right)
+    rows, columns = values.shape
+    corner = centre - right * (columns * texel / 2) - down * (rows * texel / 2)
+    return Texture(values, texel, corner, right, down)
+
+
+def pattern_size(camera: Camera) -> tuple[float, float]:
+    """Return width and height (mm) of a pattern that fills the picture of a camera, with a margin of a tenth."""
+    height, width = camera.image_size
+    edge = torch.tensor([-0.5, 0.5], dtype=torch.float64)
+    corners = torch.cartesian_prod(edge * width + (width - 1) / 2, edge * height + (height - 1) / 2)
+    rays = camera.rays(corners)
+    hits = rays.origin + rays.background[:, None] * rays.direction
+    texture = background_texture(camera, torch.zeros(2, 2, dtype=torch.float64), 1.0)
+    centre = texture.corner + texture.right + texture.down
+    reach = ((hits - centre) @ torch.stack([texture.right, texture.down], dim=1)).abs().amax(dim=0)
+    return 2.2 * float(reach[0]), 2.2 * float(reach[1])
+
+
+@torch.no_grad()
+def render(
+    camera: Camera,
+    texture: Texture,
+    field: Field | None = None,
+    box: Box | None = None,
+    n_ambient: float = 1.0,
+    samples: int = 3,
+    lens: Lens | None = None,
+    steps: int = STEPS,
+) -> Float[Tensor, "row column"]:
+    """Return the light that reaches each pixel, 0 (black) to 1 (white paper).
+
+    Parameters
+    ----------
+    camera : its own background plane plays no part: the texture's does
+    texture : what it looks at
+    field, box : what lies between, of index excess, and where; None is the reference
+    n_ambient : refractive index around the field
+    samples : points along each edge of a pixel over which the texture is averaged. Rays are bent at pixel centres and
+        their movement on the plane interpolated between them by cubic splines (tests/test_rendering.py: the difference
+        to bending every one)
+    lens : None is a pinhole
+    steps : Runge-Kutta steps through the box
+    """
+    if samples < 1:
+        raise InputError(f"samples: expected at least one point along the edge of a pixel, got {samples}")
+    lens = lens or Lens()
+    height, width = camera.image_size
+    shift = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
+    focus = lens.focus or float(texture.plane.offset - camera.centre @ texture.plane.normal) / float(
+        camera.rotation[2] @ texture.plane.normal
+    )
+    light = torch.zeros(height, width, dtype=torch.float64)
+    offsets = lens.offsets()
+    for offset in offsets:
+        movement = None
+        if field is not None:
+            assert box is not None
+            centres = _rays(camera, camera.pixel_grid().reshape(-1, 2), texture.plane, offset, focus)
+            movement = _movement(field, centres, texture.plane, box, n_ambient, steps).reshape(height, width, 3)
+        for dv in shift:
+            for du in shift:
+                pixels = camera.pixel_grid() + torch.stack([du, dv])
+                rays = _rays(camera, pixels.reshape(-1, 2), texture.plane, offset, focus)
+                points = rays.origin + rays.background[:, None] * rays.direction
+                if movement is not None:
+                    points = points + _between(movement, float(dv), float(du)).reshape(-1, 3)
+                light += texture.at(points).reshape(height, width)
+    return light / (len(offsets) * samples**2)
+
+
+def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], plane: Plane, offset: Float[Tensor, 2], focus: float) -> Rays:
+    """Rays from a point of the lens through where each pixel is in focus, on to the plane."""
+    straight = camera.rays(pixels)
+    depth = straight.direction @ camera.rotation[2]
+    point = straight.origin + (focus / depth)[:, None] * straight.direction
+    origin = (camera.centre + offset @ camera.rotation[:2]).expand_as(point)
+    direction = point - origin
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    reach = (plane.offset - origin @ plane.normal) / (direction @ plane.normal)
+    zero = torch.zeros_like(reach)
+    return Rays(origin, direction, straight.sensitivity, reach, zero, zero)
+
+
+def _movement(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float, steps: int) -> Float[Tensor, "n 3"]:
+    """How far (mm) on the plane refraction moves the point that each ray meets."""
+    rays = rays.clip(box)
+    moved = torch.zeros_like(rays.origin)
+    for part in _parts(rays):
+        chosen = rays[part]
+        position, heading = trace(field, chosen.to(dtype=torch.float32), steps, n_ambient)
+        # in single precision the straight ray is off by 1e-4 mm: move only by what the field bends
+        start = chosen.to(dtype=torch.float32)
+        length = (start.far - start.near).double()[:, None]
+        exit_ = (start.origin + start.near[:, None] * start.direction).double() + length * start.direction.double()
+        straight = torch.nn.functional.normalize(start.direction.double(), dim=-1)
+        moved[part] = _hit(position, heading, plane) - _hit(exit_, straight, plane)
+    return moved
+
+
+def _hit(position: Tensor, heading: Tensor, plane: Plane) -> Tensor:
+    reach = (plane.offset - position @ plane.normal) / (heading @ plane.normal)
+    return position + reach[:, None] * heading
+
+
+def _parts(rays: Rays) -> Iterator[Tensor]:
+    yield from torch.split(rays.crosses.nonzero()[:, 0], 1 << 14)
+
+
+def _between(movement: Float[Tensor, "row column 3"], dv: float, du: float) -> Float[Tensor, "row column 3"]:
+    """The movement at pixel centres, moved by a part of a pixel."""
+    if dv == 0 and du == 0:
+        return movement
+    from scipy.ndimage import shift
+
+    moved = shift(movement.numpy(), (-dv, -du, 0), order=3, mode="nearest")
+    return torch.from_numpy(moved)

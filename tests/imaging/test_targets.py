@@ -1,0 +1,117 @@
+"""Targets: printed, seen by a camera, found again to a hundredth of a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nerif.conventions import InputError
+from nerif.experiment import place
+from nerif.geometry import Camera, Plane
+from nerif.imaging.bundle import Pose
+from nerif.imaging.targets import Target
+from nerif.rendering import Sensor, render
+
+TARGETS = {
+    "chessboard": Target("chessboard", 10, 7, pitch=6.0),
+    "charuco": Target("charuco", 9, 7, pitch=7.0),
+    "circles": Target("circles", 9, 6, pitch=7.0),
+}
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    """A camera at the origin that looks along z, with some distortion."""
+    return Camera(
+        intrinsics=torch.tensor([[1500.0, 0, 163], [0, 1490.0, 118], [0, 0, 1]], dtype=torch.float64),
+        rotation=torch.eye(3, dtype=torch.float64),
+        translation=torch.zeros(3, dtype=torch.float64),
+        image_size=(240, 320),
+        background=Plane(torch.tensor([0.0, 0, -1], dtype=torch.float64), -900.0),
+        distortion=torch.tensor([-0.1, 0.05, 0.001, -0.001, 0], dtype=torch.float64),
+    )
+
+
+def seen(target: Target, camera: Camera, angles: tuple[float, float, float], bits: int = 12) -> tuple:
+    """A picture of the target 360 mm before the camera, and where its points are."""
+    pose = Pose(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), np.array([-2.0, 1.5, 360.0]))
+    picture = Sensor(bits=bits).expose(render(camera, place(target, pose, camera)), seed=1)
+    points = torch.from_numpy(target.points @ pose.rotation.T + pose.translation)
+    return picture, camera.project(points).numpy()
+
+
+@pytest.mark.parametrize("kind", TARGETS)
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, -20, 8), (-15, 30, -12)])
+def test_points_are_found_where_they_are(camera, kind, angles):
+    target = TARGETS[kind]
+    picture, truth = seen(target, camera, angles)
+    found = target.detect(picture)
+    assert found is not None
+    assert len(found.ids) > 0.8 * len(truth)
+    error = found.pixels - truth[found.ids]
+    assert np.sqrt(np.mean(error**2)) < (0.03 if kind == "circles" else 0.02)
+
+
+@pytest.mark.parametrize("kind", ["chessboard", "charuco"])
+@pytest.mark.parametrize("turn", [180.0, 90.0])
+def test_a_turned_target_keeps_its_numbers(camera, kind, turn):
+    target = Target(kind, 8, 7, pitch=6.0)
+    picture, truth = seen(target, camera, (10, 5, turn))
+    found = target.detect(picture)
+    assert found is not None
+    assert np.abs(found.pixels - truth[found.ids]).max() < 0.2
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_any_bit_depth(camera, bits):
+    picture, truth = seen(TARGETS["chessboard"], camera, (10, 10, 0), bits)
+    found = TARGETS["chessboard"].detect(picture)
+    assert found is not None
+    assert np.abs(found.pixels - truth).max() < 0.1
+
+
+def test_a_hidden_part_leaves_the_rest_of_a_charuco_board(camera):
+    picture, truth = seen(TARGETS["charuco"], camera, (5, 5, 0))
+    picture[:90] = 900
+    found = TARGETS["charuco"].detect(picture)
+    assert found is not None
+    assert 6 <= len(found.ids) < 48
+    assert np.abs(found.pixels - truth[found.ids]).max() < 0.3
+
+
+@pytest.mark.parametrize("kind", TARGETS)
+def test_nothing_is_found_where_nothing_is(kind):
+    noise = np.random.default_rng(0).integers(0, 4095, (240, 320)).astype(np.uint16)
+    assert TARGETS[kind].detect(noise) is None
+
+
+@pytest.mark.parametrize("kind", TARGETS)
+def test_points_are_centred_and_a_pitch_apart(kind):
+    target = TARGETS[kind]
+    points = target.points
+    assert np.allclose(points.mean(axis=0), 0)
+    assert len(points) == np.prod(target.shape)
+    assert np.isclose(np.linalg.norm(points[1] - points[0]), target.pitch)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (("checker", 9, 7), "kind"),
+        (("chessboard", 9, 7), "turned by 180"),
+        (("chessboard", 3, 2), "at least 4"),
+        (("charuco", 9, 7, 0.0), "pitch > 0"),
+        (("charuco", 9, 7, 5.0, 6.0), "marker smaller"),
+        (("charuco", 9, 7, 5.0, 3.0, "DICT_9X9"), "dictionary"),
+    ],
+)
+def test_targets_that_cannot_be(values, words):
+    with pytest.raises(InputError, match=words):
+        Target(*values)
+
+
+def test_too_few_markers_in_the_dictionary():
+    with pytest.raises(InputError, match="at least 60 markers"):
+        Target("charuco", 12, 10, 5.0, dictionary="DICT_4X4_50").raster(0.5)
