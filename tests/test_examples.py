@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -23,5 +24,15 @@ def test_own_data(tmp_path):
     assert float(left_half.mean()) > 0
 
 
+def test_from_images(tmp_path):
+    """Pictures alone, to a field that correlates with the truth by 0.98 or more."""
+    script = [sys.executable, str(EXAMPLES / "from_images.py"), str(tmp_path)]
+    done = subprocess.run(script, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    metrics = json.loads((tmp_path / "result" / "metrics.json").read_text())
+    assert metrics["cc"] >= 0.98
+    assert len(metrics["views"]) == 9
+
+
 def test_examples_are_all_tested():
-    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py"}
+    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py", "from_images.py"}

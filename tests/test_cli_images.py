@@ -1,0 +1,250 @@
+"""The verbs from pictures to a measurement, on a small rendered experiment."""
+
+from __future__ import annotations
+
+import shutil
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import tifffile
+import torch
+from scipy.spatial.transform import Rotation
+
+from nerif.cli import main
+from nerif.imaging.cameras_file import read_cameras
+from nerif.measurement import Measurement
+from nerif.simulation import view_displacement
+from nerif.volume import read_volume
+
+BOX = ["--lower", "-25", "-25", "-25", "--upper", "25", "25", "25"]
+VIEWS = 4
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    """Pictures of four views, a calibration and a measurement, each made by its verb."""
+    folder = tmp_path_factory.mktemp("experiment")
+    code = main(
+        ["render", "-o", str(folder / "pictures"), "--phantom", "gaussians", "--views", str(VIEWS), "--arc", "10",
+         "120", "--image-size", "120", "140", "--pixel-pitch", "0.034", "--background-distance", "900",
+         "--references", "3", "--poses", "14", "--backgrounds", "2", "--truth-voxels", "20"]
+    )  # fmt: skip
+    assert code == 0
+    pictures, out = folder / "pictures", folder / "calibration.toml"
+    assert main(["calibrate", str(pictures), "--config", str(pictures / "calibrate.toml"), "-o", str(out)]) == 0
+    assert main(displacement(folder)) == 0
+    return folder
+
+
+def displacement(folder, *more):
+    words = ["displacement", str(folder / "pictures"), "--calibration", str(folder / "calibration.toml")]
+    return [*words, *BOX, "-o", str(folder / "m.nc"), *map(str, more)]
+
+
+@pytest.fixture
+def copy(experiment, tmp_path):
+    """The experiment again, to be spoilt."""
+    shutil.copytree(experiment, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_calibration_finds_the_rendered_rig(experiment):
+    truth = read_cameras(experiment / "pictures" / "truth" / "calibration.toml")
+    found = read_cameras(experiment / "calibration.toml")
+    assert [c.name for c in found] == [c.name for c in truth]
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-15, 15, (50, 3)))
+    for a, b in zip(found, truth, strict=True):
+        # a narrow lens can hardly tell a turn from a shift of the principal point, but what it sees is right
+        assert np.degrees(Rotation.from_matrix((a.rotation @ b.rotation.T).numpy()).magnitude()) < 0.5
+        assert float((a.camera().project(points) - b.camera().project(points)).abs().max()) < 0.1
+        assert a.background is not None
+        assert b.background is not None
+        assert abs(a.background.offset - b.background.offset) < 5
+    for name in ("calibration.rig.png", "calibration.errors.png"):
+        assert iio.imread(experiment / name).std() > 10
+
+
+def test_measurement_holds_what_was_rendered(experiment):
+    measurement = Measurement.read(experiment / "m.nc")
+    assert len(measurement.cameras) == VIEWS
+    assert measurement.sigma is not None
+    from nerif.fields.phantoms import make_phantom
+
+    phantom = make_phantom("gaussians", measurement.box, 0)
+    truth = {c.name: c.camera() for c in read_cameras(experiment / "pictures" / "truth" / "calibration.toml")}
+    for i, name in enumerate(measurement.names):
+        d = view_displacement(phantom, truth[name], measurement.box, measurement.n_ambient, steps=40)
+        good = measurement.usable[i]
+        assert float(good.float().mean()) > 0.9
+        error = (measurement.displacement[i] - d)[good]
+        assert float(error.norm(dim=-1).median()) < 0.05
+        assert np.corrcoef(measurement.displacement[i][good].ravel(), d[good].ravel())[0, 1] > 0.97
+    assert iio.imread(experiment / "m.png").std() > 10
+
+
+def test_truth_is_beside_the_pictures(experiment):
+    assert read_volume(experiment / "pictures" / "truth" / "volume.nc").values.shape == (20, 20, 20)
+
+
+def test_nothing_is_overwritten_unasked(experiment, capsys):
+    assert main(displacement(experiment)) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["calibrate", str(experiment / "pictures"), "-o", str(experiment / "calibration.toml")]) == 2
+    assert main(["render", "-o", str(experiment / "pictures")]) == 2
+
+
+def test_bad_pictures_cost_only_themselves(copy, capsys):
+    views = sorted(p.name for p in (copy / "pictures").iterdir() if (p / "flow").is_dir())
+    (copy / "pictures" / views[0] / "reference" / "reference_001.tif").write_bytes(b"broken")
+    (copy / "pictures" / views[1] / "flow" / "flow_000.tif").unlink()
+    tifffile.imwrite(copy / "pictures" / views[2] / "flow" / "flow_000.tif", np.zeros((50, 60), np.uint16))
+    assert main(displacement(copy, "--force")) == 0
+    said = capsys.readouterr().out
+    assert "left out: " in said
+    assert "reference_001.tif" in said
+    assert f"view '{views[1]}' left out" in said
+    assert f"view '{views[2]}' left out" in said
+    assert len(Measurement.read(copy / "m.nc").cameras) == VIEWS - 2
+
+
+def test_no_good_view_is_an_error(copy, capsys):
+    for flow in (copy / "pictures").glob("*/flow/*.tif"):
+        flow.write_bytes(b"")
+    before = (copy / "m.nc").read_bytes()
+    assert main(displacement(copy, "--force")) == 2
+    assert "no view could be used" in capsys.readouterr().err
+    assert (copy / "m.nc").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--frame", "3"], "frame, average: expected numbers within the 1 flow pictures"),
+        (["--method", "piv"], "method: expected one of"),
+        (["--views", "none"], "views: expected some of"),
+        (["--average", "0"], "average: expected 1 or more"),
+    ],
+)
+def test_settings_that_cannot_be_right(experiment, capsys, more, words):
+    assert main(displacement(experiment, "--force", *more)) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_calibration_of_other_views_or_sizes(copy, capsys):
+    file = copy / "calibration.toml"
+    text = file.read_text()
+    name = read_cameras(file)[0].name
+    file.write_text(text.replace(f'name = "{name}"', 'name = "other"'))
+    assert main(displacement(copy, "--force")) == 2
+    assert f"no camera named '{name}'" in capsys.readouterr().err
+    sized = text.replace("    120,\n    140,\n", "    240,\n    280,\n")
+    assert sized != text
+    file.write_text(sized)
+    assert main(displacement(copy, "--force")) == 2
+    assert "was calibrated with (240, 280)" in capsys.readouterr().err
+
+
+def test_masks_by_threshold_and_drawn(experiment, tmp_path, capsys):
+    out = tmp_path / "masked.nc"
+    assert main(["mask", str(experiment / "m.nc"), "-o", str(out), "--threshold", "3"]) == 0
+    assert "visual hull holds" in capsys.readouterr().out
+    masked = Measurement.read(out)
+    assert masked.flow_mask is not None
+    strong = masked.displacement.norm(dim=-1) > 0.3
+    assert bool(masked.flow_mask[strong & masked.usable].all())
+    assert 0.02 < float(masked.flow_mask.float().mean()) < 0.9
+    assert iio.imread(tmp_path / "masked.masks.png").std() > 10
+    drawn = tmp_path / "drawn"
+    drawn.mkdir()
+    whole = np.full((120, 140), 255, np.uint8)
+    whole[:10] = 0
+    iio.imwrite(drawn / f"{masked.names[1]}.png", whole)
+    again = tmp_path / "again.nc"
+    assert main(["mask", str(experiment / "m.nc"), "-o", str(again), "--threshold", "3", "--drawn", str(drawn)]) == 0
+    flow_mask = Measurement.read(again).flow_mask
+    assert flow_mask is not None
+    assert not flow_mask[1, :10].any()
+    assert flow_mask[1, 10:].all()
+    assert torch.equal(flow_mask[0], masked.flow_mask[0])
+    assert main(["mask", str(again), "-o", str(tmp_path / "none.nc"), "--remove"]) == 0
+    assert Measurement.read(tmp_path / "none.nc").flow_mask is None
+
+
+def test_masks_that_leave_nothing(experiment, tmp_path, capsys):
+    out = tmp_path / "masked.nc"
+    assert main(["mask", str(experiment / "m.nc"), "-o", str(out), "--threshold", "1000"]) == 2
+    assert "no flow is left in view" in capsys.readouterr().err
+    assert main(["mask", str(experiment / "m.nc"), "-o", str(out), "--drawn", str(tmp_path)]) == 2
+    assert "expected pictures named as the views" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_masks_while_finding_displacements(experiment, tmp_path):
+    words = displacement(experiment)
+    words[words.index("-o") + 1] = str(tmp_path / "m.nc")
+    assert main([*words, "--mask", "4", "--method", "dis"]) == 0
+    measurement = Measurement.read(tmp_path / "m.nc")
+    assert measurement.flow_mask is not None
+    assert 0 < float(measurement.flow_mask.float().mean()) < 1
+
+
+def test_check_draws_the_rig_of_calibrations_and_measurements(experiment, tmp_path, capsys):
+    for source in ("calibration.toml", "m.nc"):
+        out = tmp_path / f"{source.split('.')[0]}.toml"
+        assert main(["calibrate", str(experiment / source), "--check", "-o", str(out), *BOX]) == 0
+        assert iio.imread(out.with_suffix(".rig.png")).std() > 5
+        assert not out.exists()
+    assert "look whether cameras and axes stand" in capsys.readouterr().out
+
+
+def test_other_programs_calibrations_are_taken_over(experiment, tmp_path, capsys):
+    import cv2
+
+    for camera in read_cameras(experiment / "calibration.toml")[:2]:
+        storage = cv2.FileStorage(str(tmp_path / f"{camera.name}.yml"), cv2.FILE_STORAGE_WRITE)
+        for key, value in (("K", camera.intrinsics), ("D", camera.distortion), ("R", camera.rotation)):
+            storage.write(key, value.numpy())
+        storage.write("T", camera.translation.numpy() / 1000)
+        storage.release()
+    out = tmp_path / "taken.toml"
+    words = ["calibrate", str(tmp_path), "-o", str(out), "--scale-mm", "1000"]
+    assert main(words) == 0
+    assert "was not drawn" in capsys.readouterr().out
+    more = ["--background-distance", "900", "--image-size", "120", "140", "--force"]
+    assert main([*words, *more]) == 0
+    taken, known = read_cameras(out), read_cameras(experiment / "calibration.toml")
+    assert torch.allclose(taken[0].translation, known[0].translation)
+    assert taken[0].background is not None
+    assert known[0].background is not None
+    assert float(taken[0].background.normal @ known[0].background.normal) > 0.999
+    assert abs(taken[0].background.offset - known[0].background.offset) < 10
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--lower", "0", "0", "0"], "expected both corners"),
+        (["--axes", "x+", "x+", "z+"], "right-handed"),
+        (["--target.kind", "checkers"], "target kind"),
+        (["--target.columns", "9", "--target.rows", "9"], "turned by 180"),
+        (["--world", "99"], "world: expected a target pose that was found"),
+    ],
+)
+def test_calibrate_settings_that_cannot_be_right(experiment, tmp_path, capsys, more, words):
+    config = experiment / "pictures" / "calibrate.toml"
+    line = ["calibrate", str(experiment / "pictures"), "--config", str(config), "-o", str(tmp_path / "c.toml"), *more]
+    assert main(line) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "c.toml").exists()
+
+
+def test_a_mirrored_camera_is_refused(copy, capsys):
+    view = next(p for p in sorted((copy / "pictures").iterdir()) if (p / "flow").is_dir())
+    for path in view.glob("*/*.tif"):
+        tifffile.imwrite(path, tifffile.imread(path)[:, ::-1])
+    config = copy / "pictures" / "calibrate.toml"
+    assert main(["calibrate", str(copy / "pictures"), "--config", str(config), "-o", str(copy / "c.toml")]) == 2
+    said = capsys.readouterr().err
+    assert f"view '{view.name}'" in said
+    assert "mirrored" in said
