@@ -1,0 +1,164 @@
+"""Mistakes put into a measurement are noticed, named, and laid at the right door; a clean one is left in peace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.cli import main
+from nerif.consistency import binned, check_consistency
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Ring
+from nerif.measurement import Measurement
+from nerif.simulation import simulate
+
+BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))
+
+
+def measure(phantom: str, seed: int, views: int = 6, noise: float = 0.05, box: Box = BOX) -> Measurement:
+    ring = Ring(views=views, arc=(0.0, 150.0), image_size=(30, 36), pixel_pitch=0.12)
+    field = make_phantom(phantom, box, seed)
+    return replace(simulate(field, ring.cameras(), box, 1.00027, noise, seed, steps=30), box=BOX)
+
+
+@pytest.fixture(scope="module")
+def clean() -> Measurement:
+    """Balls without symmetry, seen by six views."""
+    return measure("gaussians", 1)
+
+
+def spoilt(clean: Measurement, mistake) -> Measurement:
+    d = clean.displacement.clone()
+    return replace(clean, displacement=mistake(d))
+
+
+def in_view(i, change):
+    def mistake(d):
+        d[i] = change(d[i])
+        return d
+
+    return mistake
+
+
+def exchanged(i, j):
+    def mistake(d):
+        d[[i, j]] = d[[j, i]]
+        return d
+
+    return mistake
+
+
+MISTAKES = {
+    "swapped": (in_view(2, lambda d: d.flip(-1)), "view 60deg: u and v are swapped"),
+    "sign": (in_view(1, lambda d: -d), "view 30deg: the sign of the displacement is flipped"),
+    "sign of v": (in_view(4, lambda d: d * torch.tensor([1.0, -1.0])), "view 120deg: the sign of v is flipped"),
+    "mirrored": (
+        in_view(3, lambda d: d.flip(1) * torch.tensor([-1.0, 1.0])), "view 90deg: the picture is mirrored left to right"
+    ),
+    "upside down": (
+        in_view(3, lambda d: d.flip(0) * torch.tensor([1.0, -1.0])), "view 90deg: the picture is upside down"
+    ),
+    "exchanged": (exchanged(1, 4), "views 30deg and 120deg: these two views are exchanged"),
+    "swapped everywhere": (lambda d: d.flip(-1), "all views: u and v are swapped"),
+    "sign of v everywhere": (lambda d: d * torch.tensor([1.0, -1.0]), "all views: the sign of one component"),
+    "too large": (in_view(2, lambda d: 2.5 * d), "view 60deg: displacements 2."),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_named(clean, name):
+    mistake, words = MISTAKES[name]
+    found = check_consistency(spoilt(clean, mistake), voxels=20)
+    assert len(found.findings) == 1, found.findings
+    assert found.findings[0].startswith(words)
+    assert len(found.views) == 6
+
+
+@pytest.mark.slow
+def test_exchanged_neighbours_of_nine_are_told_from_straight_ones():
+    ring = Ring(views=9, arc=(0.0, 170.0), image_size=(40, 48), pixel_pitch=0.09)
+    field = make_phantom("flame", BOX, 0)
+    straight = simulate(field, ring.cameras(), BOX, 1.00027, 0.05, 0, steps=30)
+    assert check_consistency(straight).findings == ()
+    found = check_consistency(spoilt(straight, exchanged(3, 4)))
+    assert found.findings == ("views 63.75deg and 85deg: these two views are exchanged",)
+
+
+def test_a_view_of_something_else_is_named(clean):
+    other = measure("gaussians", 3).displacement[2]
+    found = check_consistency(spoilt(clean, in_view(2, lambda d: other)), voxels=20)
+    assert [v.name for v in found.views if v.verdict] == ["60deg"]
+    assert any(f.startswith("view 60deg: does not fit the other views") for f in found.findings)
+
+
+def test_a_camera_calibrated_on_the_wrong_side_is_named(clean):
+    mirrored = Ring(views=1, arc=(-30.0, -30.0), image_size=(30, 36), pixel_pitch=0.12).cameras()[0]
+    cameras = list(clean.cameras)
+    cameras[1] = replace(mirrored, name=cameras[1].name)
+    found = check_consistency(replace(clean, cameras=tuple(cameras)), voxels=20)
+    assert any("view 30deg" in f for f in found.findings)
+
+
+@pytest.mark.parametrize(
+    ("phantom", "seed", "noise"), [("gaussians", 0, 0.05), ("flame", 0, 0.05), ("gaussians", 2, 0.15)]
+)
+def test_no_false_alarm(phantom, seed, noise):
+    found = check_consistency(measure(phantom, seed, noise=noise), voxels=20)
+    assert found.findings == ()
+    assert all(v.verdict == "" for v in found.views)
+    assert any("lighter" in r for r in found.remarks)
+
+
+def test_a_flipped_sign_of_everything_shows_as_a_denser_flow(clean):
+    found = check_consistency(spoilt(clean, lambda d: -d), voxels=20)
+    assert found.findings == ()
+    assert any("denser" in r for r in found.remarks)
+
+
+def test_flow_that_leaves_through_the_ends_is_noticed():
+    tall = Box((-25.0, -25.0, -50.0), (25.0, 25.0, 50.0))
+    found = check_consistency(measure("flame", 0, box=tall), voxels=20)
+    assert any(f.startswith("face z+") and "--open-faces z+" in f for f in found.findings)
+    assert any(f.startswith("face z-") for f in found.findings)
+
+
+def test_too_few_views_are_no_error(clean):
+    found = check_consistency(clean.select(clean.names[:2]))
+    assert found.views == ()
+    assert found.findings == ()
+    assert "fewer than three views" in found.remarks[-1]
+
+
+def test_camera_shake_and_missing_pixels_are_told(clean):
+    moved = spoilt(clean, in_view(2, lambda d: d + torch.tensor([1.5, 0.0])))
+    valid = torch.ones(moved.displacement.shape[:3], dtype=torch.bool)
+    valid[0, :20] = False
+    found = check_consistency(replace(moved, valid=valid), voxels=20)
+    assert any("view 60deg: its rim is displaced by (1." in r for r in found.remarks)
+    assert any("view 0deg: only 33% of its pixels" in r for r in found.remarks)
+
+
+def test_binning_keeps_rays_and_displacements(clean):
+    fine = Ring(views=3, arc=(0.0, 90.0), image_size=(60, 72), pixel_pitch=0.06)
+    field = make_phantom("gaussians", BOX, 1)
+    measurement = simulate(field, fine.cameras(), BOX, 1.00027, steps=30)
+    small = binned(measurement, 36)
+    assert small.displacement.shape == (3, 30, 36, 2)
+    coarse = Ring(views=3, arc=(0.0, 90.0), image_size=(30, 36), pixel_pitch=0.12)
+    truth = simulate(field, coarse.cameras(), BOX, 1.00027, steps=30)
+    for a, b in zip(small.cameras, truth.cameras, strict=True):
+        assert torch.allclose(a.intrinsics, b.intrinsics)
+    error = (small.displacement - truth.displacement).square().mean().sqrt()
+    assert float(error) < 0.05 * float(truth.displacement.square().mean().sqrt())
+
+
+def test_the_command_names_the_view(clean, tmp_path, capsys):
+    path = tmp_path / "m.nc"
+    spoilt(clean.select(clean.names[:4]), in_view(2, lambda d: -d)).write(path)
+    assert main(["check", str(path), "--voxels", "16", "--strict"]) == 1
+    said = capsys.readouterr().out
+    assert "FOUND: view 60deg: the sign of the displacement is flipped" in said
+    assert main(["check", str(path), "--voxels", "3"]) == 2
+    assert main(["check", str(tmp_path / "none.nc")]) == 2
