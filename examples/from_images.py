@@ -36,7 +36,7 @@ nerif("displacement", pictures, "--calibration", out / "calibration.toml", "--lo
       "--upper", 25, 25, 25, "-o", out / "measurement.nc", "--force")  # fmt: skip
 
 # Swapped components, flipped signs, mirrored and exchanged views would be named here.
-# nerif("check", out / "measurement.nc")
+nerif("check", out / "measurement.nc")
 
 nerif("reconstruct", out / "measurement.nc", "-o", out / "result", "--time-limit", 30, "--voxels", 64, "--force")
 

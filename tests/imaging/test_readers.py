@@ -14,16 +14,8 @@ import numpy as np
 import pytest
 
 from nerif.conventions import InputError
-from nerif.imaging.readers import (
-    Crop,
-    Frames,
-    ImageSequence,
-    check_exposure,
-    effective_bits,
-    good_frames,
-    open_frames,
-    overexposed,
-)
+from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames, overexposed
+from nerif.imaging.sequences import Crop, ImageSequence
 
 N, H, W = 4, 7, 10
 
@@ -265,11 +257,9 @@ def test_photron_packed_12_bit(tmp_path, rng, xml, h, w):
 
 
 @pytest.mark.parametrize(("bit", "dtype"), [(8, np.uint8), (16, np.uint16)])
-def test_photron_written_by_pymraw(tmp_path, rng, bit, dtype):
-    import pyMRAW
-
+def test_photron_whole_bytes(tmp_path, rng, bit, dtype):
     stack = rng.integers(0, 255, (N, H, W)).astype(dtype)
-    pyMRAW.save_mraw(stack, str(tmp_path / "rec.cih"), bit, info_dict={"Record Rate(fps)": "500"})
+    write_photron(tmp_path, stack.tobytes(), bit=bit, depth={8: 8, 16: 12}[bit], rate=500)
     frames = open_frames(tmp_path / "rec.cih")
     same(frames, stack)
     assert frames.bits == {8: 8, 16: 12}[bit]

@@ -1,4 +1,4 @@
-"""Formats of pictures: image files, Photron and LaVision recordings, NumPy and HDF5 arrays. Opened by readers.py."""
+"""Formats of pictures: image files, LaVision recordings, NumPy and HDF5 arrays. Opened by readers.py."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from nerif.conventions import InputError
 from nerif.imaging.readers import Frames
 
-__all__ = ["FOLDER_SUFFIXES", "SUFFIXES", "ArrayFrames", "FileFrames", "Hdf5Frames", "PhotronFrames", "open_files"]
+__all__ = ["FOLDER_SUFFIXES", "SUFFIXES", "ArrayFrames", "FileFrames", "Hdf5Frames", "open_files"]
 
 FOLDER_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".im7")
 SINGLE_SUFFIXES = (".cih", ".cihx", ".mraw", ".npy", ".npz", ".h5", ".hdf5", ".hdf")
@@ -31,6 +31,8 @@ def open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames
             raise InputError(f"{name}: one of {len(files)} files of a pattern; name one recording at a time")
     match files[0].suffix.lower():
         case ".cih" | ".cihx" | ".mraw":
+            from nerif.imaging.photron import PhotronFrames
+
             return PhotronFrames(files[0], names[0])
         case ".h5" | ".hdf5" | ".hdf":
             return Hdf5Frames(files[0], names[0], dataset)
@@ -262,91 +264,6 @@ FORMATS |= {".tif": TIFF, ".tiff": TIFF, ".png": Format(lambda path: 1, _read_pn
 
 def _format(path: Path) -> Format:
     return FORMATS[path.suffix.lower()]
-
-
-class PhotronFrames(Frames):
-    """A Photron recording: a header (.cih, .cihx) and monochrome frames of 8, packed 12, or 16 bit (.mraw).
-
-    Frame i was taken i / rate after the first.
-    """
-
-    def __init__(self, path: Path, name: str) -> None:
-        header_path = path if path.suffix.lower() != ".mraw" else _partner(path, name, (".cihx", ".cih"))
-        self._path = path if path.suffix.lower() == ".mraw" else _partner(path, name, (".mraw",))
-        self._name = str(Path(name).with_name(self._path.name).as_posix())
-        cih = _photron_header(header_path, Path(name).with_name(header_path.name).as_posix())
-        self._stored, self._frames = int(cih["Color Bit"]), int(cih["Total Frame"])
-        self._height, self._width = int(cih["Image Height"]), int(cih["Image Width"])
-        self._bits = min(int(cih["EffectiveBit Depth"]), self._stored)
-        upper = self._stored == 16 and str(cih["EffectiveBit Side"]).lower() == "higher"
-        self._shift = self._stored - self._bits if upper else 0
-        self.times = np.arange(self._frames) / float(cih["Record Rate(fps)"])
-
-    def __len__(self) -> int:
-        return self._frames
-
-    def name(self, i: int) -> str:
-        return f"{self._name} frame {i}"
-
-    @property
-    def known_bits(self) -> int | None:
-        return self._bits
-
-    def load(self, i: int) -> np.ndarray:
-        pixels = self._height * self._width
-        if self._stored == 12:
-            import pyMRAW
-
-            # two pixels in three bytes, on and on through the file: a frame may begin in the middle of three
-            first, last = i * pixels // 2, -(-(i + 1) * pixels // 2)
-            data = self._bytes(i, 3 * first, 3 * last - ((i + 1) * pixels) % 2)
-            data = np.concatenate([data, np.zeros(-len(data) % 3, np.uint8)])
-            skip = i * pixels % 2
-            values = pyMRAW.nb_read_uint12(data)[skip : skip + pixels]
-        else:
-            size = self._stored // 8
-            values = self._bytes(i, i * pixels * size, (i + 1) * pixels * size).view("<u2" if size == 2 else "u1")
-            values = values >> self._shift
-        return values.reshape(self._height, self._width)
-
-    def _bytes(self, i: int, begin: int, end: int) -> np.ndarray:
-        data = np.fromfile(self._path, np.uint8, end - begin, offset=begin)
-        if len(data) < end - begin:
-            raise InputError(
-                f"{self.name(i)}: expected {self._frames} frames as the header says, the file ends before this one "
-                f"does ({self._path.stat().st_size} bytes); copy it again"
-            )
-        return data
-
-
-def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
-    """The file of the same name with one of these endings, in small or capital letters."""
-    for suffix in suffixes:
-        for other in sorted(path.parent.iterdir()):
-            if other.stem == path.stem and other.suffix.lower() == suffix:
-                return other
-    raise InputError(f"{name}: expected a {' or '.join(suffixes)} file of the same name beside it, got none")
-
-
-def _photron_header(path: Path, name: str) -> dict[str, Any]:
-    import pyMRAW
-
-    numbers = ("Color Bit", "EffectiveBit Depth", "Total Frame", "Image Height", "Image Width", "Record Rate(fps)")
-    try:
-        cih = pyMRAW.get_cih(str(path.absolute()))
-        positive = min(float(cih[key]) for key in numbers) > 0
-        kind, stored = str(cih["File Format"]), int(cih["Color Bit"])
-    except Exception as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{name}: cannot be read as a Photron header ({reason}); export it again") from None
-    if kind.lower() != "mraw" or stored not in (8, 12, 16):
-        raise InputError(
-            f"{name}: expected a monochrome MRaw recording of 8, 12 or 16 bit, got {kind} of {stored} bit; "
-            "export it so, or as TIFF"
-        )
-    if not positive:
-        raise InputError(f"{name}: expected {', '.join(numbers)} above 0, got {[cih[key] for key in numbers]}")
-    return cih
 
 
 class ArrayFrames(Frames):

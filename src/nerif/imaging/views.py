@@ -29,8 +29,7 @@ import numpy as np
 
 from nerif.conventions import InputError
 from nerif.imaging.calibration import ViewPictures
-from nerif.imaging.frames import Frames
-from nerif.imaging.readers import check_exposure, effective_bits, good_frames, open_frames
+from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames
 from nerif.imaging.sequences import Crop
 from nerif.imaging.targets import Detection, Target
 

@@ -1,1 +1,0 @@
-from nerif.imaging.readers import Frames as Frames

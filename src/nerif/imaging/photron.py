@@ -1,0 +1,129 @@
+"""Photron recordings: a header (.cih, .cihx) and monochrome frames of 8, packed 12, or 16 bit (.mraw), one by one."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+
+from nerif.conventions import InputError
+from nerif.imaging.readers import Frames
+
+__all__ = ["PhotronFrames"]
+
+NUMBERS = ("Color Bit", "EffectiveBit Depth", "Total Frame", "Image Height", "Image Width", "Record Rate(fps)")
+"""What a .cih header has to tell, besides its file format and on which side of 16 bit the effective ones are."""
+
+TAGS = {
+    "Color Bit": "imageDataInfo/colorInfo/bit",
+    "EffectiveBit Depth": "imageDataInfo/effectiveBit/depth",
+    "EffectiveBit Side": "imageDataInfo/effectiveBit/side",
+    "Total Frame": "frameInfo/totalFrame",
+    "Image Height": "imageDataInfo/resolution/height",
+    "Image Width": "imageDataInfo/resolution/width",
+    "Record Rate(fps)": "recordInfo/recordRate",
+    "File Format": "imageFileInfo/fileFormat",
+}
+"""Where the same stands in the XML of a .cihx header."""
+
+
+class PhotronFrames(Frames):
+    """A Photron recording; frame i was taken i / rate after the first."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        header_path = path if path.suffix.lower() != ".mraw" else _partner(path, name, (".cihx", ".cih"))
+        self._path = path if path.suffix.lower() == ".mraw" else _partner(path, name, (".mraw",))
+        self._name = str(Path(name).with_name(self._path.name).as_posix())
+        cih = _header(header_path, Path(name).with_name(header_path.name).as_posix())
+        self._stored, self._frames = int(cih["Color Bit"]), int(cih["Total Frame"])
+        self._height, self._width = int(cih["Image Height"]), int(cih["Image Width"])
+        self._bits = min(int(cih["EffectiveBit Depth"]), self._stored)
+        upper = self._stored == 16 and cih.get("EffectiveBit Side", "").lower() == "higher"
+        self._shift = self._stored - self._bits if upper else 0
+        self.times = np.arange(self._frames) / float(cih["Record Rate(fps)"])
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def name(self, i: int) -> str:
+        return f"{self._name} frame {i}"
+
+    @property
+    def known_bits(self) -> int | None:
+        return self._bits
+
+    def load(self, i: int) -> np.ndarray:
+        pixels = self._height * self._width
+        if self._stored == 12:
+            # two pixels in three bytes, on and on through the file: a frame may begin in the middle of three
+            first, last = i * pixels // 2, -(-(i + 1) * pixels // 2)
+            data = self._bytes(i, 3 * first, 3 * last - ((i + 1) * pixels) % 2)
+            skip = i * pixels % 2
+            values = unpack12(np.concatenate([data, np.zeros(-len(data) % 3, np.uint8)]))[skip : skip + pixels]
+        else:
+            size = self._stored // 8
+            values = self._bytes(i, i * pixels * size, (i + 1) * pixels * size).view("<u2" if size == 2 else "u1")
+            values = values >> self._shift
+        return values.reshape(self._height, self._width)
+
+    def _bytes(self, i: int, begin: int, end: int) -> np.ndarray:
+        data = np.fromfile(self._path, np.uint8, end - begin, offset=begin)
+        if len(data) < end - begin:
+            raise InputError(
+                f"{self.name(i)}: expected {self._frames} frames as the header says, the file ends before this one "
+                f"does ({self._path.stat().st_size} bytes); copy it again"
+            )
+        return data
+
+
+def unpack12(data: np.ndarray) -> np.ndarray:
+    """Unpack pairs of 12-bit values, the first bits first, from threes of bytes."""
+    one, two, three = data.reshape(-1, 3).astype(np.uint16).T
+    return np.stack([(one << 4) | (two >> 4), ((two & 15) << 8) | three], axis=-1).ravel()
+
+
+def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
+    """The file of the same name with one of these endings, in small or capital letters."""
+    for suffix in suffixes:
+        for other in sorted(path.parent.iterdir()):
+            if other.stem == path.stem and other.suffix.lower() == suffix:
+                return other
+    raise InputError(f"{name}: expected a {' or '.join(suffixes)} file of the same name beside it, got none")
+
+
+def _header(path: Path, name: str) -> dict[str, str]:
+    """What a header tells, under the names of a .cih."""
+    try:
+        text = path.read_bytes().decode("utf-8", errors="ignore")
+        cih = _from_xml(text) if path.suffix.lower() == ".cihx" else _from_lines(text)
+        positive = min(float(cih[key]) for key in NUMBERS) > 0
+        kind, stored = cih["File Format"], int(cih["Color Bit"])
+    except (KeyError, ValueError, ElementTree.ParseError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{name}: cannot be read as a Photron header ({reason}); export it again") from None
+    if kind.lower() != "mraw" or stored not in (8, 12, 16):
+        raise InputError(
+            f"{name}: expected a monochrome MRaw recording of 8, 12 or 16 bit, got {kind} of {stored} bit; "
+            "export it so, or as TIFF"
+        )
+    if not positive:
+        raise InputError(f"{name}: expected {', '.join(NUMBERS)} above 0, got {[cih[key] for key in NUMBERS]}")
+    return cih
+
+
+def _from_lines(text: str) -> dict[str, str]:
+    """Lines such as `Image Width : 1024`, up to the first empty one."""
+    head = text.replace("\r", "").split("\n\n")[0]
+    pairs = (line.split(" : ", 1) for line in head.splitlines() if " : " in line)
+    return {key.strip(): value.strip() for key, value in pairs}
+
+
+def _from_xml(text: str) -> dict[str, str]:
+    """The element <cih> inside the file; binary may stand around it."""
+    begin, end = text.find("<cih>"), text.rfind("</cih>")
+    if begin < 0 or end < 0:
+        raise ValueError("no <cih> in it")
+    root = ElementTree.fromstring(text[begin : end + len("</cih>")])
+    found = {key: root.findtext(tag) for key, tag in TAGS.items()}
+    return {key: value.strip() for key, value in found.items() if value is not None}

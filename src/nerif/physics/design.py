@@ -1,0 +1,170 @@
+"""What a rig will see, before it is built.
+
+Sources: Raffel, Background-oriented schlieren (BOS) techniques, Exp. Fluids 56 (2015) 60; Gojani, Kamishi & Obayashi,
+Measurement sensitivity and resolution for background oriented schlieren, J. Vis. 16 (2013) 201.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from nerif.conventions import InputError
+from nerif.geometry import Ring
+
+__all__ = ["Expectation", "Plan", "expect"]
+
+DIFFRACTION = 2.44  # diameter of the Airy disc over wavelength and f-number
+DOT = 3.0  # px
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is planned.
+
+    Parameters
+    ----------
+    index_contrast : largest difference of the index to the ambient
+    f_number : focal length over aperture
+    wavelength_nm : of the light
+    flow_size : width of the flow, and path length through it, mm
+    feature_size : smallest structure that has the whole contrast, mm
+    displacement_noise : of the optical flow, px
+    window : over which the optical flow averages, px
+
+    Raises
+    ------
+    InputError
+        If a number is not positive.
+    """
+
+    index_contrast: float = 2.0e-4
+    f_number: float = 16.0
+    wavelength_nm: float = 532.0
+    flow_size: float = 50.0
+    feature_size: float = 5.0
+    displacement_noise: float = 0.03
+    window: float = 8.0
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What comes of it; lengths in mm in the plane of the flow unless said otherwise."""
+
+    pixel_at_flow: float
+    """Edge of a pixel, mm."""
+    pixel_at_background: float
+    """Edge of a pixel on the background, mm."""
+    field_of_view: tuple[float, float]
+    """Width and height of the picture at the flow, mm."""
+    background_size: tuple[float, float]
+    """Width and height of the pattern to print, a tenth more than the picture shows, mm."""
+    dot: float
+    """Size of a dot of 3 px on the background, mm."""
+    sensitivity: float
+    """Displacement of a deflection in the middle of the flow, px per mrad."""
+    deflection: float
+    """Largest deflection by a Gaussian structure of the feature size, mrad."""
+    displacement: float
+    """Its displacement, px."""
+    displacement_of_sheet: float
+    """Displacement of a layer of the feature size seen edge-on through the whole flow, px: an upper bound."""
+    smallest_contrast: float
+    """Index contrast whose displacement is the noise."""
+    cone: float
+    """Diameter of the cone of rays to a pixel where it passes the flow, lens focused on the background, mm."""
+    window: float
+    """What the optical flow averages over, mm."""
+    diffraction: float
+    """Diameter of the Airy disc, mm."""
+    resolution: float
+    """All three together: root of the sum of squares, mm."""
+    notes: tuple[str, ...]
+    """What looks wrong."""
+
+
+def expect(ring: Ring, plan: Plan) -> Expectation:
+    """Return what the first camera of a ring will see of a flow around the origin.
+
+    The largest deflection by n = dn exp(-r^2 / 2 s^2) is dn sqrt(2 pi / e), at the distance s from its middle, whatever
+    its size; by a layer of thickness a, edge-on over a length L, dn L / a. The displacement is that times the lever arm
+    and the sensitivity S of the forward model (docs/conventions.md), taken from the camera itself.
+    """
+    camera = ring.cameras()[0]
+    height, width = camera.image_size
+    middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
+    ray = camera.rays(middle)
+    to_flow, to_background = ring.distance, float(ray.background[0])
+    lever = to_background - to_flow
+    # a deflection in the plane of the picture's columns
+    per_mrad = lever * float((ray.sensitivity[0, 0] @ camera.rotation[0]).abs()) / 1000
+    focal = float(camera.intrinsics[0, 0])
+    at_flow, at_background = to_flow / focal, to_background / focal
+    deflection = 1000 * plan.index_contrast * math.sqrt(2 * math.pi / math.e)
+    displacement = per_mrad * deflection
+    sheet = per_mrad * 1000 * plan.index_contrast * plan.flow_size / plan.feature_size
+    # the cone is as wide as the aperture at the lens, and a point on the background
+    cone = ring.focal_length / plan.f_number * lever / to_background
+    airy = DIFFRACTION * plan.wavelength_nm * 1e-6 * plan.f_number / ring.pixel_pitch * at_flow
+    window = plan.window * at_flow
+    size = (1.1 * width * at_background, 1.1 * height * at_background)
+    result = Expectation(
+        pixel_at_flow=at_flow,
+        pixel_at_background=at_background,
+        field_of_view=(width * at_flow, height * at_flow),
+        background_size=size,
+        dot=DOT * at_background,
+        sensitivity=per_mrad,
+        deflection=deflection,
+        displacement=displacement,
+        displacement_of_sheet=sheet,
+        smallest_contrast=plan.index_contrast * plan.displacement_noise / displacement,
+        cone=cone,
+        window=window,
+        diffraction=airy,
+        resolution=math.sqrt(cone**2 + window**2 + airy**2),
+        notes=(),
+    )
+    return Expectation(**{**result.__dict__, "notes": tuple(_notes(result, ring, plan))})
+
+
+def _notes(e: Expectation, ring: Ring, plan: Plan) -> list[str]:
+    notes = []
+    if e.displacement < 3 * plan.displacement_noise:
+        notes.append(
+            f"the displacement of {e.displacement:.3f} px is hardly above the noise of {plan.displacement_noise:g} px: "
+            "move the background away from the flow, or take a longer lens"
+        )
+    if e.displacement > plan.window / 2:
+        notes.append(f"the displacement of {e.displacement:.1f} px is more than half a window of {plan.window:g} px")
+    if e.resolution > plan.feature_size:
+        largest = max((e.cone, "stop the lens down, or bring the background nearer"), (e.window, "use smaller windows"),
+                      (e.diffraction, "open the lens"))  # fmt: skip
+        notes.append(
+            f"structures of {plan.feature_size:g} mm are finer than the resolution of {e.resolution:.2f} mm: "
+            f"{largest[1]}"
+        )
+    if min(e.field_of_view) < plan.flow_size:
+        notes.append(
+            f"the flow of {plan.flow_size:g} mm is larger than the picture of {e.field_of_view[0]:.0f} x "
+            f"{e.field_of_view[1]:.0f} mm"
+        )
+    if e.dot < 0.2:
+        notes.append(f"dots of {e.dot:.2f} mm are finer than most printers can do, 0.2 mm")
+    if ring.background_distance < plan.flow_size:
+        notes.append("the background stands inside or next to the flow")
+    angles = sorted(a % 180 for a in ring.angles)
+    if len(angles) >= 2:
+        gap = max(b - a for a, b in zip(angles, [*angles[1:], angles[0] + 180], strict=True))
+        if gap > 60:
+            notes.append(f"no view within a gap of {gap:.0f} degrees: structures across it will be smeared")
+    else:
+        notes.append("one view alone gives no depth")
+    return notes

@@ -1,0 +1,161 @@
+"""Rendered pictures obey the conventions: what is seen at p with flow is seen at p - d(p) without."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from nerif.conventions import InputError
+from nerif.fields.base import Field
+from nerif.geometry import Box, Camera, Ring
+from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
+from nerif.simulation import view_displacement
+
+BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    """A camera with distortion that looks down at an oblique background."""
+    ring = Ring(views=1, arc=(30.0, 30.0), elevation=10.0, image_size=(48, 60), pixel_pitch=0.04)
+    plain = ring.cameras()[0]
+    turn = torch.tensor([0.05, -0.08, 0.02], dtype=torch.float64)
+    normal = plain.background.normal + turn
+    distortion = torch.tensor([-0.3, 0.0, 0.001, -0.001, 0.0], dtype=torch.float64)
+    plane = dataclasses.replace(plain.background, normal=normal / normal.norm())
+    return dataclasses.replace(plain, background=plane, distortion=distortion)
+
+
+@pytest.fixture(scope="module")
+def texture(camera) -> Texture:
+    """Smooth noise, fine enough to see a tenth of a pixel."""
+    width, height = pattern_size(camera)
+    rng = np.random.default_rng(0)
+    values = gaussian_filter(rng.standard_normal((round(height / 0.3), round(width / 0.3))), 8.0)
+    return background_texture(camera, torch.from_numpy(0.5 + 0.15 * values / values.std()), 0.3)
+
+
+def test_a_ramp_is_seen_as_a_ramp(camera):
+    ramp = torch.linspace(0, 1, 400, dtype=torch.float64).expand(300, 400)
+    width, height = pattern_size(camera)
+    texture = background_texture(camera, ramp, max(width / 400, height / 300))
+    rays = camera.rays(camera.pixel_grid().reshape(-1, 2))
+    hit = rays.origin + rays.background[:, None] * rays.direction
+    expected = ((hit - texture.corner) @ texture.right / texture.texel - 0.5) / 399
+    picture = render(camera, texture)
+    assert float((picture.flatten() - expected).abs().max()) < 1e-5
+
+
+def test_background_stands_upright_in_the_middle_and_fills_the_picture(camera):
+    texture = background_texture(camera, torch.zeros(200, 240, dtype=torch.float64), 1.0)
+    centre = texture.corner + 120 * texture.right + 100 * texture.down
+    middle = camera.project(centre)
+    assert torch.allclose(middle, torch.tensor([29.5, 23.5], dtype=torch.float64), atol=1e-6)
+    assert float(camera.project(centre + texture.right)[0]) > 29.5
+    assert float(camera.project(centre + texture.down)[1]) > 23.5
+    assert abs(abs(float(texture.plane.normal @ camera.background.normal)) - 1) < 1e-12
+    width, height = pattern_size(camera)
+    whole = background_texture(camera, torch.ones(round(height), round(width), dtype=torch.float64), 1.0)
+    whole = dataclasses.replace(whole, surround=0.0)
+    assert float(render(camera, whole).min()) == pytest.approx(1.0)
+
+
+def test_a_pixel_averages_over_its_area(camera):
+    fine = torch.from_numpy(np.indices((900, 1100)).sum(axis=0) % 2).double()
+    texture = background_texture(camera, fine, 0.15)
+    assert float(render(camera, texture, samples=1).std()) > 0.1
+    assert float(render(camera, texture, samples=8).std()) < 0.03
+
+
+def test_flow_shows_at_p_what_the_reference_shows_at_p_minus_d(camera, texture, ball):
+    strong = Times(ball, 20.0)
+    reference = render(camera, texture).numpy()
+    flow = render(camera, texture, strong, BOX, 1.00027).numpy()
+    d = view_displacement(strong, camera, BOX, 1.00027).numpy()
+    assert np.linalg.norm(d, axis=-1).max() > 0.5
+    rows, columns = np.mgrid[:48, :60].astype(float)
+    moved = map_coordinates(reference, [rows - d[..., 1], columns - d[..., 0]], order=3, mode="nearest")
+    inner = (slice(3, -3), slice(3, -3))
+    assert (flow - moved)[inner].std() < 0.06 * (flow - reference)[inner].std()
+
+
+class Times(Field):
+    """A field times a factor."""
+
+    def __init__(self, field, factor):
+        self.field, self.factor = field, factor
+
+    def value_and_gradient(self, points):
+        value, gradient = self.field.value_and_gradient(points)
+        return self.factor * value, self.factor * gradient
+
+
+def test_movement_between_pixel_centres_is_that_of_rays_bent_one_by_one(camera, texture, ball):
+    strong = Times(ball, 20.0)
+    k = camera.intrinsics * 2
+    k[:2, 2] = 2 * camera.intrinsics[:2, 2] + 0.5
+    k[2, 2] = 1
+    fine = dataclasses.replace(camera, intrinsics=k, image_size=(96, 120))
+    each = render(fine, texture, strong, BOX, 1.00027, samples=1).reshape(48, 2, 60, 2).mean(dim=(1, 3))
+    between = render(camera, texture, strong, BOX, 1.00027, samples=2)
+    reference = render(camera, texture, samples=2)
+    assert float((each - between).std()) < 0.02 * float((between - reference).std())
+
+
+def test_a_lens_is_sharp_in_focus_and_blurs_by_its_circle_of_confusion(camera):
+    flat = dataclasses.replace(Ring(views=1, arc=(0.0, 0.0), image_size=(40, 60), pixel_pitch=0.04).cameras()[0])
+    edge = torch.zeros(400, 600, dtype=torch.float64)
+    edge[:, 300:] = 1.0
+    texture = background_texture(flat, edge, 0.5)
+    pinhole = render(flat, texture)
+    sharp = render(flat, texture, lens=Lens(diameter=10.0, points=61))
+    assert float((pinhole - sharp).abs().max()) < 0.02
+    blurred = render(flat, texture, lens=Lens(diameter=10.0, focus=700.0, points=200))
+    spread = np.diff(blurred.numpy()[20])
+    columns = np.arange(len(spread))
+    variance = np.average((columns - np.average(columns, weights=spread)) ** 2, weights=spread)
+    focal = float(flat.intrinsics[0, 0])
+    circle = 10.0 * abs(1 / 700 - 1 / 1200) * focal  # px
+    assert variance == pytest.approx((circle / 4) ** 2 + 1 / 12, rel=0.1)  # of a disc, along one axis, and a pixel
+
+
+def test_an_aperture_smooths_the_flow(camera, texture, ball):
+    strong = Times(ball, 20.0)
+    still = render(camera, texture, lens=Lens(60.0, points=30))
+    open_ = render(camera, texture, strong, BOX, 1.00027, lens=Lens(60.0, points=30)) - still
+    pinhole = render(camera, texture, strong, BOX, 1.00027) - render(camera, texture)
+    assert float(open_.abs().max()) < 0.95 * float(pinhole.abs().max())
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_counts_have_the_noise_of_a_sensor(bits):
+    sensor = Sensor(bits=bits, exposure=0.6, full_well=8000, read_noise=12)
+    counts = sensor.expose(torch.full((200, 300), 0.5, dtype=torch.float64), seed=1).astype(float)
+    full = 2**bits - 1
+    assert counts.mean() / full == pytest.approx(0.3, rel=0.01)
+    expected = math.sqrt(0.3 * 8000 + 12**2) / 8000 * full
+    assert counts.std() == pytest.approx(math.sqrt(expected**2 + 1 / 12), rel=0.03)
+    dark = sensor.expose(torch.full((4, 4), 9.0, dtype=torch.float64), seed=1)
+    assert (dark == full).all()
+    assert dark.dtype == (np.uint8 if bits == 8 else np.uint16)
+    quiet = Sensor(bits=bits, full_well=0)
+    assert np.ptp(quiet.expose(torch.full((9, 9), 0.5, dtype=torch.float64), seed=1)) == 0
+    light = torch.rand(9, 9, dtype=torch.float64)
+    assert np.array_equal(sensor.expose(light, 3), sensor.expose(light, 3))
+    assert not np.array_equal(sensor.expose(light, 3), sensor.expose(light, 4))
+
+
+def test_what_cannot_be(camera, texture):
+    with pytest.raises(InputError, match="bits"):
+        Sensor(bits=20)
+    with pytest.raises(InputError, match="sensor"):
+        Sensor(read_noise=-1.0)
+    with pytest.raises(InputError, match="lens"):
+        Lens(diameter=-1.0)
+    with pytest.raises(InputError, match="samples"):
+        render(camera, texture, samples=0)
