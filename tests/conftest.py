@@ -4,8 +4,11 @@ from __future__ import annotations
 
 # ruff: noqa: E402
 import math
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # threads that wait must not take the cores of other tests
 
 import jaxtyping
 import pytest
