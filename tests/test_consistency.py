@@ -67,7 +67,10 @@ MISTAKES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+QUICK = ("swapped", "sign", "mirrored", "exchanged")
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in MISTAKES])
 def test_mistakes_are_named(clean, name):
     mistake, words = MISTAKES[name]
     found = check_consistency(spoilt(clean, mistake), voxels=20)

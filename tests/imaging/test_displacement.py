@@ -181,6 +181,7 @@ def test_settings_that_cannot_be_right(change, words):
         DisplacementSettings(**change)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_pictures_that_cannot_be_right(pattern):
     references, flow = pictures(pattern, np.zeros((*SHAPE, 2)))
     settings = DisplacementSettings("dis")
