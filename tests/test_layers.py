@@ -14,7 +14,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 LAYERS = (
     ("conventions",),
     ("geometry",),
-    ("measurement", "volume", "vti"),
+    ("measurement", "volume", "vti", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),

@@ -20,12 +20,13 @@ from nerif.measurement import Measurement
 from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
 from nerif.physics.deflection import Deflection, ForwardModel, project
 from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reprojection import Reprojection
 from nerif.volume import Volume
 
 VOXEL_STEP = 0.25  # voxels between samples
 REPROJECTION_SAMPLES = 128  # a ray; 0.1 % of the rms displacement on the flame
 
-__all__ = ["evaluate_views", "evaluate_volume", "predict_view", "update_json"]
+__all__ = ["evaluate_views", "evaluate_volume", "predict_view", "reproject", "update_json"]
 
 
 def predict_view(
@@ -49,23 +50,33 @@ def _through_voxels(
     return operator.through(field.coefficients).cpu()
 
 
-def evaluate_views(
+def reproject(
     field: Field, measurement: Measurement, held_out: Collection[str] = (), device: torch.device | str = "cpu"
-) -> list[dict[str, Any]]:
-    """Re-project a field into every view: cc, ssim, psnr and rms_px over the usable pixels whose rays cross the box.
+) -> Reprojection:
+    """Predict what every view of a measurement sees of a field; px."""
+    model = Deflection(samples=REPROJECTION_SAMPLES, n_ambient=measurement.n_ambient)
+    predicted = torch.full_like(measurement.displacement, float("nan"))
+    for i, camera in enumerate(measurement.cameras):
+        height, width = camera.image_size
+        predicted[i, :height, :width] = predict_view(field, camera, model, measurement.box, device)
+    return Reprojection(measurement, predicted, tuple(held_out))
+
+
+def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
+    """Compare every view with its prediction: cc, ssim, psnr and rms_px over the usable pixels that see the box.
 
     Where sigma is known, rms_over_sigma tells whether the residual is the noise (1) or more.
     """
-    model = Deflection(samples=REPROJECTION_SAMPLES, n_ambient=measurement.n_ambient)
+    measurement = reprojection.measurement
     usable = measurement.usable
     views = []
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
         crosses = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).crosses.reshape(height, width)
         mask = usable[i, :height, :width] & crosses
-        predicted = predict_view(field, camera, model, measurement.box, device)
+        predicted = reprojection.predicted[i, :height, :width]
         measured = measurement.displacement[i, :height, :width].nan_to_num(0.0, 0.0, 0.0)
-        view: dict[str, Any] = {"name": camera.name, "held_out": camera.name in held_out}
+        view: dict[str, Any] = {"name": camera.name, "held_out": camera.name in reprojection.held_out}
         view |= displacement_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
         if measurement.sigma is not None and bool(mask.any()):
             residual = (predicted - measured)[mask] / measurement.sigma[i, :height, :width][mask]

@@ -13,7 +13,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 
-__all__ = ["Volume", "read_volume", "write_netcdf"]
+__all__ = ["QUANTITIES", "Volume", "describe", "read_volume", "read_volumes", "write_netcdf"]
 
 QUANTITIES = {
     "index_excess": ("1", "refractive index minus that of the ambient"),
@@ -22,6 +22,21 @@ QUANTITIES = {
     "temperature": ("K", "temperature"),
 }
 """Unit and long name of what a volume may hold."""
+
+STATISTICS = {"mean": "mean", "std": "standard_deviation"}
+"""Endings of what an ensemble adds to a quantity (density_std), and CF's names for them."""
+
+TITLE = "Field of refractive index (background-oriented schlieren)"
+REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
+
+
+def describe(quantity: str) -> tuple[str, str]:
+    """Return unit and long name of a quantity such as density, or density_std of an ensemble."""
+    base, _, statistic = quantity.rpartition("_")
+    if statistic in STATISTICS and base in QUANTITIES:
+        unit, name = QUANTITIES[base]
+        return unit, f"{STATISTICS[statistic].replace('_', ' ')} of {name} over the ensemble"
+    return QUANTITIES.get(quantity, ("1", quantity))
 
 
 @dataclass(frozen=True)
@@ -34,7 +49,8 @@ class Volume:
     grid : Grid, mm
     quantity : what it is, e.g. "index_excess"
     unit : of the values
-    attributes : numbers and texts that belong to it, such as n_ambient
+    attributes : numbers and texts that belong to the whole field, such as n_ambient
+    notes : those that belong to this quantity, such as what was assumed for it and how many voxels are masked
     """
 
     values: Float[Tensor, "z y x"]
@@ -42,6 +58,7 @@ class Volume:
     quantity: str = "index_excess"
     unit: str = "1"
     attributes: dict[str, float | str] = field(default_factory=dict)
+    notes: dict[str, float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if tuple(self.values.shape) != self.grid.shape:
@@ -52,24 +69,44 @@ class Volume:
 
 
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write volumes on one grid to a NetCDF-4 file with coordinates x, y, z in mm, atomically."""
+    """Write volumes on one grid to a NetCDF-4 file by the CF conventions, coordinates in mm, atomically."""
+    from datetime import UTC, datetime
+
     import xarray as xr
 
+    from nerif import __version__
+
     grid = volumes[0].grid
-    coordinates = {a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper()}) for a in "zyx"}
-    data = {}
+    coordinates = {
+        a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper(), "long_name": f"{a} of the voxel centre"})
+        for a in "zyx"
+    }
+    data: dict[str, tuple] = {}
+    attributes: dict[str, float | str] = {}
     for v in volumes:
         if v.grid != grid:
             raise InputError(f"volume '{v.quantity}': expected the grid of '{volumes[0].quantity}', got another")
-        long_name = QUANTITIES.get(v.quantity, (v.unit, v.quantity))[1]
-        data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), {"units": v.unit, "long_name": long_name})
+        about = {"units": v.unit, "long_name": describe(v.quantity)[1], **_cf(v.quantity, volumes), **v.notes}
+        data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), about)
+        attributes |= v.attributes
     dataset = xr.Dataset(data, coords=coordinates)
-    dataset.attrs = {"Conventions": "CF-1.8", **volumes[0].attributes}
+    written = f"{datetime.now(UTC).isoformat(timespec='seconds')} written by nerif {__version__}"
+    dataset.attrs = {"Conventions": "CF-1.11", "title": TITLE, "source": f"nerif {__version__}", "history": written}
+    dataset.attrs |= {"references": REFERENCES, **attributes}
     # the box cannot be told from one voxel centre alone
     dataset.attrs["box_lower_mm"], dataset.attrs["box_upper_mm"] = list(grid.box.lower), list(grid.box.upper)
     temporary = Path(f"{os.fspath(path)}.part")
     dataset.to_netcdf(temporary, engine="h5netcdf", encoding={k: {"zlib": True, "complevel": 4} for k in data})
     os.replace(temporary, path)
+
+
+def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
+    """How CF says that one variable is the spread of another."""
+    base, _, statistic = quantity.rpartition("_")
+    if statistic in STATISTICS and base in QUANTITIES:
+        return {"cell_methods": f"realization: {STATISTICS[statistic]}"}
+    beside = [v.quantity for v in volumes if v.quantity in (f"{quantity}_mean", f"{quantity}_std")]
+    return {"ancillary_variables": " ".join(beside)} if beside else {}
 
 
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
@@ -82,27 +119,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     InputError
         If the file is missing, of another kind, or lacks the quantity.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a volume (.nc or .vti)")
-    if path.suffix == ".nc":
-        arrays, grid, attributes = _read_netcdf(path)
-    elif path.suffix == ".vti":
-        from nerif.vti import read_vti
-
-        arrays, grid, attributes = read_vti(path)
-    else:
-        raise InputError(f"{path}: expected a volume in .nc or .vti, got '{path.suffix or path.name}'")
-    return _choose(path, arrays, grid, attributes, quantity)
-
-
-def _choose(
-    path: Path,
-    arrays: dict[str, Tensor],
-    grid: Grid,
-    attributes: dict[str, float | str],
-    quantity: str | None,
-) -> Volume:
+    arrays, grid, attributes = _read(Path(path))
     if quantity is None:
         known = [q for q in ("index_excess", "n") if q in arrays]
         quantity = known[0] if known else next(iter(arrays)) if len(arrays) == 1 else None
@@ -110,13 +127,46 @@ def _choose(
         raise InputError(
             f"{path}: expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}"
         )
-    values = arrays[quantity]
-    if not bool(torch.isfinite(values).all()):
+    volume = _volume(quantity, arrays[quantity], grid, attributes)
+    if "masked_voxels" not in volume.notes and not bool(torch.isfinite(volume.values).all()):
         raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
     if quantity == "n":
         n_ambient = float(attributes.get("n_ambient", 1.0))
-        return Volume((values.double() - n_ambient).float(), grid, "index_excess", "1", attributes)
-    return Volume(values.float(), grid, quantity, QUANTITIES.get(quantity, ("1",))[0], attributes)
+        return Volume((arrays["n"].double() - n_ambient).float(), grid, "index_excess", "1", volume.attributes)
+    return volume
+
+
+def read_volumes(path: str | os.PathLike[str]) -> dict[str, Volume]:
+    """Read every quantity of a .nc or .vti file, masked voxels as NaN.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or of another kind.
+    """
+    arrays, grid, attributes = _read(Path(path))
+    return {quantity: _volume(quantity, values, grid, attributes) for quantity, values in arrays.items()}
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
+    """Arrays by name, and attributes: those of one quantity as density.assumption and the like."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a volume (.nc or .vti)")
+    if path.suffix == ".nc":
+        return _read_netcdf(path)
+    if path.suffix == ".vti":
+        from nerif.vti import read_vti
+
+        return read_vti(path)
+    raise InputError(f"{path}: expected a volume in .nc or .vti, got '{path.suffix or path.name}'")
+
+
+def _volume(quantity: str, values: Tensor, grid: Grid, attributes: dict[str, float | str]) -> Volume:
+    own = f"{quantity}."
+    notes = {k.removeprefix(own): v for k, v in attributes.items() if k.startswith(own) and k != f"{own}units"}
+    shared = {k: v for k, v in attributes.items() if "." not in k}
+    values = values if quantity == "n" else values.float()
+    return Volume(values, grid, quantity, describe(quantity)[0], shared, notes)
 
 
 def _read_netcdf(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
@@ -150,9 +200,12 @@ def _read_netcdf(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float |
         for name, v in dataset.data_vars.items()
         if set(v.dims) == {"z", "y", "x"}
     }
+    found = dict(dataset.attrs)
+    for name, variable in dataset.data_vars.items():
+        found |= {f"{name}.{k}": v for k, v in variable.attrs.items()}
     attributes: dict[str, float | str] = {
         str(k): v if isinstance(v, str) else float(v)
-        for k, v in dataset.attrs.items()
+        for k, v in found.items()
         if isinstance(v, str | int | float | np.number)
     }
     return arrays, grid, attributes

@@ -11,23 +11,19 @@ import tyro
 from nerif.commands import evaluate, reconstruct, simulate
 from nerif.commands.methods import ReconstructNeRIF
 from nerif.commands.output import check_directory, say
+from nerif.commands.report import write_report
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
-from nerif.evaluation import predict_view
 from nerif.geometry import Ring
-from nerif.measurement import Measurement
-from nerif.physics.deflection import Deflection
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
-from nerif.report.figures import save_slices, save_view
-from nerif.volume import read_volume
 
 __all__ = ["Demo", "main", "run"]
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Simulate nine small views of a flame and a tenth to hold out, reconstruct, evaluate, and draw."""
+    """Simulate nine small views of a flame and a tenth to hold out, reconstruct, evaluate, and write a report."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
     """Directory to write."""
@@ -60,7 +56,7 @@ def run(settings: Demo) -> None:
         )
     )
     held_out = f"{between:g}deg"
-    result = reconstruct.run(
+    reconstruct.run(
         ReconstructNeRIF(
             measurement=measured,
             out=settings.out,
@@ -68,26 +64,15 @@ def run(settings: Demo) -> None:
             hold_out=(held_out,),
             voxels=80,
             force=True,
+            report=False,
             gas=GasSettings(),
             reconstructor=NeRIF(time_limit=settings.time_limit, epochs=1000, seed=settings.seed),
         )
     )
-    truth_file = simulate.truth_path(measured)
-    evaluate.run(evaluate.Evaluate(settings.out, truth=truth_file))
-
-    truth = read_volume(truth_file)
-    save_slices(settings.out / "slices.png", result.volume(truth.grid), truth)
-    measurement = Measurement.read(measured)
-    i = measurement.names.index(held_out)
-    predicted = predict_view(
-        result.field, measurement.cameras[i], Deflection(n_ambient=result.n_ambient), result.box, result.device
-    )
-    save_view(
-        settings.out / "held_out_view.png", held_out,
-        measurement.displacement[i].numpy(), predicted.numpy(), measurement.usable[i].numpy(),
-    )  # fmt: skip
-    say(f"Look at {settings.out}/slices.png and {settings.out}/held_out_view.png;")
-    say(f"open {settings.out}/volume.vti in ParaView; all figures: nerif info {settings.out}")
+    evaluate.run(evaluate.Evaluate(settings.out, truth=simulate.truth_path(measured)))
+    page = write_report(settings.out)
+    say(f"Open {page} in a browser: the field, the views, and whether it can be trusted.")
+    say(f"Open {settings.out}/volume.vti in ParaView; figures for print: nerif figures {settings.out}")
 
 
 def main(arguments: list[str]) -> None:

@@ -11,9 +11,10 @@ import tyro
 from nerif.commands.output import say
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
-from nerif.evaluation import evaluate_views, evaluate_volume, update_json
+from nerif.evaluation import evaluate_views, evaluate_volume, reproject, update_json
 from nerif.measurement import Measurement
 from nerif.reconstruction.files import read_field
+from nerif.reprojection import REPROJECTION
 from nerif.volume import read_volume
 
 __all__ = ["Evaluate", "main", "run"]
@@ -54,6 +55,7 @@ def run(settings: Evaluate) -> dict[str, Any]:
                 f"got one that sticks out along {', '.join(outside)}"
             )
         metrics |= evaluate_volume(field, truth, n_ambient)
+        metrics["truth"] = str(settings.truth.resolve())
         say(f"L2            {metrics['l2']:8.3%}   |n_gt - n_rec| / |n_gt - 1|, the paper's")
         say(f"L2 variation  {metrics['l2_variation']:8.3%}   |n_gt - n_rec| / |n_gt - n_ambient|")
         say(f"CC            {metrics['cc']:8.5f}")
@@ -64,7 +66,12 @@ def run(settings: Evaluate) -> dict[str, Any]:
             say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
     if settings.measurement is not None:
         measurement = Measurement.read(settings.measurement)
-        metrics["views"] = evaluate_views(field, measurement, settings.hold_out)
+        unknown = [name for name in settings.hold_out if name not in measurement.names]
+        if unknown:
+            raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{unknown[0]}'")
+        reprojection = reproject(field, measurement, settings.hold_out)
+        reprojection.write(settings.result / REPROJECTION)
+        metrics["views"] = evaluate_views(reprojection)
         say("view                CC    SSIM  PSNR [dB]  rms [px]")
         for v in metrics["views"]:
             held = "  held out" if v["held_out"] else ""

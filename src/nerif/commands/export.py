@@ -8,13 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, say
+from nerif.commands.output import check_file, say, say_masked
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings, derive
 from nerif.reconstruction.files import read_field
-from nerif.report.exports import export
+from nerif.report.exports import FORMATS, export
 from nerif.volume import Volume
 
 __all__ = ["Export", "main", "run"]
@@ -22,12 +22,12 @@ __all__ = ["Export", "main", "run"]
 
 @dataclass(frozen=True)
 class Export:
-    """Write a reconstruction as .vti (opens in ParaView), .nc or .csv, on any grid."""
+    """Write a reconstruction as .vti (opens in ParaView), .nc, .npz, .mat or .csv, on any grid."""
 
     result: Annotated[Path, tyro.conf.Positional]
     """Result directory of nerif reconstruct."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """File to write; its ending says the format: .vti, .nc or .csv."""
+    """File to write; its ending says the format: .vti, .nc, .npz, .mat or .csv."""
     quantities: tuple[str, ...] = ("index_excess", "n", "density")
     """Out of index_excess (1), n (1), density (kg/m3), temperature (K)."""
     voxels: int = 100
@@ -50,8 +50,8 @@ def run(settings: Export) -> None:
         raise InputError(f"voxels: expected at least 1, got {settings.voxels}")
     if not settings.quantities:
         raise InputError("quantities: expected at least one, got none")
-    if settings.out.suffix not in (".vti", ".nc", ".csv"):
-        raise InputError(f"out: expected a name ending in .vti, .nc or .csv, got '{settings.out.name}'")
+    if settings.out.suffix not in FORMATS:
+        raise InputError(f"out: expected a name ending in {', '.join(FORMATS)}, got '{settings.out.name}'")
     check_file(settings.out, settings.force)
     index, whole, n_ambient = read_field(settings.result)
     lower, upper = settings.lower or whole.lower, settings.upper or whole.upper
@@ -63,8 +63,10 @@ def run(settings: Export) -> None:
         raise InputError(f"lower, upper: expected a part of the box {whole_box}, got {lower} to {upper}")
     grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
     excess = Volume(index.sample(grid), grid, attributes={"n_ambient": n_ambient})
-    export(settings.out, [derive(excess, q, settings.gas) for q in settings.quantities])
+    volumes = [derive(excess, q, settings.gas) for q in settings.quantities]
+    export(settings.out, volumes)
     say(f"{settings.out}: {', '.join(settings.quantities)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
+    say_masked(volumes)
 
 
 def main(arguments: list[str]) -> None:

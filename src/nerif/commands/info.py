@@ -84,9 +84,12 @@ def _measurement(path: Path, m: Measurement) -> None:
 def _volume(path: Path, v: Volume) -> None:
     say(f"{path}: volume of {v.quantity} [{v.unit}] on {' x '.join(map(str, v.grid.shape))} voxels (z, y, x)")
     say(f"  box            {_corners(v.grid.box.lower, v.grid.box.upper)}")
-    low, high, mean = (float(x) for x in (v.values.min(), v.values.max(), v.values.mean()))
+    known = v.values[v.values.isfinite()]
+    low, high, mean = (
+        (float(x) for x in (known.min(), known.max(), known.mean())) if len(known) else (float("nan"),) * 3
+    )
     say(f"  values         {low:.6g} to {high:.6g}, mean {mean:.6g}")
-    for name, value in v.attributes.items():
+    for name, value in {**v.attributes, **v.notes}.items():
         say(f"  {name:<14} {value}")
 
 

@@ -36,6 +36,12 @@ class Reconstruct:
     """Views kept out of the reconstruction and re-projected from it."""
     start_from: Path | None = None
     """Result directory of another reconstruction in the same box, of any method, to start from."""
+    ensemble: int = 0
+    """Reconstruct so many times more with other seeds and noise, for mean and standard deviation of every quantity."""
+    leave_one_out: bool = False
+    """Let each member of the ensemble do without one view, in turn."""
+    report: bool = True
+    """Write report.html at the end."""
     force: bool = False
     """Overwrite an existing result directory."""
     resume: bool = False

@@ -10,13 +10,23 @@ from pathlib import Path
 
 from nerif.conventions import InputError
 from nerif.reconstruction.base import Step
+from nerif.volume import Volume
 
-__all__ = ["check_directory", "check_file", "interruptible", "progress_bar", "say"]
+__all__ = ["check_directory", "check_file", "interruptible", "progress_bar", "say", "say_masked"]
 
 
 def say(text: str) -> None:
     """Print a line for the user."""
     print(text, flush=True)
+
+
+def say_masked(volumes: list[Volume]) -> None:
+    """Say of each quantity how many voxels are masked, and why."""
+    for v in volumes:
+        count = int(v.notes.get("masked_voxels", 0))
+        if count:
+            share = count / v.values.numel()
+            say(f"{v.quantity}: {count} of {v.values.numel()} voxels ({share:.2%}) are NaN: {v.notes['masked_where']}")
 
 
 def check_file(path: Path, force: bool, *others: Path) -> None:

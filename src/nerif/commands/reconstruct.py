@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,29 +10,27 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from nerif import __version__
+from nerif.commands.members import add_ensemble
 from nerif.commands.methods import METHODS, Reconstruct
 from nerif.commands.output import check_directory, interruptible, progress_bar, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml, to_toml
+from nerif.commands.report import write_report
+from nerif.commands.result_files import clear, run_toml, write_result
+from nerif.commands.settings import flag_value, merge, parse, read_toml
 from nerif.conventions import InputError
-from nerif.evaluation import evaluate_views, update_json
 from nerif.fields.base import Field
-from nerif.geometry import Grid
 from nerif.measurement import Measurement
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import OnStep, Reconstruction, Step, compose
-from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_state, write_field, write_state
+from nerif.reconstruction.ensemble import Ensemble
+from nerif.reconstruction.files import read_field, read_state, write_state
 from nerif.reconstruction.presets import preset
-from nerif.report.exports import export
+from nerif.report.result import RUN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from contextlib import AbstractContextManager
 
 __all__ = ["main", "run"]
-
-RUN, METRICS, HISTORY = "run.toml", "metrics.json", "history.csv"
-OWN_FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, "volume.nc", "volume.vti")
 
 
 def run(settings: Reconstruct) -> Reconstruction:
@@ -42,6 +39,10 @@ def run(settings: Reconstruct) -> Reconstruction:
         raise InputError(f"voxels: expected at least 1, got {settings.volume_voxels}")
     measurement = Measurement.read(settings.measurement)
     training = _without(measurement, settings.hold_out)
+    if settings.ensemble:
+        Ensemble(settings.ensemble)  # refuses a wrong number before the long work
+    elif settings.leave_one_out:
+        raise InputError("leave_one_out: expected together with --ensemble K, got no ensemble")
     if measurement.wavelength_nm is not None:
         settings = replace(settings, gas=replace(settings.gas, wavelength_nm=measurement.wavelength_nm))
     derive_check(settings.gas)
@@ -61,7 +62,11 @@ def run(settings: Reconstruct) -> Reconstruction:
         result = settings.reconstructor(training, compose(*callbacks), resume, start)
     say(f"{result.outcome.reason}: {result.outcome.message}")
     begin(None)
-    _write(settings, measurement, result)
+    write_result(settings, measurement, result)
+    if settings.ensemble and result.outcome.reason != "interrupted":
+        add_ensemble(settings, measurement, training, result)
+    if settings.report:
+        write_report(settings.out)
     return result
 
 
@@ -104,9 +109,8 @@ def _begin(settings: Reconstruct) -> Callable[[Step | None], None]:
             return
         settings.out.mkdir(parents=True, exist_ok=True)
         if not settings.resume:
-            for name in OWN_FILES:
-                (settings.out / name).unlink(missing_ok=True)
-        (settings.out / RUN).write_text(_run_toml(settings))
+            clear(settings.out)
+        (settings.out / RUN).write_text(run_toml(settings))
         done.append(True)
 
     return prepare
@@ -147,60 +151,6 @@ def _scalars(settings: Reconstruct) -> AbstractContextManager[list[OnStep]]:
             yield [write]
 
     return board() if settings.tensorboard else nothing()
-
-
-def _run_toml(settings: Reconstruct, about: dict[str, Any] | None = None) -> str:
-    kept = replace(settings, force=False, resume=False, config=None, measurement=settings.measurement.resolve())
-    if kept.start_from is not None:
-        kept = replace(kept, start_from=kept.start_from.resolve())
-    head = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
-    return head + to_toml(kept, {"nerif": __version__, **(about or {})})
-
-
-def _write(settings: Reconstruct, measurement: Measurement, result: Reconstruction) -> None:
-    """Write the result directory; the field first, it is the costliest."""
-    import torch
-
-    out = settings.out
-    write_field(out, result)
-    if result.state is not None:
-        write_state(out, result.state)
-    _write_history(out / HISTORY, result.history)
-    views = evaluate_views(result.field, measurement, settings.hold_out, result.device)
-    update_json(
-        out / METRICS,
-        {
-            "views": views,
-            "seconds": result.seconds,
-            "peak_memory_bytes": result.peak_memory_bytes,
-            "device": result.device,
-            "outcome": result.outcome.reason,
-        },
-    )
-    about = {"torch": torch.__version__, "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
-    (out / RUN).write_text(_run_toml(settings, about))
-    excess = result.volume(Grid.of_resolution(result.box, settings.volume_voxels))
-    volumes = [derive(excess, quantity, settings.gas) for quantity in ("index_excess", "n", "density")]
-    volumes[0] = replace(volumes[0], attributes=volumes[-1].attributes)
-    for name in ("volume.nc", "volume.vti"):
-        export(out / name, volumes)
-    for group, held in (("training views", False), ("held-out views", True)):
-        chosen = [v for v in views if v["held_out"] is held]
-        if chosen:
-            cc = min(v["cc"] for v in chosen)
-            rms = max(v["rms_px"] for v in chosen)
-            noise = max(v.get("rms_over_sigma", float("nan")) for v in chosen)
-            beside = "" if noise != noise else f", at most {noise:.2f} sigma"
-            say(f"{len(chosen)} {group}: CC at least {cc:.4f}, rms error at most {rms:.4f} px{beside}")
-    say(f"{out}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView")
-
-
-def _write_history(path: Path, history: list[dict[str, float]]) -> None:
-    columns = list(dict.fromkeys(key for record in history for key in record))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="")
-        writer.writeheader()
-        writer.writerows(history)
 
 
 def main(arguments: list[str]) -> None:

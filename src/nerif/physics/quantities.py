@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
 from nerif.volume import QUANTITIES, Volume
 
-__all__ = ["GasSettings", "derive"]
+__all__ = ["TEMPERATURE_RANGE", "GasSettings", "derive"]
+
+TEMPERATURE_RANGE = 200.0, 4000.0
+"""K; beyond, gases of the table condense or dissociate, and one composition holds no more."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,11 @@ class GasSettings:
 def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
     """Return n, density (Gladstone-Dale) or temperature (ideal gas) from a volume of index excess.
 
+        rho = (n - 1) / K,      T = p M / (R rho)
+
+    Where the relations break down (n - 1 <= 0, temperature beyond 200 to 4000 K) values are NaN; how many, and what was
+    assumed, stands in the notes.
+
     Parameters
     ----------
     excess : Volume of index excess with n_ambient in its attributes
@@ -49,6 +61,7 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
     if quantity == "n":
         return replace(excess, values=excess.values.double() + n_ambient, quantity="n")
     k = gladstone_dale(gas.composition, gas.wavelength_nm)
+    mass = molar_mass(gas.composition)
     attributes: dict[str, float | str] = {
         **excess.attributes,
         "gas": gas.composition,
@@ -56,8 +69,33 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
         "gladstone_dale_m3_kg-1": k,
     }
     density = density_from_index(excess.values.double(), n_ambient, k)
+    real = density > 0
     if quantity == "density":
-        return Volume(density.float(), excess.grid, "density", QUANTITIES["density"][0], attributes)
-    attributes["pressure_pa"] = gas.pressure_pa
-    temperature = temperature_from_density(density, gas.pressure_pa, molar_mass(gas.composition))
-    return Volume(temperature.float(), excess.grid, "temperature", QUANTITIES["temperature"][0], attributes)
+        density = density.masked_fill(~real, math.nan)
+        return _quantity(excess, "density", density, attributes, _density_assumption(gas, k), "n - 1 <= 0")
+    attributes |= {"pressure_pa": gas.pressure_pa, "molar_mass_kg_mol-1": mass}
+    temperature = temperature_from_density(density, gas.pressure_pa, mass)
+    low, high = TEMPERATURE_RANGE
+    temperature = temperature.masked_fill((temperature < low) | (temperature > high), math.nan)
+    assumption = (
+        f"T = p M / (R rho), an ideal gas of M = {mass * 1e3:.4g} g/mol ({gas.composition}) "
+        f"at a uniform pressure of {gas.pressure_pa:g} Pa; {_density_assumption(gas, k)}"
+    )
+    where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
+    return _quantity(excess, "temperature", temperature, attributes, assumption, where)
+
+
+def _density_assumption(gas: GasSettings, k: float) -> str:
+    return (
+        f"n - 1 = K rho (Gladstone-Dale) with K = {k:.5g} m3/kg of {gas.composition} at {gas.wavelength_nm:g} nm, "
+        "one composition throughout"
+    )
+
+
+def _quantity(
+    excess: Volume, quantity: str, values: Tensor, attributes: dict[str, float | str], assumption: str, where: str
+) -> Volume:
+    """A volume whose masked voxels are NaN, counted, and explained."""
+    count = int(torch.isnan(values).sum())
+    notes: dict[str, float | str] = {"assumption": assumption, "masked_voxels": count, "masked_where": where}
+    return Volume(values.float(), excess.grid, quantity, QUANTITIES[quantity][0], attributes, notes)

@@ -40,7 +40,7 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
             axes.set_xlabel("column [px]" if k else "", fontsize=7)
             axes.set_ylabel("row [px]" if i % columns == 0 else "", fontsize=7)
     assert shown is not None
-    figure.colorbar(shown, ax=grid.ravel().tolist(), label="displacement [px]", shrink=0.6, extend="both")
+    figure.colorbar(shown.images[-1], ax=grid.ravel().tolist(), label="displacement [px]", shrink=0.6, extend="both")
     figure.savefig(path, dpi=120)
 
 
@@ -70,5 +70,5 @@ def save_masks(path: Path, measurement: Measurement) -> None:
         axes.tick_params(labelsize=6)
         axes.set_xlabel("column [px]", fontsize=7)
         axes.set_ylabel("row [px]" if i % columns == 0 else "", fontsize=7)
-    figure.colorbar(shown, ax=grid.ravel().tolist(), label="|d| [px]", shrink=0.6, extend="max")
+    figure.colorbar(shown.images[-1], ax=grid.ravel().tolist(), label="|d| [px]", shrink=0.6, extend="max")
     figure.savefig(path, dpi=120)

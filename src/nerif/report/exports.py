@@ -1,9 +1,12 @@
-"""Files for other programs: VTK image data (.vti, opens in ParaView) and comma-separated text."""
+"""Files for other programs: VTK (.vti, opens in ParaView), NetCDF, NumPy (.npz), MATLAB (.mat), text (.csv)."""
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -11,20 +14,65 @@ from nerif.conventions import InputError
 from nerif.volume import Volume, write_netcdf
 from nerif.vti import write_vti
 
-__all__ = ["export", "write_csv"]
+__all__ = ["FORMATS", "export", "write_csv", "write_mat", "write_npz"]
 
 
 def export(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write volumes on one grid to `path`, by its ending: .vti, .nc or .csv."""
-    writers = {".vti": _write_vti, ".nc": write_netcdf, ".csv": write_csv}
+    """Write volumes on one grid to `path`, by its ending: one of FORMATS.
+
+    Raises
+    ------
+    InputError
+        If the ending is another.
+    """
     suffix = Path(path).suffix
-    if suffix not in writers:
-        raise InputError(f"{path}: expected a name ending in {', '.join(writers)}, got '{suffix}'")
-    writers[suffix](path, volumes)
+    if suffix not in FORMATS:
+        raise InputError(f"{path}: expected a name ending in {', '.join(FORMATS)}, got '{suffix}'")
+    FORMATS[suffix](path, volumes)
 
 
 def _write_vti(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    write_vti(path, {v.quantity: v.values for v in volumes}, volumes[0].grid, volumes[0].attributes)
+    write_vti(path, {v.quantity: v.values for v in volumes}, volumes[0].grid, _attributes(volumes))
+
+
+def _attributes(volumes: list[Volume]) -> dict[str, float | str]:
+    """Attributes of all, then unit and notes of each quantity under density.assumption and the like."""
+    found: dict[str, float | str] = {}
+    for v in volumes:
+        found |= v.attributes
+    for v in volumes:
+        found |= {f"{v.quantity}.{name}": value for name, value in {"units": v.unit, **v.notes}.items()}
+    return found
+
+
+def write_npz(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
+    """Write arrays [z, y, x] by quantity, x_mm, y_mm, z_mm, and `about`: units and attributes as JSON; no pickles."""
+    import numpy as np
+
+    arrays: dict[str, Any] = {v.quantity: v.values.cpu().numpy() for v in volumes}
+    arrays |= {f"{a}_mm": volumes[0].grid.axis(a).numpy() for a in "xyz"}
+    arrays["about"] = np.array(json.dumps(_attributes(volumes)))
+    temporary = Path(f"{os.fspath(path)}.part")
+    with temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    os.replace(temporary, path)
+
+
+def write_mat(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
+    """Write a MATLAB 5 file: A(i, j, k) of each quantity stands at x_mm(i), y_mm(j), z_mm(k); `about` holds the rest.
+
+    MATLAB's plots want rows along y: isosurface(x_mm, y_mm, z_mm, permute(density, [2 1 3]), level).
+    """
+    from scipy.io import savemat
+
+    data: dict[str, Any] = {v.quantity: v.values.cpu().numpy().transpose(2, 1, 0) for v in volumes}
+    data |= {f"{a}_mm": volumes[0].grid.axis(a).numpy()[:, None] for a in "xyz"}
+    # names of MATLAB: letters, digits, underscores
+    data["about"] = {re.sub(r"\W", "_", name): value for name, value in _attributes(volumes).items()}
+    temporary = Path(f"{os.fspath(path)}.part")
+    with temporary.open("wb") as file:
+        savemat(file, data, do_compression=True, long_field_names=True)
+    os.replace(temporary, path)
 
 
 def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
@@ -37,3 +85,7 @@ def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     temporary = Path(f"{os.fspath(path)}.part")
     np.savetxt(temporary, torch.cat(columns, dim=1).numpy(), delimiter=",", header=header, comments="", fmt="%.9g")
     os.replace(temporary, path)
+
+
+FORMATS = {".vti": _write_vti, ".nc": write_netcdf, ".npz": write_npz, ".mat": write_mat, ".csv": write_csv}
+"""Endings and their writers."""

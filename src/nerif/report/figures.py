@@ -1,9 +1,12 @@
-"""Figures, drawn into Axes that the caller gives, and the two that go with every demo as PNG."""
+"""Figures, each drawn into Axes that the caller gives and gets back; `pages.py` makes pages of them for print.
+
+Sequential colour maps are perceptually uniform, diverging ones centred on 0; the colour-blind can read both.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,85 +14,196 @@ from nerif.volume import Volume
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.image import AxesImage
 
-__all__ = ["draw_displacement", "draw_slice", "save_slices", "save_view"]
+__all__ = [
+    "COLOUR_MAPS",
+    "DIVERGING",
+    "LABELS",
+    "add_colour_bar",
+    "draw_displacement",
+    "draw_history",
+    "draw_residuals",
+    "draw_slice",
+    "draw_slice_scores",
+    "draw_view_scores",
+    "label_of",
+    "shown",
+]
 
 PLANES = {"z": ("x", "y"), "y": ("x", "z"), "x": ("y", "z")}
 """Normal of a slice: the axes it is drawn over."""
 
+COLOUR_MAPS = {"temperature": "inferno"}
+"""By quantity; the others are drawn in viridis."""
 
-def draw_slice(axes: Axes, volume: Volume, normal: str, limits: tuple[float, float]) -> AxesImage:
-    """Draw the middle slice of a volume across the axis `normal`; lengths in mm."""
-    values = volume.values.numpy()
+DIVERGING = "RdBu_r"
+
+COLOURS = {"blue": "#0072B2", "orange": "#D55E00", "green": "#009E73", "grey": "#595959"}  # Okabe & Ito
+
+LABELS = {
+    "index_excess": ("n − n$_{ambient}$", "1"),
+    "n": ("n − 1", "1"),
+    "density": ("density", "kg m$^{-3}$"),
+    "temperature": ("temperature", "K"),
+}
+"""What stands at a colour bar, and the unit."""
+
+
+TERMS = {
+    "automatic": "displacement, exact gradient",
+    "numerical": "displacement, central differences",
+    "head": "displacement, gradient head",
+    "consistency": "head against gradient",
+    "gauge": "ambient (gauge)",
+    "loss": "whole loss",
+}
+"""Names of the terms of the loss in words."""
+
+
+def label_of(quantity: str) -> str:
+    """Return the label of a colour bar, with its unit: of density, density_std and so on."""
+    base, _, statistic = quantity.rpartition("_")
+    if statistic in ("mean", "std") and base in LABELS:
+        name, unit = LABELS[base]
+        return f"{'standard deviation of' if statistic == 'std' else 'mean'} {name} [{unit}]"
+    name, unit = LABELS.get(quantity, (quantity, "1"))
+    return f"{name} [{unit}]"
+
+
+def shown(volume: Volume) -> np.ndarray:
+    """Return the values as they are shown, (z, y, x): n as n - 1, the others as they are."""
+    values = volume.values.double().numpy()
+    return values - 1 if volume.quantity in ("n", "n_mean") else values
+
+
+def draw_slice(
+    axes: Axes, volume: Volume, normal: str, limits: tuple[float, float] | None = None, colour_map: str | None = None
+) -> Axes:
+    """Draw the middle slice of a volume across the axis `normal`; lengths in mm, masked voxels grey."""
+    values = shown(volume)
+    low, high = limits or finite_range(values)
     axis = "zyx".index(normal)
     plane = np.take(values, values.shape[axis] // 2, axis=axis)
     across, up = PLANES[normal]
     box = volume.grid.box
     i, j = "xyz".index(across), "xyz".index(up)
-    image = axes.imshow(
+    axes.set_facecolor("0.8")
+    axes.imshow(
         plane,
         origin="lower",
         extent=(box.lower[i], box.upper[i], box.lower[j], box.upper[j]),
-        vmin=limits[0],
-        vmax=limits[1],
-        cmap="viridis",
+        vmin=low,
+        vmax=high,
+        cmap=colour_map or COLOUR_MAPS.get(volume.quantity.partition("_")[0], "viridis"),
         interpolation="nearest",
     )
     axes.set_xlabel(f"{across} [mm]")
     axes.set_ylabel(f"{up} [mm]")
-    return image
+    return axes
 
 
-def draw_displacement(axes: Axes, image: np.ndarray, limit: float) -> AxesImage:
-    """Draw one displacement component (px) on a diverging scale centred on 0; rows downward."""
-    drawn = axes.imshow(image, vmin=-limit, vmax=limit, cmap="RdBu_r", interpolation="nearest")
+def finite_range(values: np.ndarray) -> tuple[float, float]:
+    """Return lowest and highest value, leaving out NaN; 0 and 1 if there is nothing else."""
+    known = values[np.isfinite(values)]
+    return (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+
+
+def draw_displacement(axes: Axes, image: np.ndarray, limit: float) -> Axes:
+    """Draw one displacement component (px) on a diverging scale centred on 0; rows downward, unmeasured pixels grey."""
+    axes.set_facecolor("0.8")
+    axes.imshow(image, vmin=-limit, vmax=limit, cmap=DIVERGING, interpolation="nearest")
     axes.set_xlabel("column [px]")
     axes.set_ylabel("row [px]")
-    return drawn
+    return axes
 
 
-def save_slices(path: Path, reconstruction: Volume, truth: Volume | None = None) -> None:
-    """Write a PNG of the three middle slices; with a truth, truth and difference below."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def add_colour_bar(axes: Sequence[Axes], label: str) -> Axes:
+    """Put a colour bar beside axes that share the last one's scale, and return its axes."""
+    from matplotlib.ticker import ScalarFormatter
 
-    values = reconstruction.values if truth is None else truth.values
-    limits = float(values.min()), float(values.max())
-    rows: list[tuple[str, Volume, tuple[float, float]]] = [("reconstruction", reconstruction, limits)]
-    if truth is not None:
-        error = Volume(reconstruction.values - truth.values, truth.grid)
-        reach = float(error.values.abs().max())
-        rows += [("truth", truth, limits), ("difference", error, (-reach, reach))]
-    figure = Figure(figsize=(11, 3.6 * len(rows)), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(len(rows), 3, squeeze=False)
-    for (name, volume, scale), line in zip(rows, grid, strict=True):
-        for axes, normal in zip(line, "zyx", strict=True):
-            drawn = draw_slice(axes, volume, normal, scale)
-            if name == "difference":
-                drawn.set_cmap("RdBu_r")
-            n = volume.grid.shape["zyx".index(normal)]
-            height = float(volume.grid.axis(normal)[n // 2])
-            axes.set_title(f"{name}, {normal} = {height:.2f} mm", fontsize=10)
-        figure.colorbar(drawn, ax=list(line), label="n − n$_{ambient}$ [1]", format="%.1e")
-    figure.savefig(path, dpi=130)
+    form = ScalarFormatter(useMathText=True)
+    form.set_powerlimits((-3, 4))
+    figure = axes[0].figure
+    bar = figure.colorbar(axes[-1].images[-1], ax=list(axes), format=form, shrink=0.9, pad=0.02)
+    bar.set_label(label)
+    return bar.ax
 
 
-def save_view(path: Path, name: str, measured: np.ndarray, predicted: np.ndarray, valid: np.ndarray) -> None:
-    """Write a PNG of measured, predicted and difference of both components of a view, px."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Axes:
+    """Draw how a run went: the terms of the loss over seconds, or the residual over iterations; logarithmic."""
+    neural = method == "nerif"
+    known = {name for record in history for name in record}
+    across = "seconds" if "seconds" in known else "step"
+    aside = {"step", "epoch", "seconds", "rays_per_second", "learning_rate", "samples", "weight", "voxels", "iteration"}
+    names = [n for n in dict.fromkeys(n for record in history for n in record) if n not in aside]
+    colours = [*COLOURS.values()]
+    drawn = 0
+    for name in names:
+        points = [(r[across], r[name]) for r in history if r.get(name, 0) > 0 and np.isfinite(r.get(name, np.nan))]
+        if len(points) < 2:
+            continue
+        x, y = np.array(points).T
+        whole = name == "loss"  # drawn below its terms, of which one is often all of it
+        axes.plot(
+            x, y, label=TERMS.get(name, name.replace("_", " ")), linewidth=3 if whole else 1, zorder=1 if whole else 2,
+            color="0.75" if whole else colours[drawn % len(colours)],
+            linestyle=("-", "--", ":", "-.")[drawn // len(colours) % 4],
+        )  # fmt: skip
+        drawn += 1
+    axes.set_yscale("log")
+    axes.set_xlabel("time [s]" if across == "seconds" else "step")
+    axes.set_ylabel("loss [1]" if neural else "scaled residual, penalty [1]")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
+    if drawn:
+        axes.legend(frameon=False)
+    return axes
 
-    figure = Figure(figsize=(11, 6.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(2, 3)
-    masked = np.where(valid[..., None], measured, np.nan)
-    limit = float(np.nanmax(np.abs(masked)))
-    for component, line in zip((0, 1), grid, strict=True):
-        images = (masked[..., component], predicted[..., component], (masked - predicted)[..., component])
-        for axes, title, image in zip(line, ("measured", "predicted", "difference"), images, strict=True):
-            drawn = draw_displacement(axes, image, limit)
-            axes.set_title(f"{'uv'[component]} {title}, view {name}", fontsize=10)
-        figure.colorbar(drawn, ax=list(line), label=f"displacement {'uv'[component]} [px]")
-    figure.savefig(path, dpi=130)
+
+def draw_slice_scores(axes: Axes, slices: list[dict[str, Any]]) -> Axes:
+    """Draw SSIM and CC of slices across z against the truth; 1 is perfect."""
+    z = [s["z_mm"] for s in slices]
+    for name, mark, colour in (("cc", "o", COLOURS["blue"]), ("ssim", "s", COLOURS["orange"])):
+        values = [np.nan if s.get(name) is None else s[name] for s in slices]
+        axes.plot(z, values, marker=mark, markersize=3, linewidth=1, color=colour, label=name.upper())
+    axes.set_xlabel("z [mm]")
+    axes.set_ylabel("CC, SSIM of a slice [1]")
+    axes.grid(True, color="0.9", linewidth=0.6)
+    axes.legend(frameon=False)
+    return axes
+
+
+def draw_view_scores(axes: Axes, views: list[dict[str, Any]]) -> Axes:
+    """Draw the rms error of every view, in units of its noise where known, else in px; held-out views marked."""
+    in_sigma = all(v.get("rms_over_sigma") is not None for v in views)
+    key = "rms_over_sigma" if in_sigma else "rms_px"
+    places = range(len(views))
+    for place, view in zip(places, views, strict=True):
+        value = view.get(key)
+        if value is None:
+            continue
+        held = view["held_out"]
+        colour = COLOURS["orange"] if held else COLOURS["blue"]
+        axes.bar(place, value, width=0.7, color=colour, hatch="///" if held else None, edgecolor="white", linewidth=0)
+    if in_sigma:
+        axes.axhline(1, color=COLOURS["grey"], linewidth=0.8, linestyle="--")
+    names = [f"{v['name']}\nheld out" if v["held_out"] else v["name"] for v in views]
+    axes.set_xticks(list(places), names, rotation=90)
+    axes.set_ylabel("rms error / noise [1]" if in_sigma else "rms error [px]")
+    return axes
+
+
+def draw_residuals(axes: Axes, residuals: np.ndarray) -> Axes:
+    """Draw the distribution of residuals in units of the noise beside the unit Gaussian that pure noise would give."""
+    edges = np.linspace(-5, 5, 61)
+    counts = np.histogram(residuals, bins=edges)[0] / (max(residuals.size, 1) * (edges[1] - edges[0]))
+    beyond = float(np.mean(np.abs(residuals) > edges[-1])) if residuals.size else 0.0
+    middle = (edges[1:] + edges[:-1]) / 2
+    axes.stairs(counts, edges, color=COLOURS["blue"], fill=True, alpha=0.35)
+    axes.stairs(counts, edges, color=COLOURS["blue"], label=f"residual ({beyond:.1%} beyond ±5)")
+    gauss = np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi)
+    axes.plot(middle, gauss, color=COLOURS["orange"], linestyle="--", linewidth=1, label="noise alone")
+    axes.set_xlabel("(predicted − measured) / σ [1]")
+    axes.set_ylabel("probability density [1]")
+    axes.set_ylim(bottom=0)
+    axes.legend(frameon=False)
+    return axes

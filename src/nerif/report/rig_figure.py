@@ -14,7 +14,7 @@ from nerif.geometry import Box, Camera
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["draw_rig", "save_rig"]
+__all__ = ["draw_rig", "picture_corners", "save_rig"]
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")  # Okabe & Ito
 
@@ -26,7 +26,7 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
     everything = [centres]
     for i, camera in enumerate(cameras):
         colour = COLOURS[i % len(COLOURS)]
-        directions, hits = _corners(camera)
+        directions, hits = picture_corners(camera)
         pyramid = camera.centre.numpy() + 0.18 * reach * directions
         _close(axes, pyramid, color=colour, linewidth=0.8)
         axes.plot(*pyramid[:2].T, color=colour, linewidth=3)
@@ -82,7 +82,7 @@ def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> N
     figure.savefig(path, dpi=130)
 
 
-def _corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def picture_corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Directions of the four corners of the picture, the top edge first, and where they meet the background (mm)."""
     height, width = camera.image_size
     pixels = torch.tensor(

@@ -1,0 +1,55 @@
+"""nerif figures: every figure of a result, as PDF and PNG for print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nerif.commands.output import say
+from nerif.commands.settings import parse
+from nerif.conventions import InputError
+from nerif.report.pages import JOURNALS, save_figures
+from nerif.report.result import read_result
+
+__all__ = ["Figures", "main", "run"]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Write every figure of a result as vector PDF and PNG at journal column widths."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """Result directory of nerif reconstruct."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder to write to; default: RESULT/figures."""
+    journal: str = "elsevier"
+    """Whose column widths: elsevier, aip, aps, nature or springer."""
+    dpi: int = 300
+    """Dots per inch of the PNG files."""
+
+
+def run(settings: Figures) -> None:
+    """Write them, and say what could not be drawn."""
+    if settings.journal not in JOURNALS:
+        raise InputError(f"journal: expected one of {', '.join(JOURNALS)}, got '{settings.journal}'")
+    if not 20 <= settings.dpi <= 2400:
+        raise InputError(f"dpi: expected 20 to 2400 dots per inch, got {settings.dpi}")
+    result = read_result(settings.result)
+    out = settings.out or settings.result / "figures"
+    if out.is_file():
+        raise InputError(f"{out}: expected a folder for --out, got a file")
+    out.mkdir(parents=True, exist_ok=True)
+    paths = save_figures(result, out, settings.journal, settings.dpi)
+    for sentence in result.missing:
+        say(f"left out: {sentence}")
+    if not paths:
+        raise InputError(f"{settings.result}: nothing to draw; {' '.join(result.missing)}")
+    say(f"{out}: {len(paths) // 2} figures, each as .pdf and .png")
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    run(parse(Figures(tyro.MISSING), arguments, "nerif figures", Figures.__doc__ or ""))

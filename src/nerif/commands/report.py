@@ -1,0 +1,53 @@
+"""nerif report: one page that shows a result, and says whether it can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nerif.commands.output import say
+from nerif.commands.settings import parse
+from nerif.conventions import InputError
+from nerif.report import html
+from nerif.report.result import REPORT, read_result
+
+__all__ = ["Report", "main", "run", "write_report"]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write a page that shows a result: one HTML file, no network, opens from disk."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """Result directory of nerif reconstruct, finished or not."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File to write; default: RESULT/report.html."""
+
+
+def run(settings: Report) -> Path:
+    """Write the page, and say what could not be shown."""
+    out = settings.out or settings.result / REPORT
+    if out.suffix not in (".html", ".htm"):
+        raise InputError(f"out: expected a name ending in .html, got '{out.name}'")
+    if not out.parent.is_dir():
+        raise InputError(f"{settings.result if settings.out is None else out}: no such directory")
+    return write_report(settings.result, out)
+
+
+def write_report(directory: Path, out: Path | None = None) -> Path:
+    """Write the page of a result directory and return its path."""
+    out = out or directory / REPORT
+    result = read_result(directory)
+    html.write(result, out)
+    for sentence in result.missing:
+        say(f"missing: {sentence}")
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB; open it in a browser")
+    return out
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    run(parse(Report(tyro.MISSING), arguments, "nerif report", Report.__doc__ or ""))

@@ -1,0 +1,165 @@
+"use strict";
+// Puts the page together: reads the packed arrays, and keeps switches, slices, colour bar and the 3-D view in step.
+
+const MASKED = 65535;
+
+async function unpack(name, about, count) {
+  const text = document.getElementById("array-" + name).textContent.trim();
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const data = new Uint8Array(await new Response(stream).arrayBuffer());
+  const values = new Float32Array(count), step = (about.high - about.low) / (MASKED - 1);
+  let code = 0;
+  for (let i = 0; i < count; i++) {
+    code = (code + data[i] + (data[count + i] << 8)) & 65535;
+    values[i] = code === MASKED ? NaN : about.low + code * step;
+  }
+  return values;
+}
+
+// n - 1, density or temperature of an index excess; NaN where the relation breaks down
+function quantityOf(relation, x) {
+  const shifted = x + relation.offset;
+  const q = relation.kind === "linear" ? shifted * relation.factor : relation.factor / shifted;
+  if (relation.lower !== null && !(shifted > 0)) return NaN;
+  if (relation.upper !== null && !(q >= relation.lower && q <= relation.upper)) return NaN;
+  return q;
+}
+
+function superscript(n) { return String(n).replace(/[-0-9]/g, (c) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)]); }
+
+async function main() {
+  for (const input of document.querySelectorAll("input[name=view]"))
+    input.addEventListener("change", () => {
+      for (const view of document.querySelectorAll(".view")) view.hidden = view.dataset.view !== input.value;
+    });
+
+  const element = document.getElementById("scene");
+  if (!element) return;
+  const scene = JSON.parse(element.textContent);
+  const count = scene.shape[0] * scene.shape[1] * scene.shape[2];
+  const names = Object.keys(scene.arrays);
+  const unpacked = await Promise.all(names.map((name) => unpack(name, scene.arrays[name], count)));
+  const arrays = Object.fromEntries(names.map((name, i) => [name, unpacked[i]]));
+  const chosen = { quantity: Object.keys(scene.quantities)[0], variant: "value" };
+  const cache = {};
+
+  function display() {
+    const key = chosen.quantity + " " + chosen.variant;
+    if (cache[key]) return cache[key];
+    const q = scene.quantities[chosen.quantity], r = q.relation, v = arrays.value, e = arrays.error;
+    const values = new Float32Array(count);
+    const own = arrays[chosen.quantity + "_" + chosen.variant];  // temperature: no linear function of the excess
+    if (own) values.set(own);
+    else if (chosen.variant === "std") for (let i = 0; i < count; i++) values[i] = arrays.std[i] * r.factor;
+    else if (chosen.variant === "mean") for (let i = 0; i < count; i++) values[i] = quantityOf(r, arrays.mean[i]);
+    else if (chosen.variant === "truth") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i] - e[i]);
+    else if (chosen.variant === "error") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i]) - quantityOf(r, v[i] - e[i]);
+    else for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i]);
+    let low = Infinity, high = -Infinity;
+    for (let i = 0; i < count; i++) { if (values[i] < low) low = values[i]; if (values[i] > high) high = values[i]; }
+    if (!(low <= high)) { low = 0; high = 1; }
+    const spread = chosen.variant === "std" || chosen.variant === "error";
+    let colours = q.colours, ambient = quantityOf(r, 0), level = q.level;
+    if (chosen.variant === "error") { high = Math.max(-low, high); low = -high; colours = scene.diverging; }
+    if (chosen.variant === "std") { low = 0; colours = "cividis"; }
+    if (chosen.variant === "value" || chosen.variant === "mean" || chosen.variant === "truth") { low = Math.min(low, q.range[0]); high = Math.max(high, q.range[1]); }
+    if (spread) { ambient = 0; level = high / 2; }
+    if (high === low) high = low + (Math.abs(low) || 1);
+    const what = { std: "standard deviation of ", mean: "mean of ", truth: "true ", error: "error of " }[chosen.variant] || "";
+    cache[key] = { values, low, high, ambient, level, table: scene.tables[colours], label: what + q.label, unit: q.unit };
+    return cache[key];
+  }
+
+  function exponentOf(shown) {
+    const e = Math.floor(Math.log10(Math.max(Math.abs(shown.low), Math.abs(shown.high)) || 1));
+    return e < -2 || e > 4 ? e : 0;
+  }
+
+  function say(value, shown) {
+    if (Number.isNaN(value)) return "masked";
+    const e = exponentOf(shown);
+    const mantissa = plain(Number((value / 10 ** e).toPrecision(4)));
+    return mantissa + (e ? " × 10" + superscript(e) : "") + (shown.unit ? " " + shown.unit : "");
+  }
+
+  function drawBar(shown) {
+    const canvas = document.getElementById("bar"), c = canvas.getContext("2d"), data = c.createImageData(512, 1);
+    for (let i = 0; i < 512; i++) {
+      for (let k = 0; k < 3; k++) data.data[4 * i + k] = shown.table[3 * (i >> 1) + k];
+      data.data[4 * i + 3] = 255;
+    }
+    c.putImageData(data, 0, 0);
+    const e = exponentOf(shown), unit = [e ? "10" + superscript(e) : "", shown.unit].filter(Boolean).join(" ");
+    document.getElementById("bar-label").textContent = shown.label + (unit ? " [" + unit + "]" : " [1]");
+    const ticks = document.getElementById("bar-ticks");
+    ticks.textContent = "";
+    for (const t of ticksBetween(shown.low / 10 ** e, shown.high / 10 ** e, 5)) {
+      const tick = document.createElement("span");
+      tick.textContent = plain(t);
+      tick.style.left = (100 * (t * 10 ** e - shown.low)) / (shown.high - shown.low) + "%";
+      ticks.append(tick);
+    }
+  }
+
+  let space = null;
+  const slices = makeSlices(scene, moved);
+  function moved() {
+    const shown = display(), at = slices.at;
+    const where = AXES.map((a) => a + " = " + plain(Number(slices.place(a, at[a]).toFixed(2)))).join(", ");
+    document.getElementById("readout").textContent = "At the cross, " + where + " mm: " + shown.label + " = " + say(slices.value(), shown);
+    if (space) space.planes(document.getElementById("planes").checked ? AXES.map((a, i) => [i, slices.place(a, at[a])]) : []);
+  }
+
+  const level = document.getElementById("level"), levelText = document.getElementById("level-text");
+  function setLevel(fromSlider) {
+    const shown = display();
+    if (!fromSlider) level.value = Math.round((1000 * (shown.level - shown.low)) / (shown.high - shown.low));
+    const value = shown.low + (level.value / 1000) * (shown.high - shown.low);
+    levelText.textContent = say(value, shown);
+    level.setAttribute("aria-valuetext", levelText.textContent);
+    if (space) space.level(value);
+  }
+
+  function update() {
+    const shown = display();
+    slices.show(shown);
+    drawBar(shown);
+    if (space) space.show(shown);
+    setLevel(false);
+    moved();
+  }
+
+  for (const name of ["quantity", "variant"])
+    for (const input of document.querySelectorAll("input[name=" + name + "]"))
+      input.addEventListener("change", () => { chosen[name] = input.value; update(); });
+  update();
+
+  try {
+    if (!document.createElement("canvas").getContext("webgl2")) throw new Error("no WebGL 2");
+    space = makeSpace(scene, document.getElementById("space"));
+  } catch (error) {
+    const message = document.getElementById("space-message");
+    message.hidden = false;
+    message.textContent = "This browser offers no WebGL 2, so the field cannot be shown in three dimensions here (" + error.message + "). The slices above hold the same values; volume.vti opens in ParaView.";
+    return;
+  }
+  const on = (id, event, act) => { const found = document.getElementById(id); if (found) found.addEventListener(event, () => act(found)); };
+  on("level", "input", () => setLevel(true));
+  on("opacity", "input", (input) => space.opacity(input.value / 100));
+  on("planes", "change", moved);
+  on("cameras", "change", (input) => space.cameras(input.checked));
+  for (const input of document.querySelectorAll("input[name=mode]")) input.addEventListener("change", () => space.mode(input.value));
+  for (const name of ["flow", "rig", "top", "front"]) on("look-" + name, "click", () => space.look[name]());
+  on("save", "click", () => {
+    const link = document.createElement("a");
+    link.download = document.title.split(" ")[0] + ".png";
+    link.href = space.picture();
+    link.click();
+  });
+  space.opacity(document.getElementById("opacity").value / 100);
+  update();
+  document.documentElement.dataset.ready = String(Math.round(performance.now()));
+}
+
+main();

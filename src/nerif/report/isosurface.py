@@ -1,0 +1,55 @@
+"""An isosurface in a Matplotlib figure, for print."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nerif.report.figures import shown
+from nerif.volume import Volume
+
+if TYPE_CHECKING:
+    from mpl_toolkits.mplot3d import Axes3D
+
+__all__ = ["default_level", "draw_isosurface"]
+
+LARGEST = 64  # voxels along an edge: finer surfaces cannot be told apart in print, and take minutes to draw
+FACE = "#E69F00"
+
+
+def default_level(volume: Volume) -> float:
+    """Return the value halfway between the ambient (median of the faces of the box) and what is farthest from it."""
+    values = shown(volume)
+    faces = np.concatenate([np.take(values, i, axis=a).ravel() for a in range(3) for i in (0, -1)])
+    ambient = float(np.nanmedian(faces)) if np.isfinite(faces).any() else 0.0
+    apart = np.nan_to_num(values - ambient)
+    return ambient + 0.5 * float(apart.flat[np.abs(apart).argmax()])
+
+
+def draw_isosurface(axes: Axes3D, volume: Volume, level: float) -> Axes3D:
+    """Draw the surface on which a quantity has the value `level` (in its unit), lit from the viewer; lengths in mm."""
+    from matplotlib.colors import LightSource
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+    from skimage.measure import marching_cubes
+
+    stride = max(1, -(-max(volume.grid.shape) // LARGEST))
+    values = shown(volume)[::stride, ::stride, ::stride]
+    values = np.nan_to_num(values, nan=float(np.nanmean(values)) if np.isfinite(values).any() else 0.0)
+    box = volume.grid.box
+    if min(values.shape) >= 2 and values.min() < level < values.max():
+        vertices, faces, _, _ = marching_cubes(values, level)
+        step = np.array(volume.grid.spacing) * stride
+        first = np.array([float(volume.grid.axis(a)[0]) for a in "xyz"])
+        triangles = (vertices[:, ::-1] * step + first)[faces]
+        light = LightSource(azdeg=225, altdeg=45)
+        surface = Poly3DCollection(triangles, facecolors=FACE, shade=True, lightsource=light, rasterized=True)
+        axes.add_collection3d(surface)
+    axes.set_xlim(box.lower[0], box.upper[0])
+    axes.set_ylim(box.lower[1], box.upper[1])
+    axes.set_zlim(box.lower[2], box.upper[2])
+    axes.set_box_aspect(box.edges, zoom=0.88)
+    axes.set_xlabel("x [mm]")
+    axes.set_ylabel("y [mm]")
+    axes.set_zlabel("z [mm]")
+    return axes

@@ -1,0 +1,231 @@
+"""`nerif figures`: every figure of a result as vector PDF and PNG, at the column widths of journals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from nerif.report.figures import (
+    DIVERGING,
+    add_colour_bar,
+    draw_displacement,
+    draw_history,
+    draw_residuals,
+    draw_slice,
+    draw_slice_scores,
+    draw_view_scores,
+    finite_range,
+    label_of,
+    shown,
+)
+from nerif.report.isosurface import default_level, draw_isosurface
+from nerif.report.result import Result
+from nerif.reprojection import Reprojection
+from nerif.volume import Volume
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["JOURNALS", "error_of", "figures_of", "residuals_over_sigma", "save_figures", "style"]
+
+JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature": (89, 183), "springer": (84, 174)}
+"""Widths of one and of two columns, mm, as the publishers' guides for authors give them."""
+
+TO_DRAW = ("n", "density", "temperature", "n_std", "density_std", "temperature_std")
+
+
+@contextmanager
+def style(size: float = 7.0) -> Iterator[None]:
+    """Text of `size` points, thin lines, fonts that stay text in PDF and SVG."""
+    import matplotlib as mpl
+
+    settings: Any = {
+        "font.size": size,
+        "axes.titlesize": size,
+        "axes.labelsize": size,
+        "legend.fontsize": size - 0.5,
+        "xtick.labelsize": size - 0.5,
+        "ytick.labelsize": size - 0.5,
+        "axes.linewidth": 0.6,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "pdf.fonttype": 42,
+        "svg.fonttype": "none",
+        "hatch.linewidth": 0.6,
+    }
+    with mpl.rc_context(settings):
+        yield
+
+
+def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi: int = 300) -> list[Path]:
+    """Write NAME.pdf and NAME.png of every figure that the result has data for, and return the paths."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    paths = []
+    with style():
+        for name, figure in figures_of(result, *JOURNALS[journal]):
+            FigureCanvasAgg(figure)
+            for ending in ("pdf", "png"):
+                paths.append(directory / f"{name}.{ending}")
+                figure.savefig(paths[-1], dpi=dpi, metadata={"Title": f"{name}, {result.directory.name}"})
+    return paths
+
+
+def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[str, Figure]]:
+    """Draw the figures one by one, with their names; `single` and `double` are column widths, mm."""
+    for quantity in TO_DRAW:
+        if quantity in result.volumes:
+            yield f"slices_{quantity}", slices(result.volumes[quantity], double)
+    error = error_of(result)
+    if error is not None:
+        yield "comparison", comparison(result.volumes["index_excess"], error, double)
+    for quantity in ("n", "density", "temperature"):
+        if quantity in result.volumes:
+            yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
+    if result.reprojection is not None:
+        for i, name in enumerate(result.reprojection.measurement.names):
+            yield f"view_{name}", view(result.reprojection, i, double)
+        if result.reprojection.measurement.sigma is not None:
+            figure = _page(single, 0.7)
+            draw_residuals(figure.subplots(), residuals_over_sigma(result.reprojection))
+            yield "residuals", figure
+        yield "rig", rig(result.reprojection, single)
+    if result.metrics.get("views"):
+        figure = _page(single, 0.8)
+        draw_view_scores(figure.subplots(), result.metrics["views"])
+        yield "views", figure
+    if result.history:
+        figure = _page(single, 0.7)
+        draw_history(figure.subplots(), result.history, str(result.settings.get("method", "nerif")))
+        yield "history", figure
+    if result.metrics.get("slices"):
+        figure = _page(single, 0.7)
+        draw_slice_scores(figure.subplots(), result.metrics["slices"])
+        yield "slice_scores", figure
+
+
+def _page(width: float, height_over_width: float) -> Figure:
+    """An empty figure of that width in mm."""
+    from matplotlib.figure import Figure
+
+    inches = width / 25.4
+    return Figure(figsize=(inches, inches * height_over_width), layout="constrained")
+
+
+def slices(volume: Volume, width: float, diverging: bool = False) -> Figure:
+    """The three middle slices of a volume, with one colour bar."""
+    ex, ey, ez = volume.grid.box.edges
+    ratios = [ex, ex, ey]
+    tallest = max(ey, ez)
+    figure = _page(width, max(0.2, 0.80 * tallest / sum(ratios)) + 0.06)
+    low, high = finite_range(shown(volume))
+    if diverging:
+        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+    line = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
+    for axes, normal in zip(line, "zyx", strict=True):
+        draw_slice(axes, volume, normal, (low, high), DIVERGING if diverging else None)
+        n = volume.grid.shape["zyx".index(normal)]
+        axes.set_title(f"{normal} = {float(volume.grid.axis(normal)[n // 2]):.1f} mm")
+    add_colour_bar(line, "error of n [1]" if diverging else label_of(volume.quantity))
+    return figure
+
+
+def isosurface(volume: Volume, width: float) -> Figure:
+    """The surface halfway between the ambient and the extreme."""
+    figure = _page(width, 1.0)
+    figure.set_layout_engine("none")
+    axes: Any = figure.add_axes((0.02, 0.04, 0.90, 0.88), projection="3d")
+    level = default_level(volume)
+    draw_isosurface(axes, volume, level)
+    figure.suptitle(f"{label_of(volume.quantity).partition(' [')[0]} = {level:.4g} {_unit(volume)}".rstrip(), y=0.97)
+    return figure
+
+
+def _unit(volume: Volume) -> str:
+    return "" if volume.unit == "1" else volume.unit.replace("m-3", "m$^{-3}$")
+
+
+def view(reprojection: Reprojection, i: int, width: float) -> Figure:
+    """Measured, re-projected and difference of both components of view `i`."""
+    measurement = reprojection.measurement
+    height_px, width_px = measurement.cameras[i].image_size
+    usable = measurement.usable[i, :height_px, :width_px, None].numpy()
+    measured = np.where(usable, measurement.displacement[i, :height_px, :width_px].numpy(), np.nan)
+    predicted = reprojection.predicted[i, :height_px, :width_px].numpy()
+    limit = float(np.nanmax(np.abs(measured))) or 1.0
+    figure = _page(width, min(1.2, 0.62 * height_px / width_px + 0.08))
+    grid = figure.subplots(2, 3, sharex=True, sharey=True)
+    for component, line in zip((0, 1), grid, strict=True):
+        images = (measured[..., component], predicted[..., component], (predicted - measured)[..., component])
+        for axes, title, image in zip(line, ("measured", "re-projected", "difference"), images, strict=True):
+            draw_displacement(axes, image, limit)
+            axes.set_title(f"{title} {'uv'[component]}")
+            axes.label_outer()
+        add_colour_bar(list(line), f"{'uv'[component]} [px]")
+    held = ", held out" if measurement.names[i] in reprojection.held_out else ""
+    figure.suptitle(f"view {measurement.names[i]}{held}")
+    return figure
+
+
+def residuals_over_sigma(reprojection: Reprojection) -> np.ndarray:
+    """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box."""
+    measurement = reprojection.measurement
+    assert measurement.sigma is not None
+    seen = measurement.usable & (reprojection.predicted != 0).any(dim=-1)  # 0 where the ray misses the box
+    residual = (reprojection.predicted - measurement.displacement)[seen] / measurement.sigma[seen]
+    return residual.flatten().numpy()
+
+
+def rig(reprojection: Reprojection, width: float) -> Figure:
+    """Cameras, box and backgrounds from obliquely above."""
+    from nerif.report.rig_figure import draw_rig
+
+    figure = _page(width, 0.95)
+    figure.set_layout_engine("none")
+    axes: Any = figure.add_axes((0.02, 0.02, 0.9, 0.96), projection="3d")
+    draw_rig(axes, reprojection.measurement.cameras, reprojection.measurement.box)
+    axes.view_init(28, -60)
+    return figure
+
+
+def comparison(excess: Volume, error: Volume, width: float) -> Figure:
+    """Middle slices of reconstruction, truth and error."""
+    from dataclasses import replace
+
+    truth = replace(excess, values=excess.values - error.values)
+    limits = finite_range(shown(truth))
+    reach = float(error.values.abs().max()) or 1.0
+    ex, ey, ez = excess.grid.box.edges
+    figure = _page(width, max(0.3, 2.3 * max(ey, ez) / (2 * ex + ey)) + 0.08)
+    grid = figure.subplots(3, 3, gridspec_kw={"width_ratios": [ex, ex, ey]})
+    rows = (("reconstruction", excess, limits), ("truth", truth, limits), ("error", error, (-reach, reach)))
+    for (name, volume, scale), line in zip(rows, grid, strict=True):
+        for axes, normal in zip(line, "zyx", strict=True):
+            draw_slice(axes, volume, normal, scale, DIVERGING if name == "error" else None)
+            n = volume.grid.shape["zyx".index(normal)]
+            axes.set_title(f"{name}, {normal} = {float(volume.grid.axis(normal)[n // 2]):.1f} mm")
+        add_colour_bar(list(line), "error of n [1]" if name == "error" else label_of("index_excess"))
+    return figure
+
+
+def error_of(result: Result) -> Volume | None:
+    """Reconstruction minus truth on the grid of the reconstruction; None without a truth that covers it."""
+    from nerif.fields.grid import VoxelField
+
+    excess, truth = result.volumes.get("index_excess"), result.truth
+    if excess is None or truth is None:
+        return None
+    if excess.grid == truth.grid:
+        return Volume(excess.values - truth.values, excess.grid)
+    inside = all(a >= b - 1e-6 for a, b in zip(excess.grid.box.lower, truth.grid.box.lower, strict=True))
+    inside &= all(a <= b + 1e-6 for a, b in zip(excess.grid.box.upper, truth.grid.box.upper, strict=True))
+    if not inside:
+        return None
+    field = VoxelField.through(truth.values, truth.grid)
+    with torch.no_grad():
+        return Volume(excess.values - field.sample(excess.grid), excess.grid)

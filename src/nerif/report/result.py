@@ -1,0 +1,160 @@
+"""A result directory as it is found: whole, half-finished or broken. What is missing is told, never fatal."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from nerif.conventions import InputError
+from nerif.reprojection import REPROJECTION, Reprojection
+from nerif.volume import Volume, read_volume, read_volumes
+
+__all__ = ["HISTORY", "METRICS", "REPORT", "RUN", "VOLUME", "Result", "read_result"]
+
+RUN, METRICS, HISTORY, VOLUME, REPORT = "run.toml", "metrics.json", "history.csv", "volume.nc", "report.html"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a result directory holds.
+
+    Parameters
+    ----------
+    directory : where it was found
+    settings : of run.toml; empty if missing
+    about : the table [about] of run.toml: versions, outcome
+    metrics : of metrics.json; empty if missing
+    history : records of history.csv, blanks as NaN
+    volumes : by quantity; with an ensemble also index_excess_mean, index_excess_std, ...
+    reprojection : measured and predicted views, or None
+    truth : index excess it was compared with, or None
+    missing : one sentence for each thing that is not there or cannot be read, with the remedy
+    """
+
+    directory: Path
+    settings: dict[str, Any] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    history: list[dict[str, float]] = field(default_factory=list)
+    volumes: dict[str, Volume] = field(default_factory=dict)
+    reprojection: Reprojection | None = None
+    truth: Volume | None = None
+    missing: tuple[str, ...] = ()
+
+    @property
+    def method(self) -> str:
+        """Name of the method as a reader knows it."""
+        names = {"nerif": "NeRIF", "tikhonov": "Tikhonov", "landweber": "Landweber", "tv": "total variation"}
+        method = str(self.settings.get("method", "unknown method"))
+        return names.get(method, method)
+
+    @property
+    def n_ambient(self) -> float | None:
+        """Refractive index that the excess is counted from."""
+        for volume in self.volumes.values():
+            if "n_ambient" in volume.attributes:
+                return float(volume.attributes["n_ambient"])
+        return None if self.reprojection is None else self.reprojection.measurement.n_ambient
+
+
+def read_result(directory: Path) -> Result:
+    """Read what there is of a result directory.
+
+    Raises
+    ------
+    InputError
+        If there is no such directory, or nothing of a reconstruction in it.
+    """
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such directory; expected one written by nerif reconstruct")
+    known = (RUN, METRICS, HISTORY, VOLUME, REPROJECTION, "field.safetensors", "checkpoint.safetensors")
+    if not any((directory / name).exists() for name in known):
+        raise InputError(
+            f"{directory}: expected a result of nerif reconstruct, got none of {', '.join(known[:5])} in it"
+        )
+    missing: list[str] = []
+
+    def attempt(name: str, read: Callable[[Path], T], default: T, without: str) -> T:
+        path = directory / name
+        if not path.is_file():
+            missing.append(f"{name} is not there: {without}")
+            return default
+        try:
+            return read(path)
+        except (InputError, OSError, ValueError, KeyError, TypeError) as error:
+            reason = " ".join(str(error).split()).replace(f"{path}: ", "")
+            missing.append(f"{name} cannot be read ({reason}): {without}")
+            return default
+
+    no_table: dict[str, Any] = {}
+    run = attempt(RUN, _toml, no_table, "the settings are not known")
+    metrics = attempt(
+        METRICS, _json, no_table, "how well the field meets the views is not known; nerif evaluate adds it"
+    )
+    no_history: list[dict[str, float]] = []
+    history = attempt(HISTORY, _history, no_history, "there are no training curves")
+    nothing: dict[str, Volume] = {}
+    volumes = attempt(
+        VOLUME, read_volumes, nothing, "there is no field to show; nerif export writes it from the network"
+    )
+    views = attempt(
+        REPROJECTION, Reprojection.read, None, "the views cannot be shown; nerif evaluate --measurement FILE"
+    )
+    if not (directory / "field.safetensors").is_file():
+        go_on = (
+            "nerif reconstruct --resume -o" if (directory / "checkpoint.safetensors").is_file() else "start it again:"
+        )
+        missing.insert(0, f"The run has not ended: there is no field.safetensors. Go on with {go_on} {directory}")
+    return Result(
+        directory=directory,
+        settings={k: v for k, v in run.items() if k != "about"},
+        about=run.get("about", {}),
+        metrics=metrics,
+        history=history,
+        volumes=volumes,
+        reprojection=views,
+        truth=_truth(metrics, missing),
+        missing=tuple(missing),
+    )
+
+
+def _truth(metrics: dict[str, Any], missing: list[str]) -> Volume | None:
+    path = metrics.get("truth")
+    if not isinstance(path, str):
+        return None
+    try:
+        return read_volume(path)
+    except InputError as error:
+        missing.append(f"The truth cannot be shown beside the field: {error}")
+        return None
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    return tomllib.loads(path.read_text())
+
+
+def _json(path: Path) -> dict[str, Any]:
+    found = json.loads(path.read_text())
+    if not isinstance(found, dict):
+        raise ValueError("expected a table of names and values")
+    return found
+
+
+def _history(path: Path) -> list[dict[str, float]]:
+    with path.open(newline="") as file:
+        return [{k: _number(v) for k, v in row.items() if k is not None} for row in csv.DictReader(file)]
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text) if text else math.nan
+    except ValueError:
+        return math.nan

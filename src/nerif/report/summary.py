@@ -1,0 +1,256 @@
+"""The first screen of a report: what was measured, what came out, can it be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nerif.physics.gas_optics import GAS_CONSTANT
+from nerif.report.figures import shown
+from nerif.report.result import Result
+
+__all__ = ["Statement", "came_out", "headline", "measured", "number", "trust", "trust_figures"]
+
+LEVELS = ("good", "note", "warning", "bad")
+HELD_OUT_CC = 0.95  # a view that was not seen is predicted this well in all our simulated cases with nine views
+NOISE_BAND = 0.7, 1.4  # rms residual over sigma that noise alone explains; sigma itself is known to a factor of about 2
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One thing to know before trusting a result.
+
+    Parameters
+    ----------
+    level : good, note, warning or bad
+    text : one or two sentences, with the remedy where there is one
+    """
+
+    level: str
+    text: str
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Return a number for people, with a power of ten written as such; a dash for none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        return f"{value:.{digits}g}"
+    mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
+    raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{float(mantissa):g} × 10{raised}"
+
+
+def measured(result: Result) -> list[tuple[str, str]]:
+    """Return what was measured, as names and values with units."""
+    if result.reprojection is None:
+        return [("Measurement", str(result.settings.get("measurement", "unknown")))]
+    m = result.reprojection.measurement
+    sizes = sorted({c.image_size for c in m.cameras})
+    size = " and ".join(f"{w} × {h}" for h, w in sizes[:3])
+    held = f", of which {len(result.reprojection.held_out)} held out" if result.reprojection.held_out else ""
+    usable = m.usable
+    d = m.displacement[usable]
+    rows = [
+        ("Views", f"{len(m.cameras)}{held}, of {size} px"),
+        (
+            "Displacement",
+            f"rms {number(float(d.square().mean().sqrt()), 3)} px, up to {number(float(d.abs().max()), 3)} px",
+        ),
+    ]
+    if m.sigma is not None:
+        rows.append(("Noise σ", f"rms {number(float(m.sigma[usable].square().mean().sqrt()), 3)} px"))
+    else:
+        rows.append(("Noise σ", "not known"))
+    inside = sum(h * w for h, w in (c.image_size for c in m.cameras))
+    rows.append(("Usable pixels", f"{float(usable.sum()) / inside:.1%}"))
+    rows.append(("Volume", " × ".join(f"{e:g}" for e in m.box.edges) + " mm (x, y, z)"))
+    light = f" at {m.wavelength_nm:g} nm" if m.wavelength_nm else ""
+    rows.append(("Ambient index", f"{m.n_ambient:.7g}{light}"))
+    return rows
+
+
+def came_out(result: Result) -> list[tuple[str, str]]:
+    """Return what was reconstructed: ranges of the quantities, and what they rest on."""
+    rows = [("Method", result.method)]
+    for quantity, name, unit in (
+        ("n", "n − 1", ""),
+        ("density", "Density", " kg m⁻³"),
+        ("temperature", "Temperature", " K"),
+    ):
+        volume = result.volumes.get(quantity)
+        if volume is None:
+            continue
+        values = shown(volume)
+        known = values[np.isfinite(values)]
+        if not known.size:
+            rows.append((name, "masked everywhere"))
+            continue
+        share = 1 - known.size / values.size
+        masked = f"; {share:.2%} masked" if share else ""
+        digits = 4 if quantity == "temperature" else 3
+        rows.append(
+            (name, f"{number(float(known.min()), digits)} to {number(float(known.max()), digits)}{unit}{masked}")
+        )
+    ambient = _ambient_temperature(result)
+    if ambient is not None:
+        rows.append(("Ambient, implied", f"{ambient:.1f} K"))
+    if result.volumes:
+        shape = next(iter(result.volumes.values())).grid.shape
+        rows.append(("Voxels", " × ".join(str(n) for n in shape[::-1]) + " (x, y, z)"))
+    if result.metrics.get("seconds") is not None:
+        memory = result.metrics.get("peak_memory_bytes")
+        beside = f", {memory / 2**30:.2f} GiB" if memory else ""
+        rows.append(("Time", f"{result.metrics['seconds']:.0f} s on {result.metrics.get('device', '?')}{beside}"))
+    return rows
+
+
+def _ambient_temperature(result: Result) -> float | None:
+    """Temperature that n_ambient stands for under the assumptions made, K."""
+    volume = result.volumes.get("temperature")
+    if volume is None:
+        return None
+    a = volume.attributes
+    refractivity = float(a["n_ambient"]) - 1
+    k, p, mass = (float(a[key]) for key in ("gladstone_dale_m3_kg-1", "pressure_pa", "molar_mass_kg_mol-1"))
+    return p * mass * k / (GAS_CONSTANT * refractivity) if refractivity > 0 else None
+
+
+def trust_figures(result: Result) -> list[tuple[str, str]]:
+    """Return the figures by which to trust it: held-out and training views, outcome, truth, ensemble."""
+    held, seen = _views(result, True), _views(result, False)
+    rows = []
+    for name, views in (("Held-out view" + ("s" if len(held) > 1 else ""), held), ("Training views", seen)):
+        if not views:
+            rows.append((name, "none"))
+            continue
+        rms = _largest(views, "rms_px")
+        noise = _largest(views, "rms_over_sigma")
+        beside = "" if noise is None else f" = {noise:.2f} σ"
+        worst = "" if len(views) == 1 else "at least "
+        rows.append((name, f"CC {worst}{number(_smallest(views, 'cc'), 5)}, rms error {number(rms, 3)} px{beside}"))
+    if "outcome" in result.metrics:
+        rows.append(("Outcome", str(result.metrics["outcome"]).replace("_", " ")))
+    if result.metrics.get("l2") is not None:
+        l2, cc = result.metrics["l2"], result.metrics.get("cc")
+        rows.append(
+            ("Against the truth", f"L2 {l2:.2%}, CC {number(cc, 5)}, SSIM {number(result.metrics.get('ssim'), 4)}")
+        )
+    ensemble = result.metrics.get("ensemble")
+    if isinstance(ensemble, dict) and "density_std" in result.volumes:
+        std = result.volumes["density_std"].values.double().numpy()
+        rms = float(np.sqrt(np.nanmean(std**2)))
+        rows.append((f"Ensemble of {ensemble.get('members')}", f"σ of density rms {number(rms, 2)} kg m⁻³"))
+    coverage = result.metrics.get("coverage")
+    if isinstance(coverage, dict):
+        rows.append(("Truth within ±2 σ", f"{coverage['share']:.0%} of the voxels"))
+    return rows
+
+
+def trust(result: Result) -> list[Statement]:
+    """Return what to know before trusting it, the gravest first."""
+    found = [Statement("bad", sentence) for sentence in result.missing]
+    found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_masks(result)
+    return sorted(found, key=lambda s: -LEVELS.index(s.level))
+
+
+def headline(statements: list[Statement]) -> Statement:
+    """Return the sum of it in one sentence."""
+    worst = max((s.level for s in statements), key=LEVELS.index, default="note")
+    return Statement(
+        worst,
+        {
+            "good": "It predicts a view it has not seen, and what it leaves unexplained is the noise.",
+            "note": "Nothing speaks against it; read the notes.",
+            "warning": "Use it with the reservations below.",
+            "bad": "Not to be relied on as it is; see below.",
+        }[worst],
+    )
+
+
+def _views(result: Result, held_out: bool) -> list[dict[str, Any]]:
+    views = result.metrics.get("views")
+    return [v for v in views if v.get("held_out") is held_out] if isinstance(views, list) else []
+
+
+def _values(views: list[dict[str, Any]], key: str) -> list[float]:
+    return [float(v[key]) for v in views if v.get(key) is not None]
+
+
+def _smallest(views: list[dict[str, Any]], key: str) -> float | None:
+    return min(_values(views, key), default=None)
+
+
+def _largest(views: list[dict[str, Any]], key: str) -> float | None:
+    return max(_values(views, key), default=None)
+
+
+def _of_outcome(result: Result) -> list[Statement]:
+    outcome, message = result.metrics.get("outcome"), result.metrics.get("message", "")
+    if outcome is None:
+        return []
+    if outcome == "diverged":
+        return [Statement("bad", f"The run diverged. {message}".strip())]
+    if outcome == "interrupted":
+        return [Statement("warning", f"The run was interrupted; --resume goes on. {message}".strip())]
+    if outcome in ("time_limit", "steps"):
+        limit = "time limit" if outcome == "time_limit" else "limit of steps"
+        return [Statement("note", f"The run ended at its {limit}; more may give more.")]
+    return []
+
+
+def _of_held_out(result: Result) -> list[Statement]:
+    if not _views(result, False):
+        return []
+    left_out = (result.metrics.get("ensemble") or {}).get("left_out") or []
+    held = _views(result, True) or left_out
+    if not held:
+        text = "No view was held out, so nothing was checked against data that the reconstruction has not seen."
+        return [Statement("warning", f"{text} Repeat with --hold-out VIEW.")]
+    cc, noise = _smallest(held, "cc"), _largest(held, "rms_over_sigma")
+    names = ", ".join(v["name"] for v in held)
+    if cc is None:
+        return [Statement("warning", f"The held-out view ({names}) has no pixel to compare.")]
+    if cc >= HELD_OUT_CC:
+        beyond = "" if noise is None or noise <= 2 else f", though its error is {noise:.1f} times the noise"
+        level = "good" if not beyond else "warning"
+        return [Statement(level, f"The field predicts what it has not seen (view {names}): CC {cc:.4f}{beyond}.")]
+    level = "warning" if cc >= 0.8 else "bad"
+    text = f"The field predicts view {names}, which it has not seen, poorly: CC {cc:.3f}."
+    return [Statement(level, f"{text} More views, or a look at the calibration (nerif check), may help.")]
+
+
+def _of_residual(result: Result) -> list[Statement]:
+    seen = _views(result, False)
+    if not seen:
+        return []
+    ratio = _values(seen, "rms_over_sigma")
+    if not ratio:
+        text = "The noise of the measurement is not known, so it cannot be told whether the residual is noise."
+        return [Statement("note", f"{text} nerif displacement writes sigma.")]
+    low, high = min(ratio), max(ratio)
+    if low < NOISE_BAND[0]:
+        text = f"The residual of a training view is {low:.2f} of the stated noise"
+        return [Statement("warning", f"{text}: the field follows noise, or sigma is too large.")]
+    if high <= NOISE_BAND[1]:
+        text = "What the field leaves unexplained in the training views"
+        return [Statement("good", f"{text} is {low:.2f} to {high:.2f} of the noise.")]
+    level = "warning" if high <= 3 else "bad"
+    text = f"Residuals are up to {high:.1f} times the stated noise: the field does not explain the views"
+    remedy = "Look at the length of the run, open faces, the calibration (nerif check), and whether sigma is too small."
+    return [Statement(level, f"{text}. {remedy}")]
+
+
+def _of_masks(result: Result) -> list[Statement]:
+    found = []
+    for quantity in ("density", "temperature"):
+        volume = result.volumes.get(quantity)
+        count = int(volume.notes.get("masked_voxels", 0)) if volume is not None else 0
+        if volume is None or not count:
+            continue
+        share = count / volume.values.numel()
+        text = f"{quantity.capitalize()} is masked in {count} voxels ({share:.2%}): {volume.notes.get('masked_where')}."
+        found.append(Statement("note" if share < 0.05 else "warning", text))
+    return found

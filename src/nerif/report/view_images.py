@@ -1,0 +1,106 @@
+"""Measured, re-projected and difference of every view as small pictures for the page."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from nerif.report.figures import DIVERGING
+from nerif.reprojection import Reprojection
+
+__all__ = ["ViewImages", "colour_table", "view_images"]
+
+LARGEST = 320  # px along an edge of a picture in the page
+
+
+@dataclass(frozen=True)
+class ViewImages:
+    """The six pictures of a view, as data addresses.
+
+    Parameters
+    ----------
+    name : of the view
+    held_out : the reconstruction has not seen it
+    scores : cc, ssim, rms_px, rms_over_sigma as far as known
+    rows : for u and v: addresses of measured, re-projected, difference
+    size : height and width of the view, px
+    shrunk : how many pixels one pixel of the pictures stands for, along an edge
+    """
+
+    name: str
+    held_out: bool
+    scores: dict[str, Any]
+    rows: dict[str, tuple[str, str, str]]
+    size: tuple[int, int]
+    shrunk: int
+
+
+def colour_table(name: str) -> list[tuple[int, int, int]]:
+    """Return 256 colours (0 to 255) of a Matplotlib colour map."""
+    from matplotlib import colormaps
+
+    return [(int(r), int(g), int(b)) for r, g, b, _ in colormaps[name](np.arange(256), bytes=True)]
+
+
+def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tuple[list[ViewImages], float, float]:
+    """Return the pictures of all views, the limit (px) of measured and re-projected, and that of the differences.
+
+    Limits hold for all views: the 99.8th percentile of what was measured, the 99.5th of the difference.
+    """
+    m = reprojection.measurement
+    scores = {v.get("name"): v for v in metrics}
+    usable = m.usable
+    difference = (reprojection.predicted - m.displacement)[usable].abs().flatten().numpy()
+    limit = float(np.quantile(m.displacement[usable].abs().flatten().numpy(), 0.998)) or 1.0
+    apart = float(np.quantile(difference, 0.995)) or 1.0
+    found = []
+    for i, camera in enumerate(m.cameras):
+        height, width = camera.image_size
+        step = -(-max(height, width) // LARGEST)
+        valid = usable[i, :height, :width, None].numpy()
+        measured = np.where(valid, m.displacement[i, :height, :width].numpy(), np.nan)
+        predicted = reprojection.predicted[i, :height, :width].numpy()
+        rows = {}
+        for c, component in enumerate("uv"):
+            images = (measured[..., c], predicted[..., c], (predicted - measured)[..., c])
+            limits = (limit, limit, apart)
+            rows[component] = tuple(_picture(_shrink(x, step), reach) for x, reach in zip(images, limits, strict=True))
+        found.append(
+            ViewImages(
+                camera.name,
+                camera.name in reprojection.held_out,
+                scores.get(camera.name, {}),
+                rows,  # type: ignore[arg-type]
+                (height, width),
+                step,
+            )
+        )
+    return found, limit, apart
+
+
+def _shrink(image: Float[np.ndarray, "row column"], step: int) -> Float[np.ndarray, "r c"]:
+    """Mean of blocks of step x step pixels, NaN where any is NaN."""
+    if step == 1:
+        return image
+    height, width = (n - n % step for n in image.shape)
+    return image[:height, :width].reshape(height // step, step, width // step, step).mean(axis=(1, 3))
+
+
+def _picture(image: Float[np.ndarray, "row column"], limit: float) -> str:
+    """A PNG of 255 colours from -limit to limit, and grey where there is nothing."""
+    from PIL import Image
+
+    scaled = np.clip((np.nan_to_num(image) / limit + 1) / 2, 0, 1) * 254
+    codes = np.where(np.isfinite(image), np.round(scaled), 255).astype(np.uint8)
+    table = colour_table(DIVERGING)
+    palette = [c for i in range(255) for c in table[round(i * 255 / 254)]] + [190, 190, 190]
+    picture = Image.fromarray(codes)
+    picture.putpalette(palette)
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

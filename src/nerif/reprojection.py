@@ -1,0 +1,78 @@
+"""A reconstruction re-projected into the views it was measured from, and the file that keeps both side by side."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.measurement import VARIABLES, Measurement
+
+__all__ = ["REPROJECTION", "Reprojection"]
+
+REPROJECTION = "reprojection.nc"
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """What was measured, and what the reconstructed field predicts.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    predicted : (view, row, column, 2) displacement, px; 0 where a ray misses the box
+    held_out : names of the views that the reconstruction has not seen
+    """
+
+    measurement: Measurement
+    predicted: Float[Tensor, "view row column 2"]
+    held_out: tuple[str, ...] = ()
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a measurement file of the predicted displacement, with `measured` and `held_out` in it, atomically."""
+        import numpy as np
+        import xarray as xr
+
+        predicted = replace(self.measurement, displacement=self.predicted, valid=self.measurement.usable)
+        whole = Path(f"{os.fspath(path)}.whole")
+        predicted.write(whole)
+        held = np.array([name in self.held_out for name in self.measurement.names], dtype=np.int8)
+        more = xr.Dataset(
+            {
+                "measured": (VARIABLES["displacement"][0], self.measurement.displacement.float().numpy()),
+                "held_out": (
+                    ("view",),
+                    held,
+                    {"units": "1", "long_name": "1 where the reconstruction has not seen it"},
+                ),
+            }
+        )
+        more["measured"].attrs = {"units": "px", "long_name": "measured displacement"}
+        more.to_netcdf(whole, mode="a", engine="h5netcdf", encoding={"measured": {"zlib": True, "complevel": 3}})
+        os.replace(whole, path)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Reprojection:
+        """Read the file.
+
+        Raises
+        ------
+        InputError
+            If it is missing, damaged, or holds no measured displacement.
+        """
+        import xarray as xr
+
+        predicted = Measurement.read(path)
+        with xr.open_dataset(path, engine="h5netcdf") as data:
+            if "measured" not in data or "held_out" not in data:
+                raise InputError(f"{path}: expected variables 'measured' and 'held_out', got a plain measurement")
+            measured = torch.from_numpy(data["measured"].values.astype("float32"))
+            held_out = tuple(
+                str(v) for v, held in zip(data["view"].values, data["held_out"].values, strict=True) if held
+            )
+        return cls(replace(predicted, displacement=measured), predicted.displacement, held_out)
