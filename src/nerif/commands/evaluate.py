@@ -12,10 +12,14 @@ from nerif.commands.output import say
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject, update_json
+from nerif.fields.grid import VoxelField
 from nerif.measurement import Measurement
 from nerif.reconstruction.files import read_field
+from nerif.report.result import VOLUME
 from nerif.reprojection import REPROJECTION
-from nerif.volume import read_volume
+from nerif.volume import Volume, read_volume, read_volumes
+
+FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 
 __all__ = ["Evaluate", "main", "run"]
 
@@ -56,6 +60,7 @@ def run(settings: Evaluate) -> dict[str, Any]:
             )
         metrics |= evaluate_volume(field, truth, n_ambient)
         metrics["truth"] = str(settings.truth.resolve())
+        metrics |= _coverage(settings.result, truth)
         say(f"L2            {metrics['l2']:8.3%}   |n_gt - n_rec| / |n_gt - 1|, the paper's")
         say(f"L2 variation  {metrics['l2_variation']:8.3%}   |n_gt - n_rec| / |n_gt - n_ambient|")
         say(f"CC            {metrics['cc']:8.5f}")
@@ -78,6 +83,22 @@ def run(settings: Evaluate) -> dict[str, Any]:
             say(f"{v['name']:<14} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {v['rms_px']:9.4f}{held}")
     update_json(settings.result / "metrics.json", metrics)
     return metrics
+
+
+def _coverage(result: Path, truth: Volume) -> dict[str, Any]:
+    """Share of the voxels whose truth lies within two standard deviations of the mean, if there is an ensemble."""
+    found = read_volumes(result / VOLUME) if (result / VOLUME).is_file() else {}
+    if "index_excess_std" not in found:
+        return {}
+    mean, std = found["index_excess_mean"], found["index_excess_std"]
+    same = mean.grid == truth.grid
+    true = truth.values if same else VoxelField.through(truth.values, truth.grid).sample(mean.grid)
+    within = (true - mean.values).abs() <= 2 * std.values
+    flow = true.abs() > FLOW * true.abs().max()
+    share = {"share": float(within.float().mean()), "share_in_flow": float(within[flow].float().mean())}
+    say(f"truth within 2 standard deviations of the ensemble's mean: {share['share']:.1%} of the voxels,")
+    say(f"  {share['share_in_flow']:.1%} of those where the excess is above {FLOW:.0%} of its largest")
+    return {"coverage": share}
 
 
 def main(arguments: list[str]) -> None:

@@ -199,11 +199,11 @@ def draw_residuals(axes: Axes, residuals: np.ndarray) -> Axes:
     beyond = float(np.mean(np.abs(residuals) > edges[-1])) if residuals.size else 0.0
     middle = (edges[1:] + edges[:-1]) / 2
     axes.stairs(counts, edges, color=COLOURS["blue"], fill=True, alpha=0.35)
-    axes.stairs(counts, edges, color=COLOURS["blue"], label=f"residual ({beyond:.1%} beyond ±5)")
+    axes.stairs(counts, edges, color=COLOURS["blue"], label=f"residual\n({beyond:.1%} beyond ±5)")
     gauss = np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi)
     axes.plot(middle, gauss, color=COLOURS["orange"], linestyle="--", linewidth=1, label="noise alone")
     axes.set_xlabel("(predicted − measured) / σ [1]")
     axes.set_ylabel("probability density [1]")
-    axes.set_ylim(bottom=0)
-    axes.legend(frameon=False)
+    axes.set_ylim(bottom=0, top=1.15 * float(max(counts.max(), gauss.max())))
+    axes.legend(frameon=False, loc="upper left", handlelength=1.2)
     return axes

@@ -119,7 +119,10 @@ def _scene(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     ):
         if volume is not None:
             sources[name] = packing.coarsen(volume)
-    packed = {name: packing.pack(volume.values.double().numpy()) for name, volume in sources.items()}
+    packed = {
+        name: packing.pack(volume.values.double().numpy(), packing.FINE if name == "value" else packing.COARSE)
+        for name, volume in sources.items()
+    }
     quantities: dict[str, dict[str, Any]] = {}
     for name, (button, label, unit) in QUANTITIES.items():
         if name not in result.volumes:
@@ -141,7 +144,7 @@ def _scene(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
         "full_shape": excess.grid.shape,
         "lower": excess.grid.box.lower,
         "upper": excess.grid.box.upper,
-        "arrays": {name: {"low": p["low"], "high": p["high"]} for name, p in packed.items()},
+        "arrays": {name: {"low": p["low"], "step": p["step"]} for name, p in packed.items()},
         "quantities": quantities,
         "variants": _variants(sources),
         "diverging": DIVERGING,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from nerif.report.figures import shown
 from nerif.volume import Volume
@@ -12,7 +13,7 @@ from nerif.volume import Volume
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["default_level", "draw_isosurface"]
+__all__ = ["default_level", "draw_isosurface", "surface_triangles"]
 
 LARGEST = 64  # voxels along an edge: finer surfaces cannot be told apart in print, and take minutes to draw
 FACE = "#E69F00"
@@ -27,24 +28,38 @@ def default_level(volume: Volume) -> float:
     return ambient + 0.5 * float(apart.flat[np.abs(apart).argmax()])
 
 
-def draw_isosurface(axes: Axes3D, volume: Volume, level: float) -> Axes3D:
-    """Draw the surface on which a quantity has the value `level` (in its unit), lit from the viewer; lengths in mm."""
-    from matplotlib.colors import LightSource
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"]:
+    """Return the corners (mm) of triangles on which a quantity has the value `level`; none where it is nowhere met."""
     from skimage.measure import marching_cubes
 
     stride = max(1, -(-max(volume.grid.shape) // LARGEST))
     values = shown(volume)[::stride, ::stride, ::stride]
     values = np.nan_to_num(values, nan=float(np.nanmean(values)) if np.isfinite(values).any() else 0.0)
-    box = volume.grid.box
-    if min(values.shape) >= 2 and values.min() < level < values.max():
-        vertices, faces, _, _ = marching_cubes(values, level)
-        step = np.array(volume.grid.spacing) * stride
-        first = np.array([float(volume.grid.axis(a)[0]) for a in "xyz"])
-        triangles = (vertices[:, ::-1] * step + first)[faces]
-        light = LightSource(azdeg=225, altdeg=45)
-        surface = Poly3DCollection(triangles, facecolors=FACE, shade=True, lightsource=light, rasterized=True)
+    if min(values.shape) < 2 or not values.min() < level < values.max():
+        return np.zeros((0, 3, 3))
+    vertices, faces, _, _ = marching_cubes(values, level)
+    first = np.array([float(volume.grid.axis(a)[0]) for a in "xyz"])
+    return (vertices[:, ::-1] * np.array(volume.grid.spacing) * stride + first)[faces]
+
+
+def draw_isosurface(axes: Axes3D, volume: Volume, level: float) -> Axes3D:
+    """Draw the surface on which a quantity has the value `level` (in its unit), lit from the viewer; lengths in mm."""
+    from matplotlib.colors import LightSource
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    triangles = surface_triangles(volume, level)
+    if len(triangles):
+        surface = Poly3DCollection(
+            triangles,
+            facecolors=FACE,
+            edgecolors=FACE,  # else the ground shines through between triangles
+            linewidths=0.2,
+            shade=True,
+            lightsource=LightSource(azdeg=225, altdeg=45),
+            rasterized=True,
+        )
         axes.add_collection3d(surface)
+    box = volume.grid.box
     axes.set_xlim(box.lower[0], box.upper[0])
     axes.set_ylim(box.lower[1], box.upper[1])
     axes.set_zlim(box.lower[2], box.upper[2])

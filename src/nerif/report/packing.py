@@ -1,7 +1,7 @@
 """Volumes packed small enough to travel inside a page: 16 bit, differences along x, bytes apart, deflated, base64.
 
 The page holds the index excess once; n, density and temperature are simple functions of it (`Relation`), so that three
-quantities take the room of one. 65535 stands for a masked voxel.
+quantities take the room of one. What stands beside it (spread, error) has 12 bits. 65535 stands for a masked voxel.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.volume import Volume
 
-__all__ = ["LARGEST", "Relation", "coarsen", "pack", "relation", "unpack"]
+__all__ = ["COARSE", "FINE", "LARGEST", "Relation", "coarsen", "pack", "relation", "unpack"]
 
 LARGEST = 128  # voxels along the longest edge; finer volumes are averaged down, and the page says so
 MASKED = 65535
+FINE, COARSE = 65534, 4095
 
 
 @dataclass(frozen=True)
@@ -78,17 +79,17 @@ def coarsen(volume: Volume, largest: int = LARGEST) -> Volume:
     return Volume(values, grid, volume.quantity, volume.unit, volume.attributes, volume.notes)
 
 
-def pack(values: Float[np.ndarray, "z y x"]) -> dict[str, Any]:
-    """Return the values as text, and what is needed to read it: x = low + code (high - low) / 65534."""
+def pack(values: Float[np.ndarray, "z y x"], levels: int = FINE) -> dict[str, Any]:
+    """Return the values as text, and what is needed to read it: x = low + code step."""
     known = np.isfinite(values)
     low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 1.0)
     span = high - low or 1.0
-    codes = np.where(known, np.round((np.nan_to_num(values) - low) / span * (MASKED - 1)), MASKED).astype("<u2")
+    codes = np.where(known, np.round((np.nan_to_num(values) - low) / span * levels), MASKED).astype("<u2")
     flat = codes.ravel()
     steps = np.diff(flat, prepend=flat.dtype.type(0))  # modulo 65536: small where the field is smooth
     data = np.concatenate([(steps & 255).astype(np.uint8), (steps >> 8).astype(np.uint8)])
-    text = base64.b64encode(zlib.compress(data.tobytes(), 9)).decode()
-    return {"low": low, "high": low + span, "text": text}
+    text = base64.b64encode(zlib.compress(data.tobytes(), 6)).decode()
+    return {"low": low, "step": span / levels, "text": text}
 
 
 def unpack(packed: dict[str, Any], shape: tuple[int, ...]) -> Float[np.ndarray, "z y x"]:
@@ -96,7 +97,7 @@ def unpack(packed: dict[str, Any], shape: tuple[int, ...]) -> Float[np.ndarray, 
     data = np.frombuffer(zlib.decompress(base64.b64decode(packed["text"])), dtype=np.uint8).astype(np.uint16)
     steps = data[: len(data) // 2] | (data[len(data) // 2 :] << 8)
     codes = np.cumsum(steps, dtype=np.uint16)
-    values = packed["low"] + codes * ((packed["high"] - packed["low"]) / (MASKED - 1))
+    values = packed["low"] + codes * packed["step"]
     return np.where(codes == MASKED, np.nan, values).reshape(shape)
 
 

@@ -94,7 +94,7 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
             figure = _page(single, 0.7)
             draw_residuals(figure.subplots(), residuals_over_sigma(result.reprojection))
             yield "residuals", figure
-        yield "rig", rig(result.reprojection, single)
+        yield "rig", rig(result.reprojection, double)
     if result.metrics.get("views"):
         figure = _page(single, 0.8)
         draw_view_scores(figure.subplots(), result.metrics["views"])
@@ -109,12 +109,12 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         yield "slice_scores", figure
 
 
-def _page(width: float, height_over_width: float) -> Figure:
+def _page(width: float, height_over_width: float, layout: str = "constrained") -> Figure:
     """An empty figure of that width in mm."""
     from matplotlib.figure import Figure
 
     inches = width / 25.4
-    return Figure(figsize=(inches, inches * height_over_width), layout="constrained")
+    return Figure(figsize=(inches, inches * height_over_width), layout=layout)  # type: ignore[arg-type]
 
 
 def slices(volume: Volume, width: float, diverging: bool = False) -> Figure:
@@ -137,8 +137,7 @@ def slices(volume: Volume, width: float, diverging: bool = False) -> Figure:
 
 def isosurface(volume: Volume, width: float) -> Figure:
     """The surface halfway between the ambient and the extreme."""
-    figure = _page(width, 1.0)
-    figure.set_layout_engine("none")
+    figure = _page(width, 1.0, layout="none")
     axes: Any = figure.add_axes((0.02, 0.04, 0.90, 0.88), projection="3d")
     level = default_level(volume)
     draw_isosurface(axes, volume, level)
@@ -182,14 +181,11 @@ def residuals_over_sigma(reprojection: Reprojection) -> np.ndarray:
 
 
 def rig(reprojection: Reprojection, width: float) -> Figure:
-    """Cameras, box and backgrounds from obliquely above."""
-    from nerif.report.rig_figure import draw_rig
+    """Cameras, box and backgrounds, obliquely and from above."""
+    from nerif.report.rig_figure import draw_two_sides
 
-    figure = _page(width, 0.95)
-    figure.set_layout_engine("none")
-    axes: Any = figure.add_axes((0.02, 0.02, 0.9, 0.96), projection="3d")
-    draw_rig(axes, reprojection.measurement.cameras, reprojection.measurement.box)
-    axes.view_init(28, -60)
+    figure = _page(width, 0.48, layout="none")
+    draw_two_sides(figure, reprojection.measurement.cameras, reprojection.measurement.box)
     return figure
 
 
@@ -201,7 +197,7 @@ def comparison(excess: Volume, error: Volume, width: float) -> Figure:
     limits = finite_range(shown(truth))
     reach = float(error.values.abs().max()) or 1.0
     ex, ey, ez = excess.grid.box.edges
-    figure = _page(width, max(0.3, 2.3 * max(ey, ez) / (2 * ex + ey)) + 0.08)
+    figure = _page(width, max(0.3, 2.7 * max(ey, ez) / (2 * ex + ey)) + 0.08)
     grid = figure.subplots(3, 3, gridspec_kw={"width_ratios": [ex, ex, ey]})
     rows = (("reconstruction", excess, limits), ("truth", truth, limits), ("error", error, (-reach, reach)))
     for (name, volume, scale), line in zip(rows, grid, strict=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,18 +12,22 @@ import torch
 from nerif.geometry import Box, Camera
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["draw_rig", "picture_corners", "save_rig"]
+__all__ = ["draw_rig", "draw_two_sides", "picture_corners", "save_rig"]
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")  # Okabe & Ito
 
 
 def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) -> Axes3D:
     """Draw cameras as pyramids (a thick edge marks the top of the picture), backgrounds, box and world axes; mm."""
+    from matplotlib.ticker import MaxNLocator
+
     centres = np.stack([c.centre.numpy() for c in cameras])
     reach = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or float(np.linalg.norm(centres[0]))
     everything = [centres]
+    around = np.argsort(np.argsort(np.arctan2(*(centres - centres.mean(axis=0)).T[1::-1])))
     for i, camera in enumerate(cameras):
         colour = COLOURS[i % len(COLOURS)]
         directions, hits = picture_corners(camera)
@@ -35,7 +39,12 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
         for corner in pyramid:
             axes.plot(*np.stack([camera.centre.numpy(), corner]).T, color=colour, linewidth=0.8)
         axes.plot(*np.stack([camera.centre.numpy(), hits.mean(axis=0)]).T, color=colour, linewidth=0.4, alpha=0.6)
-        axes.text(*camera.centre.numpy(), f" {camera.name}", color=colour, fontsize=7)
+        outward = camera.centre.numpy() - hits.mean(axis=0)
+        outward /= np.linalg.norm(outward)
+        away = (0.09, 0.2)[around[i] % 2] * reach  # names of neighbours are not in each other's way
+        name_at = camera.centre.numpy() + away * outward
+        axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center")
+        everything.append(name_at[None])
         everything.append(hits)
     if box is not None:
         _draw_box(axes, box)
@@ -52,23 +61,20 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
     axes.set_xlabel("x [mm]")
     axes.set_ylabel("y [mm]")
     axes.set_zlabel("z [mm]")
+    axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.tick_params(labelsize=6)
     return axes
 
 
-def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> None:
-    """Write a picture of the rig from two sides: obliquely from above, and along z."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 6.2))
-    FigureCanvasAgg(figure)
+def draw_two_sides(figure: Figure, cameras: Sequence[Camera], box: Box | None = None) -> None:
+    """Fill a figure with the rig from two sides: obliquely from above, and along z."""
     for i, (title, elevation, azimuth) in enumerate((("oblique view", 28, -60), ("from above (along -z)", 89.9, -90))):
-        axes = figure.add_subplot(1, 2, i + 1, projection="3d")
+        axes: Any = figure.add_axes((0.04 + 0.5 * i, 0.06, 0.4, 0.86), projection="3d")
+        axes.patch.set_visible(False)  # it would hide what its neighbour writes at the edge
         draw_rig(axes, cameras, box)
         axes.set_proj_type("ortho")
         axes.view_init(elevation, azimuth)
-        axes.set_title(title, fontsize=9)
+        axes.set_title(title)
         if i == 1:
             axes.set_zticks([])
             axes.set_zlabel("")
@@ -76,10 +82,21 @@ def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> N
         0.5, 0.02,
         "solid pyramids: cameras; dashed: what they see of their backgrounds; thick edges: top of the picture; "
         "black: box",
-        ha="center", fontsize=8,
+        ha="center",
     )  # fmt: skip
-    figure.subplots_adjust(left=0.02, right=0.95, top=0.95, bottom=0.08, wspace=0.1)
-    figure.savefig(path, dpi=130)
+
+
+def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> None:
+    """Write a picture of the rig from two sides."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({"font.size": 8, "axes.titlesize": 9}):
+        figure = Figure(figsize=(12, 6.2))
+        FigureCanvasAgg(figure)
+        draw_two_sides(figure, cameras, box)
+        figure.savefig(path, dpi=130)
 
 
 def picture_corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

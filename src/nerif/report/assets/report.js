@@ -8,11 +8,11 @@ async function unpack(name, about, count) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   const data = new Uint8Array(await new Response(stream).arrayBuffer());
-  const values = new Float32Array(count), step = (about.high - about.low) / (MASKED - 1);
+  const values = new Float32Array(count);
   let code = 0;
   for (let i = 0; i < count; i++) {
     code = (code + data[i] + (data[count + i] << 8)) & 65535;
-    values[i] = code === MASKED ? NaN : about.low + code * step;
+    values[i] = code === MASKED ? NaN : about.low + code * about.step;
   }
   return values;
 }

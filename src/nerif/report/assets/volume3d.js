@@ -167,10 +167,9 @@ function makeSpace(scene, canvas) {
 
   const controls = new THREE.OrbitControls(eye, canvas);
   controls.enableDamping = false; controls.zoomSpeed = 1.2;
-  controls.listenToKeyEvents = null;
 
   let pending = 0, coarse = false, settle = 0, slow = 0;
-  const full = Math.min(window.devicePixelRatio || 1, 2);
+  let full = Math.min(window.devicePixelRatio || 1, 2);
   function resize() {
     const box = canvas.parentElement.getBoundingClientRect();
     renderer.setPixelRatio(coarse ? full / (slow > 60 ? 3 : slow > 25 ? 2 : 1) : full);
@@ -179,15 +178,27 @@ function makeSpace(scene, canvas) {
     eye.updateProjectionMatrix();
   }
   function draw() {
-    pending = 0;
-    uniforms.steps.value = coarse && slow > 25 ? 110 : 240;
+    pending = 0; wanted = false;
+    uniforms.steps.value = Math.min(240, 40 + 2.2 * Math.max(nx, ny, nz)) / (coarse && slow > 25 ? 2 : 1);
     eye.updateMatrixWorld();
     uniforms.toClip.value.multiplyMatrices(eye.projectionMatrix, eye.matrixWorldInverse);
     const start = performance.now();
     renderer.render(world, eye);
-    if (!coarse) { renderer.getContext().finish(); slow = performance.now() - start; }
+    if (coarse) return;
+    renderer.getContext().finish();
+    slow = performance.now() - start;
+    if (slow > 700 && full > 0.5) full = Math.max(0.5, full * 0.7);  // no GPU: a softer picture rather than a wait
   }
-  function request() { if (!pending) pending = requestAnimationFrame(draw); }
+  // drawn only while it can be seen: without a GPU every picture costs the slices their time
+  let seen = false, wanted = false;
+  function request() {
+    wanted = true;
+    if (seen && !pending) pending = requestAnimationFrame(draw);
+  }
+  new IntersectionObserver((entries) => {
+    seen = entries[entries.length - 1].isIntersecting;
+    if (seen && wanted) request();
+  }, { rootMargin: "80px" }).observe(canvas);
   // while something moves, fewer pixels on slow machines; sharp again once it rests
   function moving() {
     if (!coarse) { coarse = true; resize(); }
@@ -239,11 +250,11 @@ function makeSpace(scene, canvas) {
       for (let i = 0; i < 256; i++) for (let k = 0; k < 4; k++) table.image.data[4 * i + k] = k < 3 ? colours[3 * i + k] : 255;
       table.needsUpdate = true;
       uniforms.ambient.value = Math.min(1, Math.max(0, rest));
-      request();
+      moving();
     },
     level(value) { uniforms.level.value = (value - range[0]) / (range[1] - range[0] || 1); moving(); },
     opacity(value) { uniforms.opacity.value = value; moving(); },
-    mode(name) { uniforms.surface.value = name !== "volume"; uniforms.volume.value = name !== "surface"; request(); },
+    mode(name) { uniforms.surface.value = name !== "volume"; uniforms.volume.value = name !== "surface"; moving(); },
     cameras(on) { rig.visible = on; request(); },
     planes(places) {
       planes.clear();
@@ -256,7 +267,7 @@ function makeSpace(scene, canvas) {
         }));
         planes.add(lines([0, 1, 2, 3].flatMap((i) => [ring[i], ring[(i + 1) % 4]]), [0xc0392b, 0x1e7d34, 0x1f4fbf][axis], 0.75));
       }
-      request();
+      moving();
     },
     look: { flow: () => look(oblique, near()), rig: () => look([0.5, -1, 0.75], far()), top: () => look([0, -0.001, 1], near()), front: () => look([0, -1, 0], near()) },
     picture() { coarse = false; resize(); draw(); return canvas.toDataURL("image/png"); },

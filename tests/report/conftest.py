@@ -1,0 +1,37 @@
+"""A small finished result, made once by the command line."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from nerif.cli import main
+
+RIG = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]
+QUICK = [
+    "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "60", "--epochs", "1000",
+    "--samples", "12", "16", "--sample-jitter", "2", "--points-per-batch", "600", "--voxels", "16", "--device", "cpu",
+    "--precision", "float32",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four views of balls in a box of three different edges, one held out, with an ensemble and a truth."""
+    folder = tmp_path_factory.mktemp("report")
+    measurement, out = str(folder / "m.nc"), str(folder / "balls")
+    box = ["--box", "50", "40", "30"]
+    assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", measurement, *RIG, *box]) == 0
+    run = ["reconstruct", measurement, "-o", out, "--hold-out", "170deg", *QUICK]
+    assert main([*run, "--ensemble", "2", "--leave-one-out"]) == 0
+    assert main(["evaluate", out, "--truth", str(folder / "m.truth.nc")]) == 0
+    assert main(["report", out]) == 0
+    return folder / "balls"
+
+
+@pytest.fixture
+def copy(whole: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return Path(shutil.copytree(whole, tmp_path / "copy"))

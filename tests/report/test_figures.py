@@ -1,0 +1,122 @@
+"""Figures for print: every one is there, nothing clipped, units on every axis."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from nerif.cli import main
+from nerif.geometry import Box, Grid
+from nerif.report import figures
+from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
+from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, style
+from nerif.report.result import read_result
+from nerif.volume import Volume
+
+
+@pytest.fixture
+def volume() -> Volume:
+    """A ball off the middle, in a box of three different edges."""
+    grid = Grid(Box((-5.0, -4.0, -3.0), (5.0, 4.0, 3.0)), (12, 16, 20))
+    x, y, z = grid.points().unbind(-1)
+    return Volume(-2e-4 * torch.exp(-((x - 1) ** 2 + y**2 + z**2) / 4), grid, attributes={"n_ambient": 1.00027})
+
+
+def test_every_figure_is_whole(whole):
+    """The names expected; nothing beyond the edge of the paper; a unit on every axis and colour bar; no empty panel."""
+    result = read_result(whole)
+    names = []
+    with style():
+        for name, figure in figures_of(result, *JOURNALS["elsevier"]):
+            FigureCanvasAgg(figure).draw()
+            names.append(name)
+            inches = figure.get_tightbbox().extents
+            width, height = figure.get_size_inches()
+            assert inches[0] > -0.01, name
+            assert inches[1] > -0.01, name
+            assert inches[2] < width + 0.01, name
+            assert inches[3] < height + 0.01, name
+            assert round(width * 25.4) in JOURNALS["elsevier"]
+            for axes in figure.axes:
+                assert axes.has_data() or axes.collections or axes.patches, name
+                for label in (axes.get_xlabel(), axes.get_ylabel()):
+                    assert not label or "[" in label, (name, label)
+    quantities = [f"{q}{s}" for s in ("", "_std") for q in ("n", "density", "temperature")]
+    views = ["0deg", "56.6667deg", "113.333deg", "170deg"]
+    expected = [f"slices_{q}" for q in quantities] + ["comparison"]
+    expected += [f"isosurface_{q}" for q in ("n", "density", "temperature")] + [f"view_{v}" for v in views]
+    assert names == [*expected, "residuals", "rig", "views", "history", "slice_scores"]
+
+
+def test_the_command_writes_pdf_and_png(copy, tmp_path, capsys):
+    for name in ("volume.nc", "reprojection.nc"):  # few figures are quicker
+        (copy / name).unlink()
+    assert main(["figures", str(copy), "-o", str(tmp_path / "f"), "--journal", "nature", "--dpi", "50"]) == 0
+    out = capsys.readouterr().out
+    assert "left out: volume.nc is not there" in out
+    assert sorted(p.name for p in (tmp_path / "f").iterdir()) == [
+        f"{n}.{e}" for n in ("history", "slice_scores", "views") for e in ("pdf", "png")
+    ]
+    assert (tmp_path / "f" / "views.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_functions_give_back_the_axes_they_take(volume, whole):
+    result = read_result(whole)
+    assert result.reprojection is not None
+    figure = Figure()
+    for draw, *data in (
+        (figures.draw_slice, volume, "y"),
+        (figures.draw_displacement, np.zeros((3, 4)), 1.0),
+        (figures.draw_history, result.history, "nerif"),
+        (figures.draw_slice_scores, result.metrics["slices"]),
+        (figures.draw_view_scores, result.metrics["views"]),
+        (figures.draw_residuals, residuals_over_sigma(result.reprojection)),
+    ):
+        axes = Figure().subplots()
+        assert draw(axes, *data) is axes
+    space = figure.add_subplot(projection="3d")
+    assert draw_isosurface(space, volume, default_level(volume)) is space
+
+
+def test_a_slice_is_the_middle_one_the_right_way_up(volume):
+    axes = Figure().subplots()
+    figures.draw_slice(axes, volume, "z")
+    image = axes.images[0]
+    np.testing.assert_array_equal(image.get_array(), volume.values[6].double().numpy())
+    assert image.get_extent() == [-5.0, 5.0, -4.0, 4.0]
+    assert image.origin == "lower"
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [mm]", "y [mm]")
+
+
+def test_the_isosurface_stands_where_the_ball_is(volume):
+    level = default_level(volume)
+    assert level == pytest.approx(0.5 * float(volume.values.min()), rel=0.02)
+    points = surface_triangles(volume, level).reshape(-1, 3)
+    assert points.mean(axis=0) == pytest.approx([1, 0, 0], abs=0.15)
+    radius = np.linalg.norm(points - [1, 0, 0], axis=1)
+    assert radius.mean() == pytest.approx(2 * np.sqrt(np.log(2)), rel=0.05)
+
+
+def test_a_flat_volume_has_no_surface_and_no_error():
+    grid = Grid(Box.cube(4.0), (4, 5, 6))
+    for values in (torch.zeros(grid.shape), torch.full(grid.shape, torch.nan)):
+        space = Figure().add_subplot(projection="3d")
+        flat = Volume(values, grid)
+        draw_isosurface(space, flat, default_level(flat))
+        assert not space.collections
+
+
+@pytest.mark.parametrize(
+    ("quantity", "label"),
+    [
+        ("n", "n − 1 [1]"),
+        ("density_std", "standard deviation of density [kg m$^{-3}$]"),
+        ("temperature_mean", "mean temperature [K]"),
+        ("concentration", "concentration [1]"),
+    ],
+)
+def test_labels_carry_units(quantity, label):
+    assert figures.label_of(quantity) == label

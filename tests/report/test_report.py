@@ -1,0 +1,210 @@
+"""The page of a result: everything inside, figures that are right, and what it says when something is missing."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nerif.cli import main
+from nerif.conventions import InputError
+from nerif.geometry import Box, Grid
+from nerif.physics.quantities import GasSettings, derive
+from nerif.report import html, packing
+from nerif.report.result import Result, read_result
+from nerif.report.summary import headline, number, trust
+from nerif.report.view_images import view_images
+from nerif.volume import Volume
+
+PARTS = ("run.toml", "metrics.json", "history.csv", "volume.nc", "reprojection.nc")
+
+
+def smooth(shape: tuple[int, int, int]) -> Volume:
+    """A warm column with a little noise, in a box of three different edges."""
+    grid = Grid(Box((-25.0, -20.0, -15.0), (25.0, 20.0, 15.0)), shape)
+    x, y, z = grid.points().unbind(-1)
+    noise = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    excess = -2e-4 * torch.exp(-(x**2 + y**2) / 80) * (1 + 0.2 * torch.sin(z)) + 3e-7 * noise
+    return Volume(excess, grid, attributes={"n_ambient": 1.00027})
+
+
+def test_page_is_whole_and_needs_no_network(whole):
+    text = (whole / "report.html").read_text()
+    assert not re.findall(r"""(?:src|href|action)\s*=\s*["']?(?:https?:)?//""", text)
+    assert not re.findall(r"url\(\s*['\"]?(?:https?:)?//|@import", text)
+    own_scripts = [
+        p.read_text() for p in (Path(html.__file__).parent / "assets").glob("*.js") if p.name != "three.min.js"
+    ]
+    assert len(own_scripts) == 3
+    assert not any(re.search(r"fetch\(|XMLHttpRequest|WebSocket|importScripts", s) for s in own_scripts)
+    for words in ("What was measured", "What came out", "Can it be trusted", "held out", "170deg", "Ensemble of",
+                  "Against the truth", "Gladstone-Dale", "101325 Pa", "arXiv:2409.14722"):  # fmt: skip
+        assert words in text, words
+
+
+def test_figures_on_the_page_are_those_of_the_files(whole):
+    result = read_result(whole)
+    assert not result.missing
+    metrics = json.loads((whole / "metrics.json").read_text())
+    held = next(v for v in metrics["views"] if v["held_out"])
+    page = (whole / "report.html").read_text()
+    assert f"CC {number(held['cc'], 5)}" in page
+    assert f"{number(held['rms_px'], 3)} px = {held['rms_over_sigma']:.2f} σ" in page
+    assert f"L2 {metrics['l2']:.2%}" in page
+    assert metrics["ensemble"]["members"] == 2
+    assert {v["name"] for v in metrics["ensemble"]["left_out"]} == {"0deg", "56.6667deg"}
+    assert 0 <= metrics["coverage"]["share"] <= 1
+
+
+def test_what_is_packed_comes_back():
+    volume = smooth((7, 6, 5))
+    values = volume.values.double().numpy()
+    values[1, 2, 3] = np.nan
+    packed = packing.pack(values)
+    back = packing.unpack(packed, values.shape)
+    assert np.isnan(back[1, 2, 3])
+    assert np.isnan(back).sum() == 1
+    half_a_step = 0.5 * packed["step"]
+    assert packed["step"] == pytest.approx((np.nanmax(values) - np.nanmin(values)) / 65534)
+    assert np.nanmax(np.abs(back - values)) <= 1.001 * half_a_step
+    flat = packing.pack(np.full((2, 3, 4), 5.0))
+    np.testing.assert_allclose(packing.unpack(flat, (2, 3, 4)), 5.0)
+    assert np.isnan(packing.unpack(packing.pack(np.full((2, 3, 4), np.nan)), (2, 3, 4))).all()
+
+
+@pytest.mark.parametrize("quantity", ["n", "density", "temperature"])
+def test_relations_are_those_of_the_files(quantity):
+    volume = smooth((9, 8, 7))
+    volume.values[0, 0, :3] = torch.tensor([-2.8e-4, -2.6999e-4, 3e-4])  # below vacuum, far too hot, too cold
+    derived = derive(volume, quantity, GasSettings("N2", pressure_pa=9e4))
+    expected = derived.values.double().numpy() - (quantity == "n")
+    found = packing.relation(quantity, derived.attributes)(volume.values.double().numpy())
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+    np.testing.assert_allclose(found, expected, rtol=2e-6)
+
+
+def test_a_volume_of_128_stays_below_15_megabytes(tmp_path):
+    excess = smooth((128, 128, 128))
+    values = {q: derive(excess, q, GasSettings()) for q in ("n", "density", "temperature")}
+    more = {f"index_excess_{s}": excess for s in ("mean", "std")}
+    more |= {f"temperature_{s}": values["temperature"] for s in ("mean", "std")}
+    html.write(Result(tmp_path, volumes={"index_excess": excess, **values, **more}), tmp_path / "r.html")
+    assert (tmp_path / "r.html").stat().st_size < 15e6
+
+
+def test_finer_volumes_are_averaged_down_in_their_box():
+    fine = smooth((12, 16, 20))
+    coarse = packing.coarsen(fine, 10)
+    assert coarse.grid.shape == (6, 8, 10)
+    assert coarse.grid.box == fine.grid.box
+    blocks = fine.values.reshape(6, 2, 8, 2, 10, 2).mean(dim=(1, 3, 5))
+    torch.testing.assert_close(coarse.values, blocks)
+    assert packing.coarsen(fine, 20) is fine
+
+
+def test_pictures_of_views_share_their_scales(whole):
+    reprojection = read_result(whole).reprojection
+    assert reprojection is not None
+    views, limit, apart = view_images(reprojection, [])
+    assert [v.held_out for v in views] == [False, False, False, True]
+    measured = reprojection.measurement.displacement[reprojection.measurement.usable].abs()
+    assert 0 < limit <= float(measured.max())
+    assert apart < limit
+    assert all(address.startswith("data:image/png") for v in views for row in v.rows.values() for address in row)
+
+
+@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("how", ["gone", "truncated", "nonsense"])
+def test_a_broken_result_gives_a_page_that_says_what_is_missing(copy, capsys, name, how):
+    path = copy / name
+    if how == "gone":
+        path.unlink()
+    elif how == "truncated":
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    else:
+        path.write_bytes(b"\x00\x01 nonsense")
+    if how != "gone" and (name == "history.csv" or (name, how) == ("run.toml", "truncated")):
+        assert main(["report", str(copy)]) == 0  # half a table can be a table
+        return
+    assert main(["report", str(copy)]) == 0
+    assert name in capsys.readouterr().out
+    page = (copy / "report.html").read_text()
+    assert name in page
+    assert "Not to be relied on" in page or name == "history.csv"
+
+
+def test_a_run_that_was_killed(copy, capsys):
+    for name in ("field.safetensors", "metrics.json", "history.csv", "volume.nc", "reprojection.nc", "report.html"):
+        (copy / name).unlink()
+    assert main(["report", str(copy)]) == 0
+    page = (copy / "report.html").read_text()
+    assert "The run has not ended" in page
+    assert "--resume" in page
+    assert main(["figures", str(copy)]) == 2
+    assert "nothing to draw" in capsys.readouterr().err
+
+
+def test_refusals(tmp_path, capsys, whole):
+    (tmp_path / "empty").mkdir()
+    for arguments, words in (
+        (["report", str(tmp_path / "absent")], "no such directory"),
+        (["report", str(tmp_path / "empty")], "expected a result of nerif reconstruct"),
+        (["report", str(whole), "-o", str(tmp_path / "r.pdf")], ".html"),
+        (["report", str(whole), "-o", str(tmp_path / "no" / "r.html")], "no such directory"),
+        (["figures", str(whole), "--journal", "lancet"], "elsevier"),
+        (["figures", str(whole), "--dpi", "3"], "dpi"),
+        (["figures", str(tmp_path / "absent")], "no such directory"),
+    ):
+        assert main(arguments) == 2, arguments
+        assert words in capsys.readouterr().err
+    with pytest.raises(InputError, match="no such directory"):
+        read_result(tmp_path / "absent")
+
+
+def view(held_out: bool, cc: float, noise: float | None) -> dict:
+    return {"name": "a", "held_out": held_out, "cc": cc, "rms_px": 0.1} | (
+        {} if noise is None else {"rms_over_sigma": noise}
+    )
+
+
+@pytest.mark.parametrize(
+    ("metrics", "level", "words"),
+    [
+        ({"views": [view(False, 0.99, 1.0), view(True, 0.98, 1.1)]}, "good", "has not seen"),
+        ({"views": [view(False, 0.99, 1.0)]}, "warning", "--hold-out"),
+        ({"views": [view(False, 0.99, None), view(True, 0.98, None)]}, "note", "noise of the measurement is not known"),
+        ({"views": [view(False, 0.99, 1.0), view(True, 0.9, 1.1)]}, "warning", "poorly"),
+        ({"views": [view(False, 0.99, 1.0), view(True, 0.5, 1.1)]}, "bad", "poorly"),
+        ({"views": [view(False, 0.99, 1.0), view(True, 0.99, 2.5)]}, "warning", "2.5 times the noise"),
+        ({"views": [view(False, 0.99, 0.4), view(True, 0.99, 1.0)]}, "warning", "follows noise"),
+        ({"views": [view(False, 0.99, 2.0), view(True, 0.99, 1.0)]}, "warning", "does not explain"),
+        ({"views": [view(False, 0.99, 5.0), view(True, 0.99, 1.0)]}, "bad", "does not explain"),
+        ({"outcome": "diverged", "message": "loss is NaN"}, "bad", "loss is NaN"),
+        ({"outcome": "interrupted"}, "warning", "--resume"),
+        ({"outcome": "time_limit"}, "note", "time limit"),
+    ],
+)
+def test_what_is_said_of_trust(tmp_path, metrics, level, words):
+    statements = trust(Result(tmp_path, metrics=metrics))
+    assert headline(statements).level == level
+    assert any(s.level == level and words in s.text for s in statements)
+
+
+def test_masked_voxels_are_told(tmp_path):
+    volume = smooth((6, 5, 4))
+    volume.values[:3] = -3e-4
+    density = derive(volume, "density", GasSettings())
+    statements = trust(Result(tmp_path, volumes={"density": density}))
+    assert any("60 voxels (50.00%)" in s.text and s.level == "warning" for s in statements)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [(2.75123e-4, 3, "2.75 × 10⁻⁴"), (0.0, 3, "0"), (296.94, 4, "296.9"), (None, 3, "–"), (float("nan"), 3, "–")],
+)
+def test_numbers_for_people(value, digits, text):
+    assert number(value, digits) == text

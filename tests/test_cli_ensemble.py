@@ -1,0 +1,114 @@
+"""nerif reconstruct --ensemble from end to end: files, resuming, interruption, refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import xarray as xr
+
+from nerif.cli import main
+from nerif.measurement import Measurement
+from nerif.reconstruction.base import Step
+
+RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "3", "--steps", "30", "--truth-voxels", "12"]
+QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny measurement with noise."""
+    path = tmp_path_factory.mktemp("ensemble") / "m.nc"
+    assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", str(path), *RIG]) == 0
+    return path
+
+
+def test_mean_and_spread_of_every_quantity_are_written(measured, tmp_path, capsys):
+    out = tmp_path / "r"
+    assert main(["reconstruct", str(measured), "-o", str(out), *QUICK, "--ensemble", "3"]) == 0
+    assert "ensemble of 3" in capsys.readouterr().out
+    with xr.open_dataset(out / "volume.nc") as volume:
+        for quantity in ("index_excess", "n", "density", "temperature"):
+            for statistic in ("mean", "std"):
+                assert volume[f"{quantity}_{statistic}"].attrs["members"] == 3
+            assert volume[quantity].attrs["ancillary_variables"] == f"{quantity}_mean {quantity}_std"
+        assert volume["density_std"].attrs["units"] == "kg m-3"
+        assert "standard_deviation" in volume["density_std"].attrs["cell_methods"]
+        assert float(volume["index_excess_std"].mean()) > 0
+    assert json.loads((out / "metrics.json").read_text())["ensemble"]["members"] == 3
+    assert "Ensemble mean" in (out / "report.html").read_text()
+
+
+def test_members_that_are_there_are_not_done_again(measured, tmp_path):
+    out = tmp_path / "r"
+    assert main(["reconstruct", str(measured), "-o", str(out), *QUICK, "--ensemble", "2", "--no-report"]) == 0
+    assert not (out / "report.html").exists()
+    with xr.open_dataset(out / "volume.nc") as volume:
+        before = volume["index_excess_std"].values
+    stamps = {p: p.stat().st_mtime_ns for p in (out / "ensemble").rglob("field.safetensors")}
+    assert len(stamps) == 2
+    (out / "ensemble" / "01" / "field.safetensors").write_bytes(b"broken")
+    assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
+    with xr.open_dataset(out / "volume.nc") as volume:
+        assert (volume["index_excess_std"].values == before).all()
+    again = {p: p.stat().st_mtime_ns for p in stamps}
+    assert [again[p] != stamps[p] for p in sorted(stamps)] == [True, False]
+    assert main(["reconstruct", str(measured), "-o", str(out), *QUICK, "--force", "--no-report"]) == 0
+    assert not (out / "ensemble").exists()
+
+
+def test_interrupted_in_the_second_member(measured, tmp_path, capsys, monkeypatch):
+    """Ctrl-C in a member keeps the main result and the members before it; --resume ends as if nothing had been."""
+    from nerif.commands import members
+
+    whole, out = tmp_path / "whole", tmp_path / "r"
+    arguments = ["reconstruct", str(measured), *QUICK, "--ensemble", "3", "--no-report"]
+    assert main([*arguments, "-o", str(whole)]) == 0
+    plain = members.progress_bar
+
+    def interrupting(title):
+        if "member 2" not in title:
+            return plain(title)
+
+        class Bar:
+            def __enter__(self):
+                def update(step: Step) -> None:
+                    os.kill(os.getpid(), signal.SIGINT)
+
+                return update
+
+            def __exit__(self, *exception):
+                return None
+
+        return Bar()
+
+    monkeypatch.setattr(members, "progress_bar", interrupting)
+    assert main([*arguments, "-o", str(out)]) == 0
+    assert "interrupted after 1 of 3" in capsys.readouterr().out
+    assert (out / "volume.nc").is_file()
+    monkeypatch.setattr(members, "progress_bar", plain)
+    assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
+    with xr.open_dataset(out / "volume.nc") as a, xr.open_dataset(whole / "volume.nc") as b:
+        assert (a["index_excess_std"].values == b["index_excess_std"].values).all()
+
+
+def test_without_sigma_the_residual_takes_its_place(measured, tmp_path, capsys):
+    from dataclasses import replace
+
+    replace(Measurement.read(measured), sigma=None).write(tmp_path / "m.nc")
+    arguments = [str(tmp_path / "m.nc"), "-o", str(tmp_path / "r"), *QUICK, "--regularisation", "0.1"]
+    assert main(["reconstruct", *arguments, "--ensemble", "2"]) == 0
+    assert "has no sigma" in capsys.readouterr().out
+    assert json.loads((tmp_path / "r/metrics.json").read_text())["ensemble"]["noise"] == "rms residual"
+
+
+@pytest.mark.parametrize(
+    ("more", "words"), [(["--ensemble", "1"], "2 members or more"), (["--leave-one-out"], "together with --ensemble")]
+)
+def test_refusals(measured, tmp_path, capsys, more, words):
+    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), *QUICK, *more]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()

@@ -1,0 +1,111 @@
+"""The documentation site builds without a warning, loads nothing from the web, and its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = (
+    "index", "tutorial", "images", "choosing", "limits", "conventions", "method", "formats", "benchmarks", "api",
+    "architecture", "changelog", "api/geometry", "api/reconstruction", "repository/benchmarks/results/methods-cpu",
+    "repository/examples/own_data",
+)  # fmt: skip
+DRAWINGS = ("axes", "displacement", "volume", "lever_arm")
+
+
+class Page(HTMLParser):
+    """What a page loads, where it links to, and what can be linked to in it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.links: list[str] = []
+        self.ids: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attributes}
+        self.ids |= {given[name] for name in ("id", "name") if name in given}
+        if "src" in given:
+            self.loads.append(given["src"])
+        if tag == "link" and given.get("rel") not in ("index", "search", "next", "prev", "canonical"):
+            self.loads.append(given.get("href", ""))
+        if tag == "a" and "href" in given:
+            self.links.append(given["href"])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built site: once, for those tests of this file that run in one process."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html"]
+    result = subprocess.run(
+        [*command, "-d", str(folder / "doctrees"), str(ROOT / "docs"), str(folder / "html")],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=ROOT,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return folder / "html"
+
+
+def test_site_is_whole_and_loads_nothing_from_the_web(site: Path) -> None:
+    for name in PAGES:
+        assert (site / f"{name}.html").is_file(), name
+    pages = {path: path.read_text() for path in site.rglob("*.html")}
+    parsed = {path: Page(text) for path, text in pages.items()}
+    for path, page in parsed.items():
+        for target in page.loads:
+            assert not re.match(r"(https?:)?//", target), f"{path.name} loads {target}"
+            file = target.split("?")[0].split("#")[0]
+            assert target.startswith("data:") or (path.parent / unquote(file)).is_file(), f"{path.name}: {target}"
+        assert "mathjax" not in pages[path].lower(), path.name
+    for style in site.rglob("*.css"):
+        assert not re.search(r"(@import|url\()\s*['\"]?(https?:)?//", style.read_text()), style.name
+
+    # links within the site, fragments included
+    for path, page in parsed.items():
+        for link in page.links:
+            if re.match(r"[a-z]+:", link) or path.name in ("genindex.html", "search.html"):
+                continue
+            name, _, fragment = link.partition("#")
+            target = (path.parent / unquote(name)).resolve() if name else path.resolve()
+            assert target.is_file(), f"{path.name} links to {link}"
+            if fragment and target.suffix == ".html":
+                assert unquote(fragment) in Page(target.read_text()).ids if target not in parsed else (
+                    unquote(fragment) in parsed[target].ids
+                ), f"{path.name} links to {link}"  # fmt: skip
+
+    method = pages[site / "method.html"]
+    assert method.count("<math ") > 50
+    assert "$" not in re.sub(r"<(script|style|title)\b.*?</\1>", "", method, flags=re.DOTALL)
+    assert 'class="eqno"' in method
+    for name in DRAWINGS:
+        [drawing] = site.rglob(f"{name}.svg")
+        assert drawing.stat().st_size > 5000
+        assert f"{name}.svg" in pages[site / ("method.html" if name == "lever_arm" else "conventions.html")]
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    links = re.findall(r"\]\(([^)\s]+)\)", (ROOT / "README.md").read_text())
+    assert len(links) > 5
+    for link in links:
+        if not re.match(r"[a-z]+:", link):
+            assert (ROOT / link.split("#")[0]).exists(), link
+
+
+@pytest.mark.parametrize("page", sorted(p.name for p in (ROOT / "docs").glob("*.md")))
+def test_links_of_a_page_lead_somewhere_on_a_forge_too(page: str) -> None:
+    text = re.sub(r"^```.*?^```", "", (ROOT / "docs" / page).read_text(), flags=re.MULTILINE | re.DOTALL)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if not re.match(r"[a-z]+:", link):
+            file = link.split("#")[0]
+            assert not file or (ROOT / "docs" / file).exists(), link
