@@ -1,10 +1,11 @@
 # make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo
 # make test   set up, lint, check types, run the tests (under 10 minutes on 2 cores)
+# make docs   the documentation site: open docs/_build/html/index.html
 
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-all lint clean
+.PHONY: demo test test-all lint docs clean
 
 demo: .venv/.run
 	$(BIN)/nerif demo --out out/demo --force
@@ -19,6 +20,9 @@ lint: .venv/.dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+docs: .venv/.dev
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+
 .venv/.run: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "nerif needs Python 3.11 or newer; try make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
@@ -31,4 +35,4 @@ lint: .venv/.dev
 	touch $@
 
 clean:
-	rm -rf .venv out
+	rm -rf .venv out docs/_build docs/_drawings docs/repository

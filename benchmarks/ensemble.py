@@ -11,11 +11,14 @@ the ensemble knew all of would give 95 %.
 from __future__ import annotations
 
 import argparse
+import datetime
+import shlex
+import sys
 import time
-from datetime import date
 from pathlib import Path
 
 import torch
+from flame import machine
 
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
@@ -39,7 +42,7 @@ def methods(steps: int) -> dict[str, Reconstructor]:
 
     return {
         "NeRIF": replace(preset("fast"), max_steps=steps, epochs=1e9),
-        "TV 40³": TotalVariation(voxels=40),
+        "TV": TotalVariation(voxels=40),
     }
 
 
@@ -79,7 +82,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000, help="of NeRIF")
     parser.add_argument("--phantoms", nargs="+", default=["gaussians", "flame"])
     parser.add_argument("--noise", nargs="+", type=float, default=[0.05, 0.15])
-    parser.add_argument("--methods", nargs="+", default=None)
+    parser.add_argument("--methods", nargs="+", default=["NeRIF"], help="NeRIF, TV")
+    parser.add_argument("--leave-one-out", nargs="+", choices=["no", "yes"], default=["no", "yes"])
     parser.add_argument("--write", type=Path)
     arguments = parser.parse_args()
     keep_freed_memory()
@@ -92,9 +96,9 @@ def main() -> None:
         for noise in arguments.noise:
             measurement = simulate(field, cameras, BOX, N_AMBIENT, noise, seed=1)
             for name, method in methods(arguments.steps).items():
-                if arguments.methods and name not in arguments.methods:
+                if name not in arguments.methods:
                     continue
-                for leave in (False, True):
+                for leave in (choice == "yes" for choice in arguments.leave_one_out):
                     started = time.perf_counter()
                     found = measure(method, measurement, truth, arguments.members, leave)
                     columns = list(found)
@@ -104,9 +108,9 @@ def main() -> None:
                     print("  ".join(rows[-1]), flush=True)
     head = ["phantom", "noise", "method", "one view left out", *columns, "seconds"]
     lines = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows)]
-    command = f"python benchmarks/ensemble.py --members {arguments.members} --steps {arguments.steps}"
-    about = f"{torch.get_num_threads()} threads, torch {torch.__version__}, {date.today().isoformat()}"
-    text = f"# Ensemble: is the truth within two standard deviations?\n\nCommand: `{command}`  \nMachine: {about}\n\n"
+    command = f"python benchmarks/{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}"
+    text = "# Ensemble: is the truth within two standard deviations?\n\n"
+    text += f"Command: `{command}`  \nMachine: {machine()}  \nDate: {datetime.date.today()}\n\n"
     text += "\n".join(lines) + "\n"
     print(text)
     if arguments.write:

@@ -67,7 +67,7 @@ def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
 
 def test_result_directory_is_complete(work):
     names = {p.name for p in (work / "r").iterdir()}
-    listed = "volume.nc volume.vti field.safetensors run.toml metrics.json history.csv checkpoint.safetensors"
+    listed = "volume.nc volume.vti field.safetensors run.toml metrics.json history.csv checkpoint.safetensors reprojection.nc report.html"
     assert names >= set(listed.split())
     assert not [n for n in names if n.endswith(".part")]
     metrics = json.loads((work / "r/metrics.json").read_text())
@@ -78,7 +78,7 @@ def test_result_directory_is_complete(work):
     assert [v["held_out"] for v in metrics["views"]] == [False, False, False, True]
     assert set(metrics["views"][0]) >= {"name", "held_out", "cc", "ssim", "psnr", "rms_px"}
     volume = xr.load_dataset(work / "r/volume.nc", engine="h5netcdf")
-    assert set(volume.data_vars) == {"index_excess", "n", "density"}
+    assert set(volume.data_vars) == {"index_excess", "n", "density", "temperature"}
     assert volume["n"].dtype == np.float64
     np.testing.assert_allclose(volume["n"] - 1.00027, volume["index_excess"], atol=1e-10)
     history = (work / "r/history.csv").read_text().splitlines()

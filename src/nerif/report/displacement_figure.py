@@ -70,5 +70,5 @@ def save_masks(path: Path, measurement: Measurement) -> None:
         axes.tick_params(labelsize=6)
         axes.set_xlabel("column [px]", fontsize=7)
         axes.set_ylabel("row [px]" if i % columns == 0 else "", fontsize=7)
-    figure.colorbar(shown.images[-1], ax=grid.ravel().tolist(), label="|d| [px]", shrink=0.6, extend="max")
+    figure.colorbar(shown, ax=grid.ravel().tolist(), label="|d| [px]", shrink=0.6, extend="max")
     figure.savefig(path, dpi=120)
