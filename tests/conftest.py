@@ -32,6 +32,18 @@ from nerif.simulation import simulate
 torch.set_num_threads(1)  # tests run side by side
 
 
+GROUPS = {"whole": "report", "site": "docs"}
+"""Fixtures that take long: tests that use one run in one process, so that it is made once."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep tests together that share a costly fixture."""
+    for item in items:
+        for fixture, group in GROUPS.items():
+            if fixture in getattr(item, "fixturenames", ()):
+                item.add_marker(pytest.mark.xdist_group(group))
+
+
 @pytest.fixture
 def unchecked() -> Iterator[None]:
     """Shapes are not checked by annotation, as when users call: the error has to be ours."""

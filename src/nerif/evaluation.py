@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +51,19 @@ def _through_voxels(
 
 
 def reproject(
-    field: Field, measurement: Measurement, held_out: Collection[str] = (), device: torch.device | str = "cpu"
+    field: Field,
+    measurement: Measurement,
+    held_out: Collection[str] = (),
+    device: torch.device | str = "cpu",
+    on_view: Callable[[int], None] = lambda done: None,
 ) -> Reprojection:
-    """Predict what every view of a measurement sees of a field; px."""
+    """Predict what every view of a measurement sees of a field; px. `on_view` hears how many views are done."""
     model = Deflection(samples=REPROJECTION_SAMPLES, n_ambient=measurement.n_ambient)
     predicted = torch.full_like(measurement.displacement, float("nan"))
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
         predicted[i, :height, :width] = predict_view(field, camera, model, measurement.box, device)
+        on_view(i + 1)
     return Reprojection(measurement, predicted, tuple(held_out))
 
 

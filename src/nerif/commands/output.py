@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from nerif.conventions import InputError
 from nerif.reconstruction.base import Step
 from nerif.volume import Volume
 
-__all__ = ["check_directory", "check_file", "interruptible", "progress_bar", "say", "say_masked"]
+__all__ = ["check_directory", "check_file", "counting_bar", "interruptible", "progress_bar", "say", "say_masked"]
 
 
 def say(text: str) -> None:
@@ -71,6 +71,17 @@ def interruptible() -> Iterator[list[bool]]:
         yield asked
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def counting_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show a bar that goes away when done: a callable that is told how many of `total` are."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=total)
+        yield lambda done: bar.update(task, completed=done)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Any
 
 from nerif import __version__
 from nerif.commands.methods import Reconstruct
-from nerif.commands.output import say, say_masked
+from nerif.commands.output import counting_bar, say, say_masked
 from nerif.commands.settings import to_toml
 from nerif.evaluation import evaluate_views, reproject, update_json
 from nerif.geometry import Grid
@@ -55,7 +55,8 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
     if result.state is not None:
         write_state(out, result.state)
     _write_history(out / HISTORY, result.history)
-    reprojection = reproject(result.field, measurement, settings.hold_out, result.device)
+    with counting_bar("re-projecting", len(measurement.cameras)) as bar:
+        reprojection = reproject(result.field, measurement, settings.hold_out, result.device, bar)
     reprojection.write(out / REPROJECTION)
     views = evaluate_views(reprojection)
     update_json(
@@ -78,14 +79,15 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
     }
     (out / RUN).write_text(run_toml(settings, about))
     write_volumes(out, all_quantities(settings, result))
-    for group, held in (("training views", False), ("held-out views", True)):
+    for group, held in (("training view", False), ("held-out view", True)):
         chosen = [v for v in views if v["held_out"] is held]
         if chosen:
             cc = min(v["cc"] for v in chosen)
             rms = max(v["rms_px"] for v in chosen)
             noise = max(v.get("rms_over_sigma", float("nan")) for v in chosen)
             beside = "" if noise != noise else f", at most {noise:.2f} sigma"
-            say(f"{len(chosen)} {group}: CC at least {cc:.4f}, rms error at most {rms:.4f} px{beside}")
+            plural = "s" if len(chosen) > 1 else ""
+            say(f"{len(chosen)} {group}{plural}: CC at least {cc:.4f}, rms error at most {rms:.4f} px{beside}")
     say(f"{out}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView")
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, say
+from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import flag_value, merge, parse, read_toml
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
@@ -68,19 +68,11 @@ def run(settings: Simulate) -> None:
     check_file(settings.out, settings.force, truth_path(settings.out))
     phantom, box = _phantom(settings)
     cameras = settings.ring.cameras()
-    from rich.console import Console
-    from rich.progress import track
-
-    views = iter(track(range(len(cameras)), "tracing rays", console=Console(stderr=True), transient=True))
-
-    def shown(done: int) -> None:
-        next(views, None)
-
-    measurement = simulate(
-        phantom, cameras, box, settings.n_ambient, settings.noise, settings.seed, settings.steps,
-        settings.wavelength_nm, settings.ambient_faces, on_view=shown,
-    )  # fmt: skip
-    next(views, None)
+    with counting_bar("tracing rays", len(cameras)) as bar:
+        measurement = simulate(
+            phantom, cameras, box, settings.n_ambient, settings.noise, settings.seed, settings.steps,
+            settings.wavelength_nm, settings.ambient_faces, on_view=bar,
+        )  # fmt: skip
     grid = Grid.of_resolution(box, settings.truth_voxels)
     truth = Volume(phantom.sample(grid), grid, attributes={"n_ambient": settings.n_ambient})
     measurement.write(settings.out)
