@@ -12,7 +12,7 @@ from nerif.cli import main
 from nerif.geometry import Box, Grid
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
-from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, style
+from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, style
 from nerif.report.result import read_result
 from nerif.volume import Volume
 
@@ -107,6 +107,21 @@ def test_a_flat_volume_has_no_surface_and_no_error():
         flat = Volume(values, grid)
         draw_isosurface(space, flat, default_level(flat))
         assert not space.collections
+
+
+def test_colours_do_not_go_to_a_few_outliers(volume):
+    values = volume.values.double().numpy().copy()
+    assert figures.colour_range(values) == (values.min(), values.max())
+    values[0, 0, 0] = 1.0
+    values[0, 0, 1] = np.nan
+    low, high = figures.colour_range(values)
+    assert low == pytest.approx(-2e-4, rel=0.2)
+    assert high < 1e-6
+    page = slices(Volume(torch.from_numpy(values), volume.grid), 190)
+    FigureCanvasAgg(page).draw()
+    assert len(page.axes) == 4
+    everywhere_masked = Volume(torch.full(volume.grid.shape, torch.nan), volume.grid, "temperature", "K")
+    FigureCanvasAgg(slices(everywhere_masked, 190)).draw()
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 import tyro
 
 from nerif.commands.members import add_ensemble
@@ -18,13 +19,15 @@ from nerif.commands.result_files import clear, run_toml, write_result
 from nerif.commands.settings import flag_value, merge, parse, read_toml
 from nerif.conventions import InputError
 from nerif.fields.base import Field
+from nerif.geometry import Grid
 from nerif.measurement import Measurement
-from nerif.physics.quantities import GasSettings
+from nerif.physics.quantities import GasSettings, derive
 from nerif.reconstruction.base import OnStep, Reconstruction, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
 from nerif.reconstruction.files import read_field, read_state, write_state
 from nerif.reconstruction.presets import preset
 from nerif.report.result import RUN
+from nerif.volume import Volume
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,7 +48,7 @@ def run(settings: Reconstruct) -> Reconstruction:
         raise InputError("leave_one_out: expected together with --ensemble K, got no ensemble")
     if measurement.wavelength_nm is not None:
         settings = replace(settings, gas=replace(settings.gas, wavelength_nm=measurement.wavelength_nm))
-    derive_check(settings.gas)
+    derive_check(settings.gas, measurement)
     if measurement.bad_pixels:
         say(f"{settings.measurement}: {measurement.bad_pixels} pixels with NaN or infinite displacement left out")
     resume = read_state(settings.out) if settings.resume else None
@@ -93,11 +96,11 @@ def _start(settings: Reconstruct, measurement: Measurement) -> Field | None:
     return start
 
 
-def derive_check(gas: GasSettings) -> None:
-    """Refuse an unknown gas before the long work, not after it."""
-    from nerif.physics.gas_optics import gladstone_dale
-
-    gladstone_dale(gas.composition, gas.wavelength_nm)
+def derive_check(gas: GasSettings, measurement: Measurement) -> None:
+    """Refuse what density and temperature cannot be computed from before the long work, not after it."""
+    grid = Grid(measurement.box, (1, 1, 1))
+    ambient = Volume(torch.zeros(grid.shape), grid, attributes={"n_ambient": measurement.n_ambient})
+    derive(ambient, "temperature", gas)
 
 
 def _begin(settings: Reconstruct) -> Callable[[Step | None], None]:

@@ -20,6 +20,7 @@ __all__ = [
     "DIVERGING",
     "LABELS",
     "add_colour_bar",
+    "colour_range",
     "draw_displacement",
     "draw_history",
     "draw_residuals",
@@ -81,7 +82,7 @@ def draw_slice(
 ) -> Axes:
     """Draw the middle slice of a volume across the axis `normal`; lengths in mm, masked voxels grey."""
     values = shown(volume)
-    low, high = limits or finite_range(values)
+    low, high = limits or colour_range(values)
     axis = "zyx".index(normal)
     plane = np.take(values, values.shape[axis] // 2, axis=axis)
     across, up = PLANES[normal]
@@ -102,10 +103,19 @@ def draw_slice(
     return axes
 
 
-def finite_range(values: np.ndarray) -> tuple[float, float]:
-    """Return lowest and highest value, leaving out NaN; 0 and 1 if there is nothing else."""
+def colour_range(values: np.ndarray) -> tuple[float, float]:
+    """Return the ends of the colours: lowest and highest value, or where a thousandth of the voxels is left beyond.
+
+    The latter where a few outliers would take a fifth of the colours and more. NaN is left out; 0 and 1 for nothing.
+    """
     known = values[np.isfinite(values)]
-    return (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    if not known.size:
+        return 0.0, 1.0
+    low, high = float(known.min()), float(known.max())
+    inner = np.quantile(known, [0.001, 0.999])
+    if inner[1] > inner[0] and high - low > 1.25 * (inner[1] - inner[0]):
+        return float(inner[0]), float(inner[1])
+    return low, high
 
 
 def draw_displacement(axes: Axes, image: np.ndarray, limit: float) -> Axes:
@@ -124,7 +134,11 @@ def add_colour_bar(axes: Sequence[Axes], label: str) -> Axes:
     form = ScalarFormatter(useMathText=True)
     form.set_powerlimits((-3, 4))
     figure = axes[0].figure
-    bar = figure.colorbar(axes[-1].images[-1], ax=list(axes), format=form, shrink=0.9, pad=0.02)
+    low, high = axes[-1].images[-1].get_clim()
+    drawn = np.concatenate([np.ma.masked_invalid(a.images[-1].get_array()).compressed() for a in axes])
+    beyond = (bool((drawn < low).any()), bool((drawn > high).any()))
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+    bar = figure.colorbar(axes[-1].images[-1], ax=list(axes), format=form, shrink=0.9, pad=0.02, extend=extend)
     bar.set_label(label)
     return bar.ax
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerif import __version__
 from nerif.report import packing
-from nerif.report.figures import COLOUR_MAPS, DIVERGING, draw_history, draw_residuals, draw_slice_scores, shown
+from nerif.report.figures import COLOUR_MAPS, DIVERGING, draw_history, draw_residuals, draw_slice_scores
 from nerif.report.isosurface import default_level
 from nerif.report.pages import error_of, residuals_over_sigma, style
 from nerif.report.result import Result
@@ -134,7 +134,6 @@ def _scene(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
             "relation": packing.as_plain(packing.relation(name, result.volumes[name].attributes)),
             "colours": COLOUR_MAPS.get(name, "viridis"),
             "level": default_level(result.volumes[name]),
-            "range": _range(shown(result.volumes[name])),
         }
     if not quantities:
         return None, {}
@@ -162,11 +161,6 @@ def _variants(sources: dict[str, Volume]) -> dict[str, str]:
     if "error" in sources:
         found |= {"truth": "Truth", "error": "Error"}
     return found
-
-
-def _range(values: np.ndarray) -> tuple[float, float]:
-    known = values[np.isfinite(values)]
-    return (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
 
 
 def _cameras(result: Result) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from nerif.report.figures import shown
+from nerif.report.figures import colour_range, shown
 from nerif.volume import Volume
 
 if TYPE_CHECKING:
@@ -20,12 +20,14 @@ FACE = "#E69F00"
 
 
 def default_level(volume: Volume) -> float:
-    """Return the value halfway between the ambient (median of the faces of the box) and what is farthest from it."""
+    """Return the value halfway between the ambient (median of the faces of the box) and what is farthest from it.
+
+    A few outliers do not count: see figures.colour_range.
+    """
     values = shown(volume)
     faces = np.concatenate([np.take(values, i, axis=a).ravel() for a in range(3) for i in (0, -1)])
     ambient = float(np.nanmedian(faces)) if np.isfinite(faces).any() else 0.0
-    apart = np.nan_to_num(values - ambient)
-    return ambient + 0.5 * float(apart.flat[np.abs(apart).argmax()])
+    return ambient + 0.5 * max((end - ambient for end in colour_range(values)), key=abs)
 
 
 def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"]:

@@ -13,13 +13,13 @@ import torch
 from nerif.report.figures import (
     DIVERGING,
     add_colour_bar,
+    colour_range,
     draw_displacement,
     draw_history,
     draw_residuals,
     draw_slice,
     draw_slice_scores,
     draw_view_scores,
-    finite_range,
     label_of,
     shown,
 )
@@ -123,7 +123,7 @@ def slices(volume: Volume, width: float, diverging: bool = False) -> Figure:
     ratios = [ex, ex, ey]
     tallest = max(ey, ez)
     figure = _page(width, max(0.2, 0.80 * tallest / sum(ratios)) + 0.06)
-    low, high = finite_range(shown(volume))
+    low, high = colour_range(shown(volume))
     if diverging:
         low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
     line = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
@@ -194,7 +194,7 @@ def comparison(excess: Volume, error: Volume, width: float) -> Figure:
     from dataclasses import replace
 
     truth = replace(excess, values=excess.values - error.values)
-    limits = finite_range(shown(truth))
+    limits = colour_range(shown(truth))
     reach = float(error.values.abs().max()) or 1.0
     ex, ey, ez = excess.grid.box.edges
     figure = _page(width, max(0.3, 2.7 * max(ey, ez) / (2 * ex + ey)) + 0.08)

@@ -11,7 +11,7 @@ from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.report.figures import shown
 from nerif.report.result import Result
 
-__all__ = ["Statement", "came_out", "headline", "measured", "number", "trust", "trust_figures"]
+__all__ = ["Statement", "came_out", "headline", "measured", "number", "percent", "trust", "trust_figures"]
 
 LEVELS = ("good", "note", "warning", "bad")
 HELD_OUT_CC = 0.95  # a view that was not seen is predicted this well in all our simulated cases with nine views
@@ -41,6 +41,11 @@ def number(value: float | None, digits: int = 4) -> str:
     mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
     raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"{float(mantissa):g} × 10{raised}"
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent; what is there at all is never called 0."""
+    return "under 0.01%" if 0 < share < 1e-4 else f"{share:.2%}"
 
 
 def measured(result: Result) -> list[tuple[str, str]]:
@@ -89,7 +94,7 @@ def came_out(result: Result) -> list[tuple[str, str]]:
             rows.append((name, "masked everywhere"))
             continue
         share = 1 - known.size / values.size
-        masked = f"; {share:.2%} masked" if share else ""
+        masked = f"; {percent(share)} masked" if share else ""
         digits = 4 if quantity == "temperature" else 3
         rows.append(
             (name, f"{number(float(known.min()), digits)} to {number(float(known.max()), digits)}{unit}{masked}")
@@ -251,6 +256,8 @@ def _of_masks(result: Result) -> list[Statement]:
         if volume is None or not count:
             continue
         share = count / volume.values.numel()
-        text = f"{quantity.capitalize()} is masked in {count} voxels ({share:.2%}): {volume.notes.get('masked_where')}."
+        voxels = "voxel" if count == 1 else "voxels"
+        where = volume.notes.get("masked_where")
+        text = f"{quantity.capitalize()} is masked in {count} {voxels} ({percent(share)}): {where}."
         found.append(Statement("note" if share < 0.05 else "warning", text))
     return found

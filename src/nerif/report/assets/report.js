@@ -26,6 +26,18 @@ function quantityOf(relation, x) {
   return q;
 }
 
+// between the lowest and the highest thousandth of the voxels: a few outliers must not take all the colours
+function limits(values, low, high) {
+  const bins = new Uint32Array(4096), scale = 4095 / (high - low || 1);
+  let known = 0;
+  for (let i = 0; i < values.length; i++) if (!Number.isNaN(values[i])) { bins[Math.floor((values[i] - low) * scale)]++; known++; }
+  const edge = known / 1000;
+  let first = 0, last = 4095;
+  for (let sum = bins[0]; sum < edge && first < 4095; sum += bins[++first]);
+  for (let sum = bins[4095]; sum < edge && last > 0; sum += bins[--last]);
+  return [low + first / scale, low + (last + 1) / scale];
+}
+
 function superscript(n) { return String(n).replace(/[-0-9]/g, (c) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)]); }
 
 async function main() {
@@ -41,10 +53,11 @@ async function main() {
   const names = Object.keys(scene.arrays);
   const unpacked = await Promise.all(names.map((name) => unpack(name, scene.arrays[name], count)));
   const arrays = Object.fromEntries(names.map((name, i) => [name, unpacked[i]]));
-  const chosen = { quantity: Object.keys(scene.quantities)[0], variant: "value" };
+  const switches = { quantity: Object.keys(scene.quantities)[0], variant: "value" };
   const cache = {};
 
-  function display() {
+  function display(wanted) {
+    const chosen = wanted || switches;
     const key = chosen.quantity + " " + chosen.variant;
     if (cache[key]) return cache[key];
     const q = scene.quantities[chosen.quantity], r = q.relation, v = arrays.value, e = arrays.error;
@@ -59,15 +72,21 @@ async function main() {
     let low = Infinity, high = -Infinity;
     for (let i = 0; i < count; i++) { if (values[i] < low) low = values[i]; if (values[i] > high) high = values[i]; }
     if (!(low <= high)) { low = 0; high = 1; }
+    const lowest = low, highest = high;
+    const robust = limits(values, low, high);
+    if (high - low > 1.25 * (robust[1] - robust[0]) && robust[1] > robust[0]) [low, high] = robust;
     const spread = chosen.variant === "std" || chosen.variant === "error";
     let colours = q.colours, ambient = quantityOf(r, 0), level = q.level;
     if (chosen.variant === "error") { high = Math.max(-low, high); low = -high; colours = scene.diverging; }
     if (chosen.variant === "std") { low = 0; colours = "cividis"; }
-    if (chosen.variant === "value" || chosen.variant === "mean" || chosen.variant === "truth") { low = Math.min(low, q.range[0]); high = Math.max(high, q.range[1]); }
+    if (chosen.variant === "value" || chosen.variant === "mean" || chosen.variant === "truth") {
+      // the same colours for all three, so that they can be compared
+      if (chosen.variant !== "value") ({ low, high } = display({ quantity: chosen.quantity, variant: "value" }));
+    }
     if (spread) { ambient = 0; level = high / 2; }
     if (high === low) high = low + (Math.abs(low) || 1);
     const what = { std: "standard deviation of ", mean: "mean of ", truth: "true ", error: "error of " }[chosen.variant] || "";
-    cache[key] = { values, low, high, ambient, level, table: scene.tables[colours], label: what + q.label, unit: q.unit };
+    cache[key] = { values, low, high, lowest, highest, ambient, level, table: scene.tables[colours], label: what + q.label, unit: q.unit };
     return cache[key];
   }
 
@@ -92,6 +111,8 @@ async function main() {
     c.putImageData(data, 0, 0);
     const e = exponentOf(shown), unit = [e ? "10" + superscript(e) : "", shown.unit].filter(Boolean).join(" ");
     document.getElementById("bar-label").textContent = shown.label + (unit ? " [" + unit + "]" : " [1]");
+    const beyond = shown.lowest < shown.low || shown.highest > shown.high;
+    document.getElementById("bar-note").textContent = beyond ? "Colours end where a thousandth of the voxels is left; values go from " + say(shown.lowest, shown) + " to " + say(shown.highest, shown) + "." : "";
     const ticks = document.getElementById("bar-ticks");
     ticks.textContent = "";
     for (const t of ticksBetween(shown.low / 10 ** e, shown.high / 10 ** e, 5)) {
@@ -132,7 +153,7 @@ async function main() {
 
   for (const name of ["quantity", "variant"])
     for (const input of document.querySelectorAll("input[name=" + name + "]"))
-      input.addEventListener("change", () => { chosen[name] = input.value; update(); });
+      input.addEventListener("change", () => { switches[name] = input.value; update(); });
   update();
 
   try {

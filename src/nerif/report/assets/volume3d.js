@@ -64,7 +64,7 @@ void main() {
     }
     if (volume) {
       float strength = abs(value - ambient) / scale;
-      float alpha = 1.0 - exp(-opacity * 60.0 * strength * strength * h / whole);
+      float alpha = 1.0 - exp(-opacity * 110.0 * pow(strength, 1.6) * h / whole);
       sum.rgb += (1.0 - sum.a) * alpha * tableAt(value);
       sum.a += (1.0 - sum.a) * alpha;
     }
@@ -135,12 +135,14 @@ function makeSpace(scene, canvas) {
     sprite.renderOrder = 2;
     return sprite;
   }
-  // names of the axes at the lower edges of the box
+  // names of the axes at the lower edges of the box; from afar they would only hide it
+  const names = new THREE.Group();
+  world.add(names);
   const off = 0.06 * reach;
   for (const [name, at] of [["x", [middle.x, lower.y - off, lower.z - off]], ["y", [upper.x + off, middle.y, lower.z - off]], ["z", [lower.x - off, lower.y - off, middle.z]]])
-    world.add(label(name + " [mm]", at, 0.022, "#16202b"));
+    names.add(label(name + " [mm]", at, 0.022, "#16202b"));
   for (const [at, text] of [[[lower.x, lower.y - off, lower.z - off], lower.x], [[upper.x, lower.y - off, lower.z - off], upper.x], [[upper.x + off, lower.y, lower.z - off], lower.y], [[upper.x + off, upper.y, lower.z - off], upper.y], [[lower.x - off, lower.y - off, lower.z], lower.z], [[lower.x - off, lower.y - off, upper.z], upper.z]])
-    world.add(label(plain(text), at, 0.02, "#46535f"));
+    names.add(label(plain(text), at, 0.02, "#46535f"));
 
   const rig = new THREE.Group();
   let rigReach = reach;
@@ -180,6 +182,7 @@ function makeSpace(scene, canvas) {
   function draw() {
     pending = 0; wanted = false;
     uniforms.steps.value = Math.min(240, 40 + 2.2 * Math.max(nx, ny, nz)) / (coarse && slow > 25 ? 2 : 1);
+    names.visible = eye.position.distanceTo(middle) < 9 * reach;
     eye.updateMatrixWorld();
     uniforms.toClip.value.multiplyMatrices(eye.projectionMatrix, eye.matrixWorldInverse);
     const start = performance.now();
@@ -218,8 +221,8 @@ function makeSpace(scene, canvas) {
     moving();
   }
   const oblique = [0.62, -1, 0.42];
-  const near = () => (1.1 * reach) / (2 * Math.tan((eye.fov * Math.PI) / 360)) / Math.min(1, eye.aspect);
-  const far = () => (2.05 * rigReach) / (2 * Math.tan((eye.fov * Math.PI) / 360)) / Math.min(1, eye.aspect);
+  const near = () => (1.2 * reach) / (2 * Math.tan((eye.fov * Math.PI) / 360)) / Math.min(1, eye.aspect);
+  const far = () => (1.6 * rigReach) / (2 * Math.tan((eye.fov * Math.PI) / 360)) / Math.min(1, eye.aspect);
   canvas.addEventListener("keydown", (event) => {
     const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     const zoom = { "+": 0.9, "=": 0.9, "-": 1 / 0.9 }[event.key];
