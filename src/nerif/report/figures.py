@@ -135,7 +135,7 @@ def add_colour_bar(axes: Sequence[Axes], label: str) -> Axes:
     form.set_powerlimits((-3, 4))
     figure = axes[0].figure
     low, high = axes[-1].images[-1].get_clim()
-    drawn = np.concatenate([np.ma.masked_invalid(a.images[-1].get_array()).compressed() for a in axes])
+    drawn = np.concatenate([np.ma.masked_invalid(np.ma.asarray(a.images[-1].get_array())).compressed() for a in axes])
     beyond = (bool((drawn < low).any()), bool((drawn > high).any()))
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
     bar = figure.colorbar(axes[-1].images[-1], ax=list(axes), format=form, shrink=0.9, pad=0.02, extend=extend)
