@@ -44,33 +44,6 @@ def test_round_trip(volumes, tmp_path, ending):
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_vti_has_x_fastest_and_starts_at_the_first_voxel_centre(volumes, tmp_path):
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
-
-    export(tmp_path / "v.vti", volumes)
-    reader = vtkXMLImageDataReader()
-    reader.SetFileName(str(tmp_path / "v.vti"))
-    reader.Update()
-    image = reader.GetOutput()
-    assert image.GetDimensions() == (4, 3, 5)
-    assert image.GetOrigin() == pytest.approx((-0.5, 3.0, -2.0))
-    assert image.GetSpacing() == pytest.approx((1.0, 2.0, 2.0))
-    flat = vtk_to_numpy(image.GetPointData().GetArray("index_excess"))
-    np.testing.assert_array_equal(flat, VALUES.numpy().ravel())
-    point = image.FindPoint(1.5, 5.0, 4.0)  # voxel x 2, y 1, z 3
-    assert image.GetPointData().GetArray("index_excess").GetValue(point) == pytest.approx(float(VALUES[3, 1, 2]))
-
-
-def test_netcdf_states_coordinates_and_units(volumes, tmp_path):
-    write_netcdf(tmp_path / "v.nc", volumes)
-    with xr.open_dataset(tmp_path / "v.nc") as dataset:
-        assert dataset["density"].dims == ("z", "y", "x")
-        assert dataset["density"].attrs["units"] == "kg m-3"
-        assert dataset["x"].attrs["units"] == "mm"
-        assert dataset["z"].values.tolist() == [-2, 0, 2, 4, 6]
-
-
 def test_csv(volumes, tmp_path):
     export(tmp_path / "v.csv", volumes)
     with (tmp_path / "v.csv").open() as file:

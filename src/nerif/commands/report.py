@@ -44,7 +44,8 @@ def write_report(directory: Path, out: Path | None = None) -> Path:
     html.write(result, out)
     for sentence in result.missing:
         say(f"missing: {sentence}")
-    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB; open it in a browser")
+    size = out.stat().st_size
+    say(f"{out}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")
     return out
 
 

@@ -48,8 +48,6 @@ def run_toml(settings: Reconstruct, about: dict[str, Any] | None = None) -> str:
 
 def write_result(settings: Reconstruct, measurement: Measurement, result: Reconstruction) -> None:
     """Write the result directory; the field first, it is the costliest."""
-    import torch
-
     out = settings.out
     write_field(out, result)
     if result.state is not None:
@@ -70,13 +68,7 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
             "message": result.outcome.message,
         },
     )
-    finished = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    about = {
-        "finished": finished,
-        "torch": torch.__version__,
-        "outcome": result.outcome.reason,
-        "seconds": round(result.seconds, 3),
-    }
+    about = {**_versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
     (out / RUN).write_text(run_toml(settings, about))
     write_volumes(out, all_quantities(settings, result))
     for group, held in (("training view", False), ("held-out view", True)):
@@ -89,6 +81,22 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
             plural = "s" if len(chosen) > 1 else ""
             say(f"{len(chosen)} {group}{plural}: CC at least {cc:.4f}, rms error at most {rms:.4f} px{beside}")
     say(f"{out}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView")
+
+
+def _versions() -> dict[str, str]:
+    """When and with what it was done."""
+    import platform
+
+    import numpy as np
+    import torch
+
+    return {
+        "finished": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "machine": f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads",
+    }
 
 
 def all_quantities(settings: Reconstruct, result: Reconstruction) -> list[Volume]:

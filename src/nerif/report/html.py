@@ -165,15 +165,16 @@ def _variants(sources: dict[str, Volume]) -> dict[str, str]:
 
 def _cameras(result: Result) -> list[dict[str, Any]]:
     """Centre, directions of the picture's corners and where they meet the background, of every camera; mm."""
-    if result.reprojection is None:
+    if result.measurement is None:
         return []
+    held_out = () if result.reprojection is None else result.reprojection.held_out
     found = []
-    for camera in result.reprojection.measurement.cameras:
+    for camera in result.measurement.cameras:
         directions, hits = picture_corners(camera)
         found.append(
             {
                 "name": camera.name,
-                "held_out": camera.name in result.reprojection.held_out,
+                "held_out": camera.name in held_out,
                 "centre": camera.centre.tolist(),
                 "directions": np.round(directions, 6).tolist(),
                 "background": np.round(hits, 3).tolist(),

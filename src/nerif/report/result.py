@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from nerif.conventions import InputError
+from nerif.measurement import Measurement
+from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reprojection import REPROJECTION, Reprojection
 from nerif.volume import Volume, read_volume, read_volumes
 
@@ -35,6 +37,7 @@ class Result:
     history : records of history.csv, blanks as NaN
     volumes : by quantity; with an ensemble also index_excess_mean, index_excess_std, ...
     reprojection : measured and predicted views, or None
+    measurement : what was measured, or None
     truth : index excess it was compared with, or None
     missing : one sentence for each thing that is not there or cannot be read, with the remedy
     """
@@ -46,6 +49,7 @@ class Result:
     history: list[dict[str, float]] = field(default_factory=list)
     volumes: dict[str, Volume] = field(default_factory=dict)
     reprojection: Reprojection | None = None
+    measurement: Measurement | None = None
     truth: Volume | None = None
     missing: tuple[str, ...] = ()
 
@@ -55,14 +59,6 @@ class Result:
         names = {"nerif": "NeRIF", "tikhonov": "Tikhonov", "landweber": "Landweber", "tv": "total variation"}
         method = str(self.settings.get("method", "unknown method"))
         return names.get(method, method)
-
-    @property
-    def n_ambient(self) -> float | None:
-        """Refractive index that the excess is counted from."""
-        for volume in self.volumes.values():
-            if "n_ambient" in volume.attributes:
-                return float(volume.attributes["n_ambient"])
-        return None if self.reprojection is None else self.reprojection.measurement.n_ambient
 
 
 def read_result(directory: Path) -> Result:
@@ -75,17 +71,22 @@ def read_result(directory: Path) -> Result:
     """
     if not directory.is_dir():
         raise InputError(f"{directory}: no such directory; expected one written by nerif reconstruct")
-    known = (RUN, METRICS, HISTORY, VOLUME, REPROJECTION, "field.safetensors", "checkpoint.safetensors")
+    known = (RUN, METRICS, HISTORY, VOLUME, REPROJECTION, FIELD, CHECKPOINT)
     if not any((directory / name).exists() for name in known):
         raise InputError(
             f"{directory}: expected a result of nerif reconstruct, got none of {', '.join(known[:5])} in it"
         )
+    finished = (directory / FIELD).is_file()
     missing: list[str] = []
+    not_yet: list[str] = []
 
     def attempt(name: str, read: Callable[[Path], T], default: T, without: str) -> T:
         path = directory / name
         if not path.is_file():
-            missing.append(f"{name} is not there: {without}")
+            if finished:
+                missing.append(f"{name} is not there: {without}")
+            else:
+                not_yet.append(name)
             return default
         try:
             return read(path)
@@ -108,11 +109,11 @@ def read_result(directory: Path) -> Result:
     views = attempt(
         REPROJECTION, Reprojection.read, None, "the views cannot be shown; nerif evaluate --measurement FILE"
     )
-    if not (directory / "field.safetensors").is_file():
-        go_on = (
-            "nerif reconstruct --resume -o" if (directory / "checkpoint.safetensors").is_file() else "start it again:"
-        )
-        missing.insert(0, f"The run has not ended: there is no field.safetensors. Go on with {go_on} {directory}")
+    if not finished:
+        resume = (directory / CHECKPOINT).is_file()
+        go_on = f"Go on with nerif reconstruct --resume -o {directory}" if resume else "Start it again"
+        rest = f" Not there yet: {', '.join(not_yet)}." if not_yet else ""
+        missing.insert(0, f"The run has not ended: there is no {FIELD}. {go_on}.{rest}")
     return Result(
         directory=directory,
         settings={k: v for k, v in run.items() if k != "about"},
@@ -121,9 +122,18 @@ def read_result(directory: Path) -> Result:
         history=history,
         volumes=volumes,
         reprojection=views,
+        measurement=_measurement(run) if views is None else views.measurement,
         truth=_truth(metrics, missing),
         missing=tuple(missing),
     )
+
+
+def _measurement(run: dict[str, Any]) -> Measurement | None:
+    """The measurement of the run, if it is still where it was."""
+    try:
+        return Measurement.read(str(run["measurement"]))
+    except (InputError, KeyError):
+        return None
 
 
 def _truth(metrics: dict[str, Any], missing: list[str]) -> Volume | None:

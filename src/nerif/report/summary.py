@@ -50,12 +50,13 @@ def percent(share: float) -> str:
 
 def measured(result: Result) -> list[tuple[str, str]]:
     """Return what was measured, as names and values with units."""
-    if result.reprojection is None:
+    m = result.measurement
+    if m is None:
         return [("Measurement", str(result.settings.get("measurement", "unknown")))]
-    m = result.reprojection.measurement
     sizes = sorted({c.image_size for c in m.cameras})
     size = " and ".join(f"{w} × {h}" for h, w in sizes[:3])
-    held = f", of which {len(result.reprojection.held_out)} held out" if result.reprojection.held_out else ""
+    names = result.settings.get("hold_out", ()) if result.reprojection is None else result.reprojection.held_out
+    held = f", of which {len(names)} held out" if names else ""
     usable = m.usable
     d = m.displacement[usable]
     rows = [
@@ -129,7 +130,7 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
     rows = []
     for name, views in (("Held-out view" + ("s" if len(held) > 1 else ""), held), ("Training views", seen)):
         if not views:
-            rows.append((name, "none"))
+            rows.append((name, "none" if seen else "not known"))
             continue
         rms = _largest(views, "rms_px")
         noise = _largest(views, "rms_over_sigma")

@@ -274,6 +274,5 @@ function makeSpace(scene, canvas) {
     },
     look: { flow: () => look(oblique, near()), rig: () => look([0.5, -1, 0.75], far()), top: () => look([0, -0.001, 1], near()), front: () => look([0, -1, 0], near()) },
     picture() { coarse = false; resize(); draw(); return canvas.toDataURL("image/png"); },
-    destroy() { renderer.dispose(); },
   };
 }
