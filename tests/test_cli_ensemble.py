@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 import xarray as xr
 
 from nerif.cli import main
+from nerif.fields.grid import VoxelField
+from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction.base import Step
+from nerif.volume import Volume, read_volumes, write_netcdf
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "3", "--steps", "30", "--truth-voxels", "12"]
 QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]
@@ -60,6 +65,57 @@ def test_members_that_are_there_are_not_done_again(measured, tmp_path):
     assert not (out / "ensemble").exists()
 
 
+def test_members_of_other_settings_are_done_again(measured, tmp_path):
+    """Resuming with a view left out, or another weight, must not take members that saw it, or had another weight."""
+    out, fresh = tmp_path / "r", tmp_path / "fresh"
+    arguments = ["reconstruct", str(measured), *QUICK, "--no-report", "--ensemble", "2"]
+    assert main([*arguments, "-o", str(out)]) == 0
+    assert main(["reconstruct", "--resume", "-o", str(out), "--leave-one-out"]) == 0
+    assert main([*arguments, "-o", str(fresh), "--leave-one-out"]) == 0
+    found, expected = (json.loads((d / "metrics.json").read_text())["ensemble"]["left_out"] for d in (out, fresh))
+    assert [v["cc"] for v in found] == pytest.approx([v["cc"] for v in expected], abs=1e-6)
+    assert main(["reconstruct", "--resume", "-o", str(out), "--ensemble", "0", "--no-leave-one-out"]) == 0
+    assert "ensemble" not in json.loads((out / "metrics.json").read_text())  # nor is there one in volume.nc
+
+
+def test_a_member_that_diverged_is_left_out_and_told(measured, tmp_path, capsys, monkeypatch):
+    from nerif.reconstruction.base import Outcome
+    from nerif.reconstruction.tikhonov import Tikhonov
+
+    calls, plain = [], Tikhonov.__call__
+
+    def second_diverges(self, *arguments):
+        calls.append(1)
+        result = plain(self, *arguments)
+        return replace(result, outcome=Outcome("diverged", "of itself")) if len(calls) == 3 else result
+
+    monkeypatch.setattr(Tikhonov, "__call__", second_diverges)
+    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), *QUICK, "--ensemble", "3"]) == 0
+    assert "member 2 diverged" in capsys.readouterr().out
+    ensemble = json.loads((tmp_path / "r/metrics.json").read_text())["ensemble"]
+    assert (ensemble["members"], ensemble["diverged"]) == (2, [2])
+    assert "Members 2 of the ensemble diverged" in (tmp_path / "r/report.html").read_text()
+
+
+def test_coverage_counts_the_voxels_of_the_truth(measured, tmp_path):
+    """A truth of half the box is compared within it, not beyond."""
+    out = tmp_path / "r"
+    assert main(["reconstruct", str(measured), "-o", str(out), *QUICK, "--ensemble", "3", "--no-report"]) == 0
+    found = read_volumes(out / "volume.nc")
+    half = Grid(Box((-25.0, -25.0, 0.0), (25.0, 25.0, 25.0)), (5, 10, 10))
+    mean, std = (
+        VoxelField.through(v.values, v.grid).sample(half)
+        for v in (found["index_excess_mean"], found["index_excess_std"])
+    )
+    shift = torch.full(half.shape, 1.0)
+    shift[:, :, ::2] = 3.0  # standard deviations off: half of the voxels lie within two
+    truth = Volume(mean + shift * std, half, attributes={"n_ambient": 1.00027})
+    write_netcdf(tmp_path / "t.nc", [truth])
+    assert main(["evaluate", str(out), "--truth", str(tmp_path / "t.nc")]) == 0
+    coverage = json.loads((out / "metrics.json").read_text())["coverage"]
+    assert coverage["share"] == pytest.approx(0.5, abs=0.02)
+
+
 def test_interrupted_in_the_second_member(measured, tmp_path, capsys, monkeypatch):
     """Ctrl-C in a member keeps the main result and the members before it; --resume ends as if nothing had been."""
     from nerif.commands import members
@@ -96,8 +152,6 @@ def test_interrupted_in_the_second_member(measured, tmp_path, capsys, monkeypatc
 
 
 def test_without_sigma_the_residual_takes_its_place(measured, tmp_path, capsys):
-    from dataclasses import replace
-
     replace(Measurement.read(measured), sigma=None).write(tmp_path / "m.nc")
     arguments = [str(tmp_path / "m.nc"), "-o", str(tmp_path / "r"), *QUICK, "--regularisation", "0.1"]
     assert main(["reconstruct", *arguments, "--ensemble", "2"]) == 0
@@ -106,7 +160,12 @@ def test_without_sigma_the_residual_takes_its_place(measured, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("more", "words"), [(["--ensemble", "1"], "2 members or more"), (["--leave-one-out"], "together with --ensemble")]
+    ("more", "words"),
+    [
+        (["--ensemble", "1"], "2 members or more"),
+        (["--leave-one-out"], "together with --ensemble"),
+        (["--ensemble", "2", "--leave-one-out", "--hold-out", "0deg", "85deg"], "two training views"),
+    ],
 )
 def test_refusals(measured, tmp_path, capsys, more, words):
     assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), *QUICK, *more]) == 2

@@ -73,6 +73,16 @@ def test_a_volume_from_elsewhere(tmp_path):
     np.testing.assert_array_equal(volume.values.numpy(), values.transpose(2, 1, 0))
 
 
+def test_a_part_cut_out_by_xarray_keeps_its_place(volumes, tmp_path):
+    write_netcdf(tmp_path / "v.nc", volumes)
+    with xr.open_dataset(tmp_path / "v.nc") as whole:
+        whole.isel(z=slice(1, 4)).to_netcdf(tmp_path / "part.nc", engine="h5netcdf")
+    part = read_volume(tmp_path / "part.nc")
+    assert part.grid.box.lower == pytest.approx((-1, 2, -1))
+    assert part.grid.box.upper == pytest.approx((3, 8, 5))
+    assert torch.equal(part.values, VALUES[1:4])
+
+
 def test_refusals(volumes, tmp_path):
     spoilt = Volume(torch.where(VALUES > 3e-5, torch.nan, VALUES), GRID)
     write_netcdf(tmp_path / "nan.nc", [spoilt])

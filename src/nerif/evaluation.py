@@ -26,7 +26,7 @@ from nerif.volume import Volume
 VOXEL_STEP = 0.25  # voxels between samples
 REPROJECTION_SAMPLES = 128  # a ray; 0.1 % of the rms displacement on the flame
 
-__all__ = ["evaluate_views", "evaluate_volume", "predict_view", "reproject", "update_json"]
+__all__ = ["evaluate_views", "evaluate_volume", "predict_view", "reproject", "update_json", "write_json"]
 
 
 def predict_view(
@@ -73,12 +73,11 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     Where sigma is known, rms_over_sigma tells whether the residual is the noise (1) or more.
     """
     measurement = reprojection.measurement
-    usable = measurement.usable
+    compared = measurement.usable & measurement.sees_box
     views = []
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
-        crosses = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).crosses.reshape(height, width)
-        mask = usable[i, :height, :width] & crosses
+        mask = compared[i, :height, :width]
         predicted = reprojection.predicted[i, :height, :width]
         measured = measurement.displacement[i, :height, :width].nan_to_num(0.0, 0.0, 0.0)
         view: dict[str, Any] = {"name": camera.name, "held_out": camera.name in reprojection.held_out}
@@ -107,10 +106,15 @@ def update_json(path: Path, entries: dict[str, Any]) -> dict[str, Any]:
     except ValueError:
         raise InputError(f"{path}: not a JSON file, or truncated; remove it and evaluate again") from None
     known |= entries
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(_plain(known), indent=2, allow_nan=False) + "\n")
-    os.replace(temporary, path)
+    write_json(path, known)
     return known
+
+
+def write_json(path: Path, entries: dict[str, Any]) -> None:
+    """Write a JSON file, atomically; NaN and infinity as null."""
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
+    os.replace(temporary, path)
 
 
 def _plain(value: Any) -> Any:

@@ -150,6 +150,16 @@ class Measurement:
         return mask
 
     @property
+    def sees_box(self) -> Bool[Tensor, "view row column"]:
+        """Pixels whose rays cross the box."""
+        mask = torch.zeros(self.displacement.shape[:3], dtype=torch.bool)
+        for i, camera in enumerate(self.cameras):
+            height, width = camera.image_size
+            crosses = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(self.box).crosses
+            mask[i, :height, :width] = crosses.reshape(height, width)
+        return mask
+
+    @property
     def bad_pixels(self) -> int:
         """Pixels called valid whose displacement is NaN or infinite: masked, but worth a line."""
         called = self._inside if self.valid is None else self._inside & self.valid

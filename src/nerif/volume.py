@@ -183,12 +183,16 @@ def _read_netcdf(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float |
     lower, upper = [], []
     for axis in "xyz":
         centres = dataset[axis].values.astype(np.float64)
-        given = dataset.attrs.get("box_lower_mm"), dataset.attrs.get("box_upper_mm")
-        if given[0] is not None and given[1] is not None:
-            lower.append(float(given[0]["xyz".index(axis)]))
-            upper.append(float(given[1]["xyz".index(axis)]))
-            continue
         steps = np.diff(centres)
+        corners = [dataset.attrs[name] for name in ("box_lower_mm", "box_upper_mm") if name in dataset.attrs]
+        if len(corners) == 2:
+            ends = [float(corner["xyz".index(axis)]) for corner in corners]
+            edge = (ends[1] - ends[0]) / len(centres)
+            # a part cut out of the volume has the whole's attributes, but not its coordinates
+            if np.allclose(centres, ends[0] + (np.arange(len(centres)) + 0.5) * edge, rtol=0, atol=1e-3 * edge):
+                lower.append(ends[0])
+                upper.append(ends[1])
+                continue
         if len(steps) == 0 or not np.allclose(steps, steps.mean(), rtol=1e-3) or steps.mean() <= 0:
             raise InputError(f"{path}: expected equally spaced, rising voxel centres along {axis} (mm)")
         lower.append(float(centres[0] - steps.mean() / 2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from nerif.geometry import Box, Grid
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
 from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, style
-from nerif.report.result import read_result
+from nerif.report.result import Result, read_result
 from nerif.volume import Volume
 
 
@@ -98,6 +100,34 @@ def test_the_isosurface_stands_where_the_ball_is(volume):
     assert points.mean(axis=0) == pytest.approx([1, 0, 0], abs=0.15)
     radius = np.linalg.norm(points - [1, 0, 0], axis=1)
     assert radius.mean() == pytest.approx(2 * np.sqrt(np.log(2)), rel=0.05)
+
+
+def test_masked_voxels_have_no_surface_of_their_own(volume):
+    level = default_level(volume)
+    whole = surface_triangles(volume, level)
+    holed = volume.values.clone()
+    holed[5:7, 7:9, 10:12] = torch.nan  # inside the ball
+    masked = surface_triangles(Volume(holed, volume.grid), level)
+    assert len(masked) == len(whole)
+
+
+def test_names_of_views_become_names_of_files(whole):
+    result = read_result(whole)
+    assert result.reprojection is not None
+    m = result.reprojection.measurement
+    odd = ("a/b", "a b", "a$x_$", "é<")
+    cameras = tuple(replace(c, name=name) for c, name in zip(m.cameras, odd, strict=True))
+    views = [{"name": name, "held_out": False, "cc": 0.9, "rms_px": 0.1} for name in odd]
+    renamed = Result(
+        whole,
+        metrics={"views": views},
+        reprojection=replace(result.reprojection, measurement=replace(m, cameras=cameras)),
+    )
+    names = []
+    for name, figure in figures_of(renamed, 90, 190):
+        FigureCanvasAgg(figure).draw()
+        names.append(name)
+    assert names[:4] == ["view_a_b", "view_a_b_1", "view_a_x__", "view_é_"]
 
 
 def test_a_flat_volume_has_no_surface_and_no_error():

@@ -12,12 +12,15 @@ import torch
 
 from nerif.cli import main
 from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import html, packing
+from nerif.report.pages import residuals_over_sigma
 from nerif.report.result import Result, read_result
 from nerif.report.summary import headline, number, trust
-from nerif.report.view_images import view_images
+from nerif.report.view_images import _shrink, view_images
+from nerif.reprojection import Reprojection
 from nerif.volume import Volume
 
 PARTS = ("run.toml", "metrics.json", "history.csv", "volume.nc", "reprojection.nc")
@@ -134,7 +137,8 @@ def test_a_broken_result_gives_a_page_that_says_what_is_missing(copy, capsys, na
     assert name in capsys.readouterr().out
     page = (copy / "report.html").read_text()
     assert name in page
-    assert "Not to be relied on" in page or name == "history.csv"
+    level = headline(trust(read_result(copy))).level
+    assert level == "bad" or name not in ("metrics.json", "volume.nc")
 
 
 def test_a_run_that_was_killed(copy, capsys):
@@ -176,24 +180,112 @@ def view(held_out: bool, cc: float, noise: float | None) -> dict:
 @pytest.mark.parametrize(
     ("metrics", "level", "words"),
     [
-        ({"views": [view(False, 0.99, 1.0), view(True, 0.98, 1.1)]}, "good", "has not seen"),
+        ({"views": [view(False, 0.99, 1.0), view(True, 0.98, 1.1)]}, "good", "has not been seen"),
         ({"views": [view(False, 0.99, 1.0)]}, "warning", "--hold-out"),
         ({"views": [view(False, 0.99, None), view(True, 0.98, None)]}, "note", "noise of the measurement is not known"),
         ({"views": [view(False, 0.99, 1.0), view(True, 0.9, 1.1)]}, "warning", "poorly"),
         ({"views": [view(False, 0.99, 1.0), view(True, 0.5, 1.1)]}, "bad", "poorly"),
         ({"views": [view(False, 0.99, 1.0), view(True, 0.99, 2.5)]}, "warning", "2.5 times the noise"),
         ({"views": [view(False, 0.99, 0.4), view(True, 0.99, 1.0)]}, "warning", "follows noise"),
-        ({"views": [view(False, 0.99, 2.0), view(True, 0.99, 1.0)]}, "warning", "does not explain"),
-        ({"views": [view(False, 0.99, 5.0), view(True, 0.99, 1.0)]}, "bad", "does not explain"),
+        ({"views": [view(False, 0.99, 2.0), view(True, 0.99, 1.0)]}, "warning", "not explained"),
+        ({"views": [view(False, 0.99, 5.0), view(True, 0.99, 1.0)]}, "bad", "not explained"),
+        ({"views": [view(False, 0.99, 0.6), view(False, 0.3, 12.0), view(True, 0.99, 1.0)]}, "bad", "12.0 times"),
+        ({"views": [view(False, 0.99, 0.6), view(False, 0.3, 2.0), view(True, 0.99, 1.0)]}, "warning", "follows noise"),
+        ({"views": [view(True, 0.1, 30.0)]}, "bad", "poorly"),
+        ({}, "warning", "not compared with any view"),
+        ({"views": [view(False, 0.99, 1.0), view(True, 0.99, 1.0)], "cc": 0.5, "l2_variation": 0.9}, "bad", "90.0%"),
+        ({"views": [view(False, 0.99, 1.0)], "ensemble": {"members": 3, "diverged": [2]}}, "warning", "Members 2"),
         ({"outcome": "diverged", "message": "loss is NaN"}, "bad", "loss is NaN"),
         ({"outcome": "interrupted"}, "warning", "--resume"),
-        ({"outcome": "time_limit"}, "note", "time limit"),
+        ({"outcome": "time_limit", "views": [view(False, 0.99, 1.0), view(True, 0.98, 1.1)]}, "note", "time limit"),
     ],
 )
 def test_what_is_said_of_trust(tmp_path, metrics, level, words):
     statements = trust(Result(tmp_path, metrics=metrics))
     assert headline(statements).level == level
     assert any(s.level == level and words in s.text for s in statements)
+
+
+def test_what_cannot_be_shown_does_not_condemn(copy):
+    metrics = json.loads((copy / "metrics.json").read_text())
+    good = [view(False, 0.99, 1.0), view(True, 0.99, 1.0)]
+    metrics |= {"views": good, "truth": "/nowhere/truth.nc", "outcome": "epochs", "cc": 0.999, "l2_variation": 0.01}
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    (copy / "history.csv").unlink()
+    result = read_result(copy)
+    assert {gap.what for gap in result.missing} == {"history.csv", "truth"}
+    assert result.truth is None
+    statements = [s for s in trust(result) if "masked" not in s.text]
+    assert headline(statements).level == "note"
+
+
+def test_a_truth_that_moved_with_the_result_is_found(copy):
+    (copy / "t.nc").write_bytes((copy / "volume.nc").read_bytes())
+    metrics = json.loads((copy / "metrics.json").read_text()) | {"truth": "/nowhere/t.nc"}
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    assert read_result(copy).truth is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("metrics.json", '{"views": [1]}', "views"),
+        ("metrics.json", '{"ensemble": 2}', "ensemble"),
+        ("metrics.json", '{"coverage": {}}', "coverage"),
+        ("metrics.json", "[]", "table"),
+        ("history.csv", "a,b\n1,2\n", "seconds"),
+    ],
+)
+def test_tables_of_another_kind_are_refused_not_drawn(copy, name, text, words):
+    (copy / name).write_text(text)
+    (gap,) = [gap for gap in read_result(copy).missing if gap.what == name]
+    assert words in gap.sentence
+    assert main(["report", str(copy)]) == 0
+
+
+def scene_of(page: Path) -> str:
+    """The JSON that the page draws from."""
+    match = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page.read_text())
+    assert match is not None
+    return match[1]
+
+
+def test_the_gas_is_doubted_in_a_liquid(tmp_path):
+    grid = Grid(Box.cube(4.0), (4, 5, 6))
+    water = Volume(torch.zeros(grid.shape), grid, attributes={"n_ambient": 1.333})
+    found = {q: derive(water, q, GasSettings()) for q in ("n", "density", "temperature")}
+    statements = trust(Result(tmp_path, volumes={"index_excess": water, **found}))
+    assert any("do not apply here" in s.text and s.level == "warning" for s in statements)
+    html.write(Result(tmp_path, volumes={"index_excess": water, **found}), tmp_path / "r.html")
+    assert "NaN" not in scene_of(tmp_path / "r.html")
+
+
+def test_residuals_are_those_of_every_ray_through_the_box(measurement):
+    """Also where the field is exactly 0, as outside a visual hull."""
+    nothing = Reprojection(measurement, torch.zeros_like(measurement.displacement))
+    found = residuals_over_sigma(nothing)
+    seen = measurement.usable & measurement.sees_box
+    assert found.size == 2 * int(seen.sum())
+    scores = evaluate_views(nothing)
+    pixels = [int(seen[i].sum()) for i in range(len(scores))]
+    rms = np.sqrt(sum(n * v["rms_over_sigma"] ** 2 for n, v in zip(pixels, scores, strict=True)) / sum(pixels))
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(rms, rel=1e-5)
+
+
+def test_pictures_of_narrow_and_large_views():
+    """Shrunk along each edge by itself."""
+    assert _shrink(np.ones((2, 900)), (1, 3)).shape == (2, 300)
+    image = np.arange(24.0).reshape(4, 6)
+    np.testing.assert_array_equal(_shrink(image, (2, 3)), [[4, 7], [16, 19]])
+    image[0, 0] = np.nan
+    assert np.isnan(_shrink(image, (2, 3))).tolist() == [[True, False], [False, False]]
+
+
+def test_evaluating_again_keeps_what_was_held_out(copy):
+    measurement = json.loads((copy / "metrics.json").read_text())["measurement"]
+    assert main(["evaluate", str(copy), "--measurement", measurement]) == 0
+    views = json.loads((copy / "metrics.json").read_text())["views"]
+    assert [v["name"] for v in views if v["held_out"]] == ["170deg"]
 
 
 def test_masked_voxels_are_told(tmp_path):
@@ -206,7 +298,14 @@ def test_masked_voxels_are_told(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
-    [(2.75123e-4, 3, "2.75 × 10⁻⁴"), (0.0, 3, "0"), (296.94, 4, "296.9"), (None, 3, "–"), (float("nan"), 3, "–")],
+    [
+        (2.75123e-4, 3, "2.75 × 10⁻⁴"),
+        (1454.2, 3, "1450"),
+        (0.0, 3, "0"),
+        (296.94, 4, "296.9"),
+        (None, 3, "–"),
+        (float("nan"), 3, "–"),
+    ],
 )
 def test_numbers_for_people(value, digits, text):
     assert number(value, digits) == text

@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from torch import Tensor
 
 from nerif.commands.output import say
-from nerif.commands.settings import parse
+from nerif.commands.settings import parse, read_toml
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject, update_json
 from nerif.fields.grid import VoxelField
 from nerif.measurement import Measurement
 from nerif.reconstruction.files import read_field
-from nerif.report.result import VOLUME
+from nerif.report.result import RUN, VOLUME
 from nerif.reprojection import REPROJECTION
 from nerif.volume import Volume, read_volume, read_volumes
 
@@ -34,8 +35,8 @@ class Evaluate:
     """Volume file (.nc, .vti) of the true index; compared on its own grid."""
     measurement: Path | None = None
     """Measurement to re-project into."""
-    hold_out: tuple[str, ...] = ()
-    """Views of that measurement which the reconstruction has not seen."""
+    hold_out: tuple[str, ...] | None = None
+    """Views of that measurement which the reconstruction has not seen; default: those that run.toml held out."""
 
 
 def run(settings: Evaluate) -> dict[str, Any]:
@@ -71,11 +72,9 @@ def run(settings: Evaluate) -> dict[str, Any]:
             say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
     if settings.measurement is not None:
         measurement = Measurement.read(settings.measurement)
-        unknown = [name for name in settings.hold_out if name not in measurement.names]
-        if unknown:
-            raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{unknown[0]}'")
-        reprojection = reproject(field, measurement, settings.hold_out)
+        reprojection = reproject(field, measurement, _held_out(settings, measurement))
         reprojection.write(settings.result / REPROJECTION)
+        metrics["measurement"] = str(settings.measurement.resolve())
         metrics["views"] = evaluate_views(reprojection)
         say("view                CC    SSIM  PSNR [dB]  rms [px]")
         for v in metrics["views"]:
@@ -85,16 +84,32 @@ def run(settings: Evaluate) -> dict[str, Any]:
     return metrics
 
 
+def _held_out(settings: Evaluate, measurement: Measurement) -> tuple[str, ...]:
+    """Names of the views that the reconstruction has not seen."""
+    if settings.hold_out is None:
+        run = settings.result / RUN
+        held = read_toml(run).get("hold_out", []) if run.is_file() else []
+        return tuple(name for name in held if name in measurement.names)
+    unknown = [name for name in settings.hold_out if name not in measurement.names]
+    if unknown:
+        raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{unknown[0]}'")
+    return settings.hold_out
+
+
 def _coverage(result: Path, truth: Volume) -> dict[str, Any]:
-    """Share of the voxels whose truth lies within two standard deviations of the mean, if there is an ensemble."""
+    """Share of the truth's voxels within two standard deviations of the mean, if there is an ensemble."""
     found = read_volumes(result / VOLUME) if (result / VOLUME).is_file() else {}
     if "index_excess_std" not in found:
         return {}
-    mean, std = found["index_excess_mean"], found["index_excess_std"]
-    same = mean.grid == truth.grid
-    true = truth.values if same else VoxelField.through(truth.values, truth.grid).sample(mean.grid)
-    within = (true - mean.values).abs() <= 2 * std.values
-    flow = true.abs() > FLOW * true.abs().max()
+
+    def on_its_grid(volume: Volume) -> Tensor:
+        if volume.grid == truth.grid:
+            return volume.values
+        return VoxelField.through(volume.values, volume.grid).sample(truth.grid)
+
+    mean, std = (on_its_grid(found[f"index_excess_{s}"]) for s in ("mean", "std"))
+    within = (truth.values - mean).abs() <= 2 * std
+    flow = truth.values.abs() > FLOW * truth.values.abs().max()
     share = {"share": float(within.float().mean()), "share_in_flow": float(within[flow].float().mean())}
     say(f"truth within 2 standard deviations of the ensemble's mean: {share['share']:.1%} of the voxels,")
     say(f"  {share['share_in_flow']:.1%} of those where the excess is above {FLOW:.0%} of its largest")

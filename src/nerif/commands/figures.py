@@ -12,7 +12,7 @@ from nerif.commands.output import say
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
 from nerif.report.pages import JOURNALS, save_figures
-from nerif.report.result import read_result
+from nerif.report.result import FIGURES, read_result
 
 __all__ = ["Figures", "main", "run"]
 
@@ -38,15 +38,15 @@ def run(settings: Figures) -> None:
     if not 20 <= settings.dpi <= 2400:
         raise InputError(f"dpi: expected 20 to 2400 dots per inch, got {settings.dpi}")
     result = read_result(settings.result)
-    out = settings.out or settings.result / "figures"
+    out = settings.out or settings.result / FIGURES
     if out.is_file():
         raise InputError(f"{out}: expected a folder for --out, got a file")
     out.mkdir(parents=True, exist_ok=True)
     paths = save_figures(result, out, settings.journal, settings.dpi)
-    for sentence in result.missing:
-        say(f"left out: {sentence}")
+    for gap in result.missing:
+        say(f"left out: {gap.sentence}")
     if not paths:
-        raise InputError(f"{settings.result}: nothing to draw; {' '.join(result.missing)}")
+        raise InputError(f"{settings.result}: nothing to draw; {' '.join(gap.sentence for gap in result.missing)}")
     say(f"{out}: {len(paths) // 2} figures, each as .pdf and .png")
 
 

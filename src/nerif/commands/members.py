@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -13,38 +16,49 @@ from nerif.commands.output import interruptible, progress_bar, say
 from nerif.commands.result_files import ENSEMBLE, all_quantities, write_volumes
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, reproject, update_json
+from nerif.fields.base import Field
 from nerif.measurement import Measurement
-from nerif.reconstruction.base import Outcome, Reconstruction, compose
+from nerif.reconstruction.base import Outcome, Reconstruction, Reconstructor, compose
 from nerif.reconstruction.ensemble import Ensemble, Spread
 from nerif.reconstruction.files import FIELD, read_field, write_field
 from nerif.report.result import METRICS
 
 __all__ = ["add_ensemble"]
 
+ASKED = "asked.json"
 
-def add_ensemble(settings: Reconstruct, measurement: Measurement, training: Measurement, main: Reconstruction) -> None:
+
+def add_ensemble(
+    settings: Reconstruct, training: Measurement, main: Reconstruction, start: Field | None = None
+) -> None:
     """Reconstruct the members, and write mean and standard deviation of every quantity beside the main result.
 
-    Members that an interrupted run has left are not done again. An interruption leaves those done so far.
+    Members that an interrupted run of the same settings has left are not done again. An interruption leaves those done
+    so far. A member that diverges is left out, and told.
     """
     ensemble = Ensemble(settings.ensemble, settings.leave_one_out)
     noise, source = _noise(training, main)
-    spread, left_out, started = Spread(), [], time.monotonic()
+    spread, left_out, diverged, started = Spread(), [], [], time.monotonic()
     for number in range(1, ensemble.members + 1):
-        result = _member(settings, ensemble, number, training, noise)
-        if result is None:
+        result = _member(settings, ensemble, number, training, noise, start)
+        if result.outcome.reason == "interrupted":
             say(f"ensemble: interrupted after {spread.count} of {ensemble.members} members; --resume goes on")
             break
+        if result.outcome.reason == "diverged":
+            say(f"ensemble: member {number} diverged and is left out: {result.outcome.message}")
+            diverged.append(number)
+            continue
         spread.add(all_quantities(settings, result))
         out = ensemble.left_out(number, training)
         if out:
             left_out += evaluate_views(reproject(result.field, training.select(out), out, result.device))
     if spread.count < 2:
+        say(f"ensemble: {spread.count} members are too few for a standard deviation; none is written")
         return
     write_volumes(settings.out, [*all_quantities(settings, main), *spread.volumes()])
     about: dict[str, Any] = {
-        "members": spread.count, "noise": source, "leave_one_out": ensemble.leave_one_out, "left_out": left_out,
-        "seconds": time.monotonic() - started,
+        "members": spread.count, "diverged": diverged, "noise": source, "leave_one_out": ensemble.leave_one_out,
+        "left_out": left_out, "seconds": time.monotonic() - started,
     }  # fmt: skip
     update_json(settings.out / METRICS, {"ensemble": about})
     excess = next(v for v in spread.volumes() if v.quantity == "index_excess_std")
@@ -59,30 +73,53 @@ def _noise(training: Measurement, main: Reconstruction) -> tuple[torch.Tensor, s
     """Standard deviation of the noise of every pixel, px: that of the file, else the rms residual of each view."""
     if training.sigma is not None:
         return training.sigma.nan_to_num(0.0, 0.0, 0.0), "sigma of the measurement"
-    rms = [v["rms_px"] for v in evaluate_views(reproject(main.field, training, (), main.device))]
+    rms = torch.tensor([v["rms_px"] for v in evaluate_views(reproject(main.field, training, (), main.device))])
     say("ensemble: the measurement has no sigma; noise of the size of each view's rms residual is added")
-    return torch.tensor(rms)[:, None, None, None].expand(training.displacement.shape).clone(), "rms residual"
+    # NaN for a view of which no ray crosses the box
+    return rms.nan_to_num(0.0)[:, None, None, None].expand(training.displacement.shape).clone(), "rms residual"
 
 
 def _member(
-    settings: Reconstruct, ensemble: Ensemble, number: int, training: Measurement, noise: torch.Tensor
-) -> Reconstruction | None:
-    """One member: read if it is there already, else reconstructed; None if interrupted on the way."""
+    settings: Reconstruct,
+    ensemble: Ensemble,
+    number: int,
+    training: Measurement,
+    noise: torch.Tensor,
+    start: Field | None,
+) -> Reconstruction:
+    """One member: read if it is there already, made by the same settings from the same data; else reconstructed."""
     folder: Path = settings.out / ENSEMBLE / f"{number:02d}"
-    if (folder / FIELD).is_file():
+    reconstructor, noisy = ensemble.member(number, settings.reconstructor, training, noise)
+    asked_for = _fingerprint(settings, reconstructor, noisy)
+    if (folder / FIELD).is_file() and (folder / ASKED).is_file() and (folder / ASKED).read_text() == asked_for:
         try:
             field, box, n_ambient = read_field(folder)
             kept = Outcome("converged", "read from disc")
             return Reconstruction(field, box, n_ambient, [], kept, {}, device="cpu")
         except InputError as error:
             say(f"{error}; this member is done again")
-    reconstructor, noisy = ensemble.member(number, settings.reconstructor, training, noise)
     out = "".join(f", without {name}" for name in ensemble.left_out(number, training))
     title = f"member {number} of {ensemble.members}{out}"
     with interruptible() as asked, progress_bar(title) as bar:
-        result = reconstructor(noisy, compose(bar, lambda _: asked[0]))  # type: ignore[arg-type]
-    if result.outcome.reason == "interrupted":
-        return None
-    folder.mkdir(parents=True, exist_ok=True)
-    write_field(folder, result)
+        result = reconstructor(noisy, compose(bar, lambda _: asked[0]), None, start)  # type: ignore[arg-type]
+    if result.outcome.reason not in ("interrupted", "diverged"):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ASKED).unlink(missing_ok=True)
+        write_field(folder, result)
+        (folder / ASKED).write_text(asked_for)
     return result
+
+
+def _fingerprint(settings: Reconstruct, reconstructor: Reconstructor, data: Measurement) -> str:
+    """What a member was made by and from, as text: another one of either gives another text."""
+    seen = hashlib.sha256()
+    for values in (data.displacement, data.sigma, data.usable):
+        if values is not None:
+            seen.update(values.contiguous().numpy().tobytes())
+    asked = {
+        "views": data.names,
+        "data": seen.hexdigest(),
+        "start_from": str(settings.start_from),
+        **dataclasses.asdict(reconstructor),  # type: ignore[call-overload]
+    }
+    return json.dumps(asked, indent=1, default=str) + "\n"

@@ -44,6 +44,8 @@ def run(settings: Reconstruct) -> Reconstruction:
     training = _without(measurement, settings.hold_out)
     if settings.ensemble:
         Ensemble(settings.ensemble)  # refuses a wrong number before the long work
+        if settings.leave_one_out and len(training.cameras) < 2:
+            raise InputError("leave_one_out: expected two training views or more, got one, which cannot be left out")
     elif settings.leave_one_out:
         raise InputError("leave_one_out: expected together with --ensemble K, got no ensemble")
     if measurement.wavelength_nm is not None:
@@ -66,10 +68,12 @@ def run(settings: Reconstruct) -> Reconstruction:
     say(f"{result.outcome.reason}: {result.outcome.message}")
     begin(None)
     write_result(settings, measurement, result)
-    if settings.ensemble and result.outcome.reason != "interrupted":
-        add_ensemble(settings, measurement, training, result)
-    if settings.report:
-        write_report(settings.out)
+    try:
+        if settings.ensemble and result.outcome.reason != "interrupted":
+            add_ensemble(settings, training, result, _start(settings, measurement))
+    finally:  # the page of the main result, whatever becomes of the members
+        if settings.report:
+            write_report(settings.out)
     return result
 
 

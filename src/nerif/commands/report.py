@@ -42,8 +42,8 @@ def write_report(directory: Path, out: Path | None = None) -> Path:
     out = out or directory / REPORT
     result = read_result(directory)
     html.write(result, out)
-    for sentence in result.missing:
-        say(f"missing: {sentence}")
+    for gap in result.missing:
+        say(f"missing: {gap.sentence}")
     size = out.stat().st_size
     say(f"{out}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")
     return out

@@ -13,14 +13,14 @@ from nerif import __version__
 from nerif.commands.methods import Reconstruct
 from nerif.commands.output import counting_bar, say, say_masked
 from nerif.commands.settings import to_toml
-from nerif.evaluation import evaluate_views, reproject, update_json
+from nerif.evaluation import evaluate_views, reproject, write_json
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.physics.quantities import derive
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.files import CHECKPOINT, FIELD, write_field, write_state
 from nerif.report.exports import export
-from nerif.report.result import HISTORY, METRICS, REPORT, RUN, VOLUME
+from nerif.report.result import FIGURES, HISTORY, METRICS, REPORT, RUN, VOLUME
 from nerif.reprojection import REPROJECTION
 from nerif.volume import Volume
 
@@ -34,7 +34,8 @@ def clear(directory: Path) -> None:
     """Remove what an earlier run has written there, and nothing else."""
     for name in OWN_FILES:
         (directory / name).unlink(missing_ok=True)
-    shutil.rmtree(directory / ENSEMBLE, ignore_errors=True)
+    for name in (ENSEMBLE, FIGURES):
+        shutil.rmtree(directory / name, ignore_errors=True)
 
 
 def run_toml(settings: Reconstruct, about: dict[str, Any] | None = None) -> str:
@@ -57,7 +58,7 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
         reprojection = reproject(result.field, measurement, settings.hold_out, result.device, bar)
     reprojection.write(out / REPROJECTION)
     views = evaluate_views(reprojection)
-    update_json(
+    write_json(  # afresh: scores of an earlier field must not stay
         out / METRICS,
         {
             "views": views,
@@ -66,6 +67,7 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
             "device": result.device,
             "outcome": result.outcome.reason,
             "message": result.outcome.message,
+            "measurement": str(settings.measurement.resolve()),
         },
     )
     about = {**_versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}

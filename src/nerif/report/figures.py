@@ -149,6 +149,7 @@ def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Ax
     known = {name for record in history for name in record}
     across = "seconds" if "seconds" in known else "step"
     aside = {"step", "epoch", "seconds", "rays_per_second", "learning_rate", "samples", "weight", "voxels", "iteration"}
+    aside |= {"taken_back", "fit_step"}
     names = [n for n in dict.fromkeys(n for record in history for n in record) if n not in aside]
     colours = [*COLOURS.values()]
     drawn = 0
@@ -201,7 +202,7 @@ def draw_view_scores(axes: Axes, views: list[dict[str, Any]]) -> Axes:
     if in_sigma:
         axes.axhline(1, color=COLOURS["grey"], linewidth=0.8, linestyle="--")
     names = [f"{v['name']}\nheld out" if v["held_out"] else v["name"] for v in views]
-    axes.set_xticks(list(places), names, rotation=90)
+    axes.set_xticks(list(places), names, rotation=90, parse_math=False)
     axes.set_ylabel("rms error / noise [1]" if in_sigma else "rms error [px]")
     return axes
 

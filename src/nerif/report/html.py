@@ -65,7 +65,7 @@ def render(result: Result) -> str:
     return environment.get_template("report.html.j2").render(
         title=result.directory.resolve().name,
         version=__version__,
-        source=Path(str(result.settings["measurement"])).name if "measurement" in result.settings else "",
+        source=_source(result),
         finished=result.about.get("finished", ""),
         headline=headline(statements),
         statements=statements,
@@ -77,7 +77,6 @@ def render(result: Result) -> str:
         scene=scene,
         scene_json=_json(scene),
         arrays=arrays,
-        quantities=QUANTITIES,
         views=views,
         first_view=first,
         limit=limit,
@@ -209,6 +208,12 @@ def _svg(draw: Callable[[Axes], object]) -> str:
         text = io.BytesIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     return "data:image/svg+xml;base64," + base64.b64encode(text.getvalue()).decode()
+
+
+def _source(result: Result) -> str:
+    """Name of the measurement whose views are shown."""
+    path = result.metrics.get("measurement", result.settings.get("measurement"))
+    return Path(str(path)).name if path else ""
 
 
 def _gradient(name: str) -> str:

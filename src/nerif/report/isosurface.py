@@ -36,12 +36,23 @@ def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"
 
     stride = max(1, -(-max(volume.grid.shape) // LARGEST))
     values = shown(volume)[::stride, ::stride, ::stride]
-    values = np.nan_to_num(values, nan=float(np.nanmean(values)) if np.isfinite(values).any() else 0.0)
+    values = _filled(values)
     if min(values.shape) < 2 or not values.min() < level < values.max():
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(values, level)
     first = np.array([float(volume.grid.axis(a)[0]) for a in "xyz"])
     return (vertices[:, ::-1] * np.array(volume.grid.spacing) * stride + first)[faces]
+
+
+def _filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
+    """Masked voxels take the value of the nearest that is not: they must not have a surface of their own."""
+    from scipy.ndimage import distance_transform_edt
+
+    masked = ~np.isfinite(values)
+    if masked.all() or not masked.any():
+        return np.nan_to_num(values)
+    nearest = distance_transform_edt(masked, return_distances=False, return_indices=True)
+    return values[tuple(nearest)]
 
 
 def draw_isosurface(axes: Axes3D, volume: Volume, level: float) -> Axes3D:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,6 +37,7 @@ __all__ = ["JOURNALS", "error_of", "figures_of", "residuals_over_sigma", "save_f
 JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature": (89, 183), "springer": (84, 174)}
 """Widths of one and of two columns, mm, as the publishers' guides for authors give them."""
 
+NOT_IN_FILES = r"[^\w.+-]"
 TO_DRAW = ("n", "density", "temperature", "n_std", "density_std", "temperature_std")
 
 
@@ -88,8 +90,12 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         if quantity in result.volumes:
             yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
     if result.reprojection is not None:
+        taken: set[str] = set()
         for i, name in enumerate(result.reprojection.measurement.names):
-            yield f"view_{name}", view(result.reprojection, i, double)
+            plain = re.sub(NOT_IN_FILES, "_", name)
+            plain = plain if plain not in taken else f"{plain}_{i}"
+            taken.add(plain)
+            yield f"view_{plain}", view(result.reprojection, i, double)
         if result.reprojection.measurement.sigma is not None:
             figure = _page(single, 0.7)
             draw_residuals(figure.subplots(), residuals_over_sigma(result.reprojection))
@@ -117,21 +123,19 @@ def _page(width: float, height_over_width: float, layout: str = "constrained") -
     return Figure(figsize=(inches, inches * height_over_width), layout=layout)  # type: ignore[arg-type]
 
 
-def slices(volume: Volume, width: float, diverging: bool = False) -> Figure:
+def slices(volume: Volume, width: float) -> Figure:
     """The three middle slices of a volume, with one colour bar."""
     ex, ey, ez = volume.grid.box.edges
     ratios = [ex, ex, ey]
     tallest = max(ey, ez)
     figure = _page(width, max(0.2, 0.80 * tallest / sum(ratios)) + 0.06)
-    low, high = colour_range(shown(volume))
-    if diverging:
-        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+    limits = colour_range(shown(volume))
     line = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
     for axes, normal in zip(line, "zyx", strict=True):
-        draw_slice(axes, volume, normal, (low, high), DIVERGING if diverging else None)
+        draw_slice(axes, volume, normal, limits)
         n = volume.grid.shape["zyx".index(normal)]
         axes.set_title(f"{normal} = {float(volume.grid.axis(normal)[n // 2]):.1f} mm")
-    add_colour_bar(line, "error of n [1]" if diverging else label_of(volume.quantity))
+    add_colour_bar(line, label_of(volume.quantity))
     return figure
 
 
@@ -167,7 +171,7 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
             axes.label_outer()
         add_colour_bar(list(line), f"{'uv'[component]} [px]")
     held = ", held out" if measurement.names[i] in reprojection.held_out else ""
-    figure.suptitle(f"view {measurement.names[i]}{held}")
+    figure.suptitle(f"view {measurement.names[i]}{held}", parse_math=False)
     return figure
 
 
@@ -175,7 +179,7 @@ def residuals_over_sigma(reprojection: Reprojection) -> np.ndarray:
     """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box."""
     measurement = reprojection.measurement
     assert measurement.sigma is not None
-    seen = measurement.usable & (reprojection.predicted != 0).any(dim=-1)  # 0 where the ray misses the box
+    seen = measurement.usable & measurement.sees_box
     residual = (reprojection.predicted - measurement.displacement)[seen] / measurement.sigma[seen]
     return residual.flatten().numpy()
 

@@ -17,11 +17,26 @@ from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reprojection import REPROJECTION, Reprojection
 from nerif.volume import Volume, read_volume, read_volumes
 
-__all__ = ["HISTORY", "METRICS", "REPORT", "RUN", "VOLUME", "Result", "read_result"]
+__all__ = ["FIGURES", "HISTORY", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "read_result"]
 
 RUN, METRICS, HISTORY, VOLUME, REPORT = "run.toml", "metrics.json", "history.csv", "volume.nc", "report.html"
+FIGURES = "figures"
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Something that is not there or cannot be read.
+
+    Parameters
+    ----------
+    what : name of the file, or "truth"
+    sentence : what follows from it, with the remedy
+    """
+
+    what: str
+    sentence: str
 
 
 @dataclass(frozen=True)
@@ -39,7 +54,7 @@ class Result:
     reprojection : measured and predicted views, or None
     measurement : what was measured, or None
     truth : index excess it was compared with, or None
-    missing : one sentence for each thing that is not there or cannot be read, with the remedy
+    missing : what is not there or cannot be read
     """
 
     directory: Path
@@ -51,7 +66,7 @@ class Result:
     reprojection: Reprojection | None = None
     measurement: Measurement | None = None
     truth: Volume | None = None
-    missing: tuple[str, ...] = ()
+    missing: tuple[Missing, ...] = ()
 
     @property
     def method(self) -> str:
@@ -77,14 +92,14 @@ def read_result(directory: Path) -> Result:
             f"{directory}: expected a result of nerif reconstruct, got none of {', '.join(known[:5])} in it"
         )
     finished = (directory / FIELD).is_file()
-    missing: list[str] = []
+    missing: list[Missing] = []
     not_yet: list[str] = []
 
     def attempt(name: str, read: Callable[[Path], T], default: T, without: str) -> T:
         path = directory / name
         if not path.is_file():
             if finished:
-                missing.append(f"{name} is not there: {without}")
+                missing.append(Missing(name, f"{name} is not there: {without}"))
             else:
                 not_yet.append(name)
             return default
@@ -92,13 +107,13 @@ def read_result(directory: Path) -> Result:
             return read(path)
         except (InputError, OSError, ValueError, KeyError, TypeError) as error:
             reason = " ".join(str(error).split()).replace(f"{path}: ", "")
-            missing.append(f"{name} cannot be read ({reason}): {without}")
+            missing.append(Missing(name, f"{name} cannot be read ({reason}): {without}"))
             return default
 
     no_table: dict[str, Any] = {}
     run = attempt(RUN, _toml, no_table, "the settings are not known")
     metrics = attempt(
-        METRICS, _json, no_table, "how well the field meets the views is not known; nerif evaluate adds it"
+        METRICS, _metrics, no_table, "how well the field meets the views is not known; nerif evaluate adds it"
     )
     no_history: list[dict[str, float]] = []
     history = attempt(HISTORY, _history, no_history, "there are no training curves")
@@ -113,7 +128,7 @@ def read_result(directory: Path) -> Result:
         resume = (directory / CHECKPOINT).is_file()
         go_on = f"Go on with nerif reconstruct --resume -o {directory}" if resume else "Start it again"
         rest = f" Not there yet: {', '.join(not_yet)}." if not_yet else ""
-        missing.insert(0, f"The run has not ended: there is no {FIELD}. {go_on}.{rest}")
+        missing.insert(0, Missing(FIELD, f"The run has not ended: there is no {FIELD}. {go_on}.{rest}"))
     return Result(
         directory=directory,
         settings={k: v for k, v in run.items() if k != "about"},
@@ -123,7 +138,7 @@ def read_result(directory: Path) -> Result:
         volumes=volumes,
         reprojection=views,
         measurement=_measurement(run) if views is None else views.measurement,
-        truth=_truth(metrics, missing),
+        truth=_truth(directory, metrics, missing),
         missing=tuple(missing),
     )
 
@@ -136,14 +151,16 @@ def _measurement(run: dict[str, Any]) -> Measurement | None:
         return None
 
 
-def _truth(metrics: dict[str, Any], missing: list[str]) -> Volume | None:
+def _truth(directory: Path, metrics: dict[str, Any], missing: list[Missing]) -> Volume | None:
+    """The truth it was compared with: where it was then, or beside the result if both have moved."""
     path = metrics.get("truth")
     if not isinstance(path, str):
         return None
+    places = (Path(path), directory / Path(path).name, directory.parent / Path(path).name)
     try:
-        return read_volume(path)
+        return read_volume(next((p for p in places if p.is_file()), places[0]))
     except InputError as error:
-        missing.append(f"The truth cannot be shown beside the field: {error}")
+        missing.append(Missing("truth", f"The truth cannot be shown beside the field: {error}"))
         return None
 
 
@@ -151,16 +168,28 @@ def _toml(path: Path) -> dict[str, Any]:
     return tomllib.loads(path.read_text())
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _metrics(path: Path) -> dict[str, Any]:
+    """metrics.json, refused as a whole where a part is not what nerif writes."""
     found = json.loads(path.read_text())
     if not isinstance(found, dict):
         raise ValueError("expected a table of names and values")
+    for name, known in (("views", "name"), ("slices", "z_mm")):
+        rows = found.get(name, [])
+        if not isinstance(rows, list) or not all(isinstance(row, dict) and known in row for row in rows):
+            raise ValueError(f"'{name}' is not a list of tables with '{known}'")
+    for name, known in (("ensemble", "members"), ("coverage", "share")):
+        table = found.get(name, {known: 0})
+        if not isinstance(table, dict) or known not in table:
+            raise ValueError(f"'{name}' is not a table with '{known}'")
     return found
 
 
 def _history(path: Path) -> list[dict[str, float]]:
     with path.open(newline="") as file:
-        return [{k: _number(v) for k, v in row.items() if k is not None} for row in csv.DictReader(file)]
+        rows = [{k: _number(v) for k, v in row.items() if k is not None} for row in csv.DictReader(file)]
+    if rows and not {"seconds", "step"} & set(rows[0]):
+        raise ValueError(f"expected columns 'seconds' or 'step', got {', '.join(list(rows[0])[:5])}")
+    return rows
 
 
 def _number(text: str | None) -> float:

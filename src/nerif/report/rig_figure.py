@@ -43,7 +43,7 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
         outward /= np.linalg.norm(outward)
         away = (0.09, 0.2)[around[i] % 2] * reach  # names of neighbours are not in each other's way
         name_at = camera.centre.numpy() + away * outward
-        axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center")
+        axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center", parse_math=False)
         everything.append(name_at[None])
         everything.append(hits)
     if box is not None:

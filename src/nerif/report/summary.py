@@ -8,13 +8,19 @@ from typing import Any
 import numpy as np
 
 from nerif.physics.gas_optics import GAS_CONSTANT
+from nerif.physics.quantities import TEMPERATURE_RANGE
+from nerif.reconstruction.files import FIELD
 from nerif.report.figures import shown
-from nerif.report.result import Result
+from nerif.report.result import METRICS, VOLUME, Result
 
 __all__ = ["Statement", "came_out", "headline", "measured", "number", "percent", "trust", "trust_figures"]
 
+VITAL = (FIELD, METRICS, VOLUME)
+"""Without these nothing can be said of a result; without the others less can be shown."""
+
 LEVELS = ("good", "note", "warning", "bad")
 HELD_OUT_CC = 0.95  # a view that was not seen is predicted this well in all our simulated cases with nine views
+TRUTH_CC = 0.98, 0.9  # good and fair, of all our simulated cases
 NOISE_BAND = 0.7, 1.4  # rms residual over sigma that noise alone explains; sigma itself is known to a factor of about 2
 
 
@@ -32,12 +38,12 @@ class Statement:
     text: str
 
 
-def number(value: float | None, digits: int = 4) -> str:
-    """Return a number for people, with a power of ten written as such; a dash for none."""
-    if value is None or not np.isfinite(value):
+def number(value: object, digits: int = 4) -> str:
+    """Return a number for people, with a power of ten written as such; a dash for what is none."""
+    if not isinstance(value, int | float) or not np.isfinite(value):
         return "–"
     if value == 0 or 1e-3 <= abs(value) < 1e5:
-        return f"{value:.{digits}g}"
+        return f"{float(f'{value:.{digits}g}'):.10g}"
     mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
     raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"{float(mantissa):g} × 10{raised}"
@@ -139,11 +145,10 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
         rows.append((name, f"CC {worst}{number(_smallest(views, 'cc'), 5)}, rms error {number(rms, 3)} px{beside}"))
     if "outcome" in result.metrics:
         rows.append(("Outcome", str(result.metrics["outcome"]).replace("_", " ")))
-    if result.metrics.get("l2") is not None:
-        l2, cc = result.metrics["l2"], result.metrics.get("cc")
-        rows.append(
-            ("Against the truth", f"L2 {l2:.2%}, CC {number(cc, 5)}, SSIM {number(result.metrics.get('ssim'), 4)}")
-        )
+    m = result.metrics
+    if m.get("l2") is not None and m.get("l2_variation") is not None:
+        errors = f"L2 {m['l2']:.2%}, of the variation {m['l2_variation']:.2%}"
+        rows.append(("Against the truth", f"{errors}; CC {number(m.get('cc'), 5)}, SSIM {number(m.get('ssim'), 4)}"))
     ensemble = result.metrics.get("ensemble")
     if isinstance(ensemble, dict) and "density_std" in result.volumes:
         std = result.volumes["density_std"].values.double().numpy()
@@ -151,14 +156,17 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
         rows.append((f"Ensemble of {ensemble.get('members')}", f"σ of density rms {number(rms, 2)} kg m⁻³"))
     coverage = result.metrics.get("coverage")
     if isinstance(coverage, dict):
-        rows.append(("Truth within ±2 σ", f"{coverage['share']:.0%} of the voxels"))
+        flow = coverage.get("share_in_flow")
+        beside = "" if flow is None else f", {flow:.0%} of those in the flow"
+        rows.append(("Truth within ±2 σ", f"{coverage['share']:.0%} of the voxels{beside}"))
     return rows
 
 
 def trust(result: Result) -> list[Statement]:
     """Return what to know before trusting it, the gravest first."""
-    found = [Statement("bad", sentence) for sentence in result.missing]
-    found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_masks(result)
+    found = [Statement("bad" if gap.what in VITAL else "note", gap.sentence) for gap in result.missing]
+    found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_truth(result)
+    found += _of_gas(result) + _of_masks(result) + _of_ensemble(result)
     return sorted(found, key=lambda s: -LEVELS.index(s.level))
 
 
@@ -169,7 +177,7 @@ def headline(statements: list[Statement]) -> Statement:
         worst,
         {
             "good": "It predicts a view it has not seen, and what it leaves unexplained is the noise.",
-            "note": "Nothing speaks against it; read the notes.",
+            "note": "Nothing found speaks against it; read the notes.",
             "warning": "Use it with the reservations below.",
             "bad": "Not to be relied on as it is; see below.",
         }[worst],
@@ -208,45 +216,78 @@ def _of_outcome(result: Result) -> list[Statement]:
 
 
 def _of_held_out(result: Result) -> list[Statement]:
-    if not _views(result, False):
-        return []
+    seen, held = _views(result, False), _views(result, True)
     left_out = (result.metrics.get("ensemble") or {}).get("left_out") or []
-    held = _views(result, True) or left_out
+    what = "The field predicts"
+    if not held and left_out:
+        held, what = left_out, "Members of the ensemble predict"
     if not held:
+        if not seen:
+            text = "The field was not compared with any view: nerif evaluate --measurement FILE does it."
+            return [Statement("warning", text)]
         text = "No view was held out, so nothing was checked against data that the reconstruction has not seen."
         return [Statement("warning", f"{text} Repeat with --hold-out VIEW.")]
-    cc, noise = _smallest(held, "cc"), _largest(held, "rms_over_sigma")
-    names = ", ".join(v["name"] for v in held)
-    if cc is None:
-        return [Statement("warning", f"The held-out view ({names}) has no pixel to compare.")]
+    known = [v for v in held if v.get("cc") is not None]
+    if not known:
+        return [Statement("warning", "The held-out views have no pixel to compare.")]
+    worst = min(known, key=lambda v: v["cc"])
+    cc, noise, name = worst["cc"], _largest(known, "rms_over_sigma"), worst["name"]
+    among = f"; the worst of {len(known)}" if len(known) > 1 else ""
     if cc >= HELD_OUT_CC:
-        beyond = "" if noise is None or noise <= 2 else f", though its error is {noise:.1f} times the noise"
-        level = "good" if not beyond else "warning"
-        return [Statement(level, f"The field predicts what it has not seen (view {names}): CC {cc:.4f}{beyond}.")]
-    level = "warning" if cc >= 0.8 else "bad"
-    text = f"The field predicts view {names}, which it has not seen, poorly: CC {cc:.3f}."
-    return [Statement(level, f"{text} More views, or a look at the calibration (nerif check), may help.")]
+        beyond = "" if noise is None or noise <= 2 else f", though the error is {noise:.1f} times the noise"
+        text = f"{what} what has not been seen (view {name}{among}): CC {cc:.4f}{beyond}."
+        return [Statement("warning" if beyond else "good", text)]
+    text = f"{what} poorly what has not been seen (view {name}{among}): CC {cc:.3f}."
+    remedy = "More views, or a look at the calibration (nerif check), may help."
+    return [Statement("warning" if cc >= 0.8 else "bad", f"{text} {remedy}")]
 
 
 def _of_residual(result: Result) -> list[Statement]:
     seen = _views(result, False)
-    if not seen:
-        return []
-    ratio = _values(seen, "rms_over_sigma")
-    if not ratio:
+    known = [v for v in seen if v.get("rms_over_sigma") is not None]
+    if not known:
         text = "The noise of the measurement is not known, so it cannot be told whether the residual is noise."
-        return [Statement("note", f"{text} nerif displacement writes sigma.")]
-    low, high = min(ratio), max(ratio)
+        return [Statement("note", f"{text} nerif displacement writes sigma.")] if seen else []
+    lowest, highest = (f(known, key=lambda v: v["rms_over_sigma"]) for f in (min, max))
+    low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
+    found = []
+    if high > NOISE_BAND[1]:
+        text = f"The residual of training view {highest['name']} is {high:.1f} times the stated noise: not explained."
+        remedy = "Look at the length of the run, open faces, the calibration (nerif check), whether sigma is too small."
+        found.append(Statement("warning" if high <= 3 else "bad", f"{text} {remedy}"))
     if low < NOISE_BAND[0]:
-        text = f"The residual of a training view is {low:.2f} of the stated noise"
-        return [Statement("warning", f"{text}: the field follows noise, or sigma is too large.")]
-    if high <= NOISE_BAND[1]:
+        text = f"The residual of training view {lowest['name']} is {low:.2f} of the stated noise"
+        found.append(Statement("warning", f"{text}: the field follows noise, or sigma is too large."))
+    if not found:
         text = "What the field leaves unexplained in the training views"
-        return [Statement("good", f"{text} is {low:.2f} to {high:.2f} of the noise.")]
-    level = "warning" if high <= 3 else "bad"
-    text = f"Residuals are up to {high:.1f} times the stated noise: the field does not explain the views"
-    remedy = "Look at the length of the run, open faces, the calibration (nerif check), and whether sigma is too small."
-    return [Statement(level, f"{text}. {remedy}")]
+        found.append(Statement("good", f"{text} is {low:.2f} to {high:.2f} of the noise."))
+    return found
+
+
+def _of_truth(result: Result) -> list[Statement]:
+    cc, variation = result.metrics.get("cc"), result.metrics.get("l2_variation")
+    if cc is None or variation is None:
+        return []
+    level = "good" if cc >= TRUTH_CC[0] else "warning" if cc >= TRUTH_CC[1] else "bad"
+    text = f"Against the truth: CC {cc:.4f}, error {variation:.1%} of the variation of n."
+    return [Statement(level, text)]
+
+
+def _of_gas(result: Result) -> list[Statement]:
+    ambient = _ambient_temperature(result)
+    low, high = TEMPERATURE_RANGE
+    if ambient is None or low <= ambient <= high:
+        return []
+    text = f"The ambient index would mean {ambient:.3g} K in the gas assumed"
+    return [Statement("warning", f"{text}: density and temperature do not apply here. See --gas.composition.")]
+
+
+def _of_ensemble(result: Result) -> list[Statement]:
+    diverged = (result.metrics.get("ensemble") or {}).get("diverged") or []
+    if not diverged:
+        return []
+    names = ", ".join(map(str, diverged))
+    return [Statement("warning", f"Members {names} of the ensemble diverged and are left out of mean and deviation.")]
 
 
 def _of_masks(result: Result) -> list[Statement]:

@@ -29,7 +29,7 @@ class ViewImages:
     scores : cc, ssim, rms_px, rms_over_sigma as far as known
     rows : for u and v: addresses of measured, re-projected, difference
     size : height and width of the view, px
-    shrunk : how many pixels one pixel of the pictures stands for, along an edge
+    shrunk : how many rows and columns one pixel of the pictures stands for
     """
 
     name: str
@@ -37,7 +37,7 @@ class ViewImages:
     scores: dict[str, Any]
     rows: dict[str, tuple[str, str, str]]
     size: tuple[int, int]
-    shrunk: int
+    shrunk: tuple[int, int]
 
 
 def colour_table(name: str) -> list[tuple[int, int, int]]:
@@ -61,7 +61,7 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
     found = []
     for i, camera in enumerate(m.cameras):
         height, width = camera.image_size
-        step = -(-max(height, width) // LARGEST)
+        step = (-(-height // LARGEST), -(-width // LARGEST))
         valid = usable[i, :height, :width, None].numpy()
         measured = np.where(valid, m.displacement[i, :height, :width].numpy(), np.nan)
         predicted = reprojection.predicted[i, :height, :width].numpy()
@@ -83,12 +83,10 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
     return found, limit, apart
 
 
-def _shrink(image: Float[np.ndarray, "row column"], step: int) -> Float[np.ndarray, "r c"]:
-    """Mean of blocks of step x step pixels, NaN where any is NaN."""
-    if step == 1:
-        return image
-    height, width = (n - n % step for n in image.shape)
-    return image[:height, :width].reshape(height // step, step, width // step, step).mean(axis=(1, 3))
+def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Float[np.ndarray, "r c"]:
+    """Mean of blocks of pixels, NaN where any is NaN; what is left over at the far edges is not shown."""
+    (down, across), (height, width) = step, (n - n % s for n, s in zip(image.shape, step, strict=True))
+    return image[:height, :width].reshape(height // down, down, width // across, across).mean(axis=(1, 3))
 
 
 def _picture(image: Float[np.ndarray, "row column"], limit: float) -> str:

@@ -86,7 +86,8 @@ async function main() {
     if (spread) { ambient = 0; level = high / 2; }
     if (high === low) high = low + (Math.abs(low) || 1);
     const what = { std: "standard deviation of ", mean: "mean of ", truth: "true ", error: "error of " }[chosen.variant] || "";
-    cache[key] = { values, low, high, lowest, highest, ambient, level, table: scene.tables[colours], label: what + q.label, unit: q.unit };
+    const borrowed = chosen.variant === "mean" || chosen.variant === "truth";
+    cache[key] = { borrowed, values, low, high, lowest, highest, ambient, level, table: scene.tables[colours], label: what + q.label, unit: q.unit };
     return cache[key];
   }
 
@@ -112,7 +113,7 @@ async function main() {
     const e = exponentOf(shown), unit = [e ? "10" + superscript(e) : "", shown.unit].filter(Boolean).join(" ");
     document.getElementById("bar-label").textContent = shown.label + (unit ? " [" + unit + "]" : " [1]");
     const beyond = shown.lowest < shown.low || shown.highest > shown.high;
-    document.getElementById("bar-note").textContent = beyond ? "Colours end where a thousandth of the voxels is left; values go from " + say(shown.lowest, shown) + " to " + say(shown.highest, shown) + "." : "";
+    document.getElementById("bar-note").textContent = beyond ? (shown.borrowed ? "Colours are those of the reconstruction" : "Colours end where a thousandth of the voxels is left") + "; values go from " + say(shown.lowest, shown) + " to " + say(shown.highest, shown) + "." : "";
     const ticks = document.getElementById("bar-ticks");
     ticks.textContent = "";
     for (const t of ticksBetween(shown.low / 10 ** e, shown.high / 10 ** e, 5)) {
@@ -162,6 +163,7 @@ async function main() {
   } catch (error) {
     const message = document.getElementById("space-message");
     message.hidden = false;
+    document.querySelector(".panel").hidden = true;
     message.textContent = "This browser offers no WebGL 2, so the field cannot be shown in three dimensions here (" + error.message + "). The slices above hold the same values; volume.vti opens in ParaView.";
     return;
   }
@@ -174,7 +176,7 @@ async function main() {
   for (const name of ["flow", "rig", "top", "front"]) on("look-" + name, "click", () => space.look[name]());
   on("save", "click", () => {
     const link = document.createElement("a");
-    link.download = document.title.split(" ")[0] + ".png";
+    link.download = document.querySelector("h1").textContent.replace(/[^\w.+-]+/g, "_") + ".png";
     link.href = space.picture();
     link.click();
   });
@@ -183,4 +185,9 @@ async function main() {
   document.documentElement.dataset.ready = String(Math.round(performance.now()));
 }
 
-main();
+main().catch((error) => {
+  const trouble = document.getElementById("trouble");
+  if (!trouble) throw error;
+  trouble.hidden = false;
+  trouble.textContent = "This browser could not draw the field (" + error.message + "). One of 2023 or later can; volume.vti opens in ParaView.";
+});

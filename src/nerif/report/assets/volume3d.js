@@ -170,6 +170,12 @@ function makeSpace(scene, canvas) {
   const controls = new THREE.OrbitControls(eye, canvas);
   controls.enableDamping = false; controls.zoomSpeed = 1.2;
 
+  // the wheel scrolls the page, unless this view is in use
+  canvas.addEventListener("pointerdown", () => canvas.focus());
+  canvas.parentElement.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey && document.activeElement !== canvas) event.stopPropagation();
+  }, { capture: true });
+
   let pending = 0, coarse = false, settle = 0, slow = 0;
   let full = Math.min(window.devicePixelRatio || 1, 2);
   function resize() {
@@ -245,9 +251,12 @@ function makeSpace(scene, canvas) {
       range = [low, high];
       const span = high - low || 1, rest = (ambient - low) / span, half = texture.image.data;
       const empty = THREE.DataUtils.toHalfFloat(Math.min(1, Math.max(0, rest)));
+      let last = empty;  // a masked voxel takes its neighbour's value, not to have a surface of its own
       for (let i = 0; i < values.length; i++) {
         const t = (values[i] - low) / span;
-        half[i] = Number.isNaN(t) ? empty : THREE.DataUtils.toHalfFloat(t < 0 ? 0 : t > 1 ? 1 : t);
+        if (i % nx === 0) last = empty;
+        if (!Number.isNaN(t)) last = THREE.DataUtils.toHalfFloat(t < 0 ? 0 : t > 1 ? 1 : t);
+        half[i] = last;
       }
       texture.needsUpdate = true;
       for (let i = 0; i < 256; i++) for (let k = 0; k < 4; k++) table.image.data[4 * i + k] = k < 3 ? colours[3 * i + k] : 255;
