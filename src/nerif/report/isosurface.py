@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["default_level", "draw_isosurface", "surface_triangles"]
 
-LARGEST = 64  # voxels along an edge: finer surfaces cannot be told apart in print, and take minutes to draw
+LARGEST = 80  # voxels along an edge: finer surfaces cannot be told apart in print, and take minutes to draw
 FACE = "#E69F00"
 
 
