@@ -191,7 +191,7 @@ def test_resume_goes_on_and_raises_limits(work, tmp_path):
 
 def test_ctrl_c_leaves_a_usable_result_to_resume(work, tmp_path):
     out = tmp_path / "r"
-    command = [sys.executable, "-m", "nerif", "reconstruct", str(work / "m.nc"), "-o", str(out), *QUICK]
+    command = [sys.executable, "-m", "nerif", "reconstruct", str(work / "m.nc"), "-o", str(out), "--no-report", *QUICK]
     command[command.index("--max-steps") + 1] = "100000"
     process = subprocess.Popen([*command, "--checkpoint-every", "0.2"], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     deadline = time.monotonic() + 90
@@ -214,7 +214,7 @@ def test_tensorboard_scalars(work, tmp_path):
     out = tmp_path / "r"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TF_CPP_MIN_LOG_LEVEL", "3")
-        assert main(["reconstruct", str(work / "m.nc"), "-o", str(out), "--tensorboard", *QUICK]) == 0
+        assert main(["reconstruct", str(work / "m.nc"), "-o", str(out), "--tensorboard", "--no-report", *QUICK]) == 0
     assert list((out / "tensorboard").glob("events*"))
 
 
@@ -227,7 +227,7 @@ def test_nan_and_infinite_pixels_are_masked_and_counted(spoil, tmp_path, capsys)
         d["displacement"].values[1, 5, 6, 1] = np.inf
 
     path = spoil(edit)
-    assert main(["reconstruct", path, "-o", str(tmp_path / "r"), *QUICK]) == 0
+    assert main(["reconstruct", path, "-o", str(tmp_path / "r"), "--no-report", *QUICK]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
     assert len(lines) == 1
     assert "6 pixels" in lines[0]

@@ -34,7 +34,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", measurement, *TINY]) == 0
     for method in METHODS:
         arguments = ["--method", method, "-o", str(folder / method), "--hold-out", "85deg", "--voxels", "14"]
-        assert main(["reconstruct", measurement, *arguments, "--iterations", "20", "--device", "cpu"]) == 0
+        assert main(["reconstruct", measurement, *arguments, "--iterations", "20", "--no-report"]) == 0
     return folder
 
 
