@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import imageio.v3 as iio
@@ -85,6 +86,14 @@ def test_measurement_holds_what_was_rendered(experiment):
 
 def test_truth_is_beside_the_pictures(experiment):
     assert read_volume(experiment / "pictures" / "truth" / "volume.nc").values.shape == (20, 20, 20)
+
+
+def test_field_from_pictures_alone_is_that_which_was_rendered(experiment):
+    """Four views are few; examples/from_images.py does nine (test_examples.py, slow)."""
+    words = ["reconstruct", str(experiment / "m.nc"), "-o", str(experiment / "r"), "--method", "tv", "--voxels", "20"]
+    assert main([*words, "--basis", "linear", "--iterations", "60", "--no-report"]) == 0
+    assert main(["evaluate", str(experiment / "r"), "--truth", str(experiment / "pictures/truth/volume.nc")]) == 0
+    assert json.loads((experiment / "r/metrics.json").read_text())["cc"] > 0.9
 
 
 def test_nothing_is_overwritten_unasked(experiment, capsys):

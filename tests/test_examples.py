@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from nerif.measurement import Measurement
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -24,6 +26,7 @@ def test_own_data(tmp_path):
     assert float(left_half.mean()) > 0
 
 
+@pytest.mark.slow
 def test_from_images(tmp_path):
     """Pictures alone, to a field that correlates with the truth by 0.98 or more."""
     script = [sys.executable, str(EXAMPLES / "from_images.py"), str(tmp_path)]
