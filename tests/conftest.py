@@ -16,7 +16,17 @@ import torch
 from jaxtyping import install_import_hook
 
 CHECKED = ("conventions", "geometry", "measurement", "volume", "vti", "fields", "physics", "metrics", "simulation")
-CHECKED += ("reprojection", "evaluation", "report", "imaging", "rendering", "experiment", "consistency", "mistakes")
+CHECKED += (
+    "reprojection",
+    "evaluation",
+    "report",
+    "imaging",
+    "rendering",
+    "experiment",
+    "consistency",
+    "mistakes",
+    "study",
+)
 # what Numba compiles stays as it is written
 SOLVERS = Path(__file__).parents[1] / "src" / "nerif" / "reconstruction"
 CHECKED += tuple(f"reconstruction.{p.stem}" for p in SOLVERS.glob("[!_]*.py") if p.stem != "kernels_numba")

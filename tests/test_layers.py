@@ -23,6 +23,7 @@ LAYERS = (
     ("reconstruction",),
     ("evaluation", "consistency", "mistakes"),
     ("report",),
+    ("study",),
     ("commands",),
     ("cli", "__main__"),
 )

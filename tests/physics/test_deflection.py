@@ -82,6 +82,20 @@ def test_curved_rays_converge_to_lever_arm_at_second_order(cameras, cube):
     assert all(1.9 < order < 2.1 for order in orders), (differences, orders)
 
 
+def test_curved_deflection_is_right_to_second_order(cameras, cube):
+    """Bending the straight ray once leaves what is of third order."""
+    rays = rays_of(cameras, cube)
+    differences = []
+    for amplitude in (-1.6e-2, -8e-3, -4e-3):
+        field = one_ball(amplitude, width=2.5)
+        bent, curved = Deflection("curved", 400, N_AMBIENT)(field, rays), CurvedRays(400, N_AMBIENT)(field, rays)
+        straight = Deflection("lever_arm", 400, N_AMBIENT)(field, rays)
+        differences.append(float((bent - curved).square().mean().sqrt()))
+        assert differences[-1] < 0.1 * float((straight - curved).square().mean().sqrt())
+    orders = [math.log2(a / b) for a, b in pairwise(differences)]
+    assert all(order > 2.6 for order in orders), (differences, orders)
+
+
 def test_paraxial_differs_by_the_lever_arm_alone(cameras, cube):
     """On a field thin along the rays and at their middle, one lever arm for the whole ray is exact."""
     rays = rays_of(cameras, cube)

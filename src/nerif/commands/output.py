@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,8 @@ from nerif.reconstruction.base import Step
 from nerif.volume import Volume
 
 __all__ = ["check_directory", "check_file", "counting_bar", "interruptible", "progress_bar", "say", "say_masked"]
+
+SAME_SIGNAL = 0.5  # seconds
 
 
 def say(text: str) -> None:
@@ -53,13 +56,18 @@ def check_directory(path: Path, force: bool) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[list[bool]]:
-    """Turn the first Ctrl-C into a request to stop (the list becomes [True]); the second one breaks off."""
-    asked = [False]
+    """Turn the first Ctrl-C into a request to stop (the list becomes [True]); the second one breaks off.
+
+    A second signal at once is the same Ctrl-C, passed on by a launcher such as torchrun.
+    """
+    asked, first = [False], [0.0]
 
     def handler(number: int, frame: object) -> None:
-        if asked[0]:
+        if asked[0] and time.monotonic() - first[0] > SAME_SIGNAL:
             raise KeyboardInterrupt
-        asked[0] = True
+        if asked[0]:
+            return
+        asked[0], first[0] = True, time.monotonic()
         print("\nstopping after this step; Ctrl-C again to break off", file=sys.stderr, flush=True)
 
     try:

@@ -25,6 +25,7 @@ from nerif.physics.quantities import GasSettings, derive
 from nerif.reconstruction.base import OnStep, Reconstruction, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
 from nerif.reconstruction.files import read_field, read_state, write_state
+from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.presets import preset
 from nerif.report.result import RUN
 from nerif.volume import Volume
@@ -57,6 +58,12 @@ def run(settings: Reconstruct) -> Reconstruction:
     start = _start(settings, measurement) if resume is None else None
     if not settings.resume:
         check_directory(settings.out, settings.force)
+    ranks = Ranks.from_environment()
+    if ranks.size > 1:
+        check_parallel(settings)
+    if not ranks.is_first:  # under torchrun the first process tells, and writes
+        with interruptible():
+            return settings.reconstructor(training, None, resume, start)
     begin = _begin(settings)
     with (
         interruptible() as asked,
@@ -75,6 +82,14 @@ def run(settings: Reconstruct) -> Reconstruction:
         if settings.report:
             write_report(settings.out)
     return result
+
+
+def check_parallel(settings: Reconstruct) -> None:
+    """Refuse what does not split its rays over the processes of torchrun."""
+    if settings.method != "nerif":
+        raise InputError(f"method: expected nerif under torchrun, got '{settings.method}', which runs in one process")
+    if settings.ensemble:
+        raise InputError("ensemble: expected none under torchrun; run the ensemble in one process")
 
 
 def _without(measurement: Measurement, names: tuple[str, ...]) -> Measurement:

@@ -24,7 +24,7 @@ from nerif.report.result import FIGURES, HISTORY, METRICS, REPORT, RUN, VOLUME
 from nerif.reprojection import REPROJECTION
 from nerif.volume import Volume
 
-__all__ = ["ENSEMBLE", "all_quantities", "clear", "run_toml", "write_result", "write_volumes"]
+__all__ = ["ENSEMBLE", "all_quantities", "clear", "run_toml", "versions", "write_result", "write_volumes"]
 
 ENSEMBLE = "ensemble"
 OWN_FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, "volume.vti", REPROJECTION, REPORT)
@@ -70,7 +70,7 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
             "measurement": str(settings.measurement.resolve()),
         },
     )
-    about = {**_versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
+    about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
     (out / RUN).write_text(run_toml(settings, about))
     write_volumes(out, all_quantities(settings, result))
     for group, held in (("training view", False), ("held-out view", True)):
@@ -85,7 +85,7 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
     say(f"{out}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView")
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     """When and with what it was done."""
     import platform
 

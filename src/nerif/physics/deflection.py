@@ -2,8 +2,10 @@
 
     d = integral (s_b - s) S grad(n) / n ds      lever_arm (default)
     d = (s_b - s_mid) integral S grad(n) / n ds  paraxial: one lever arm for the whole ray (paper, Eq. (3))
+    d = integral (s_b - s) S [grad(n)(x + delta) - theta dn/ds] / n ds
+                                                 curved: the ray bent by delta and theta, right to second order
 
-`curved`, which bends the ray, is in ray_tracing.py.
+Rays are traced through, to every order, in ray_tracing.py.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Rays
 
-__all__ = ["Deflection", "ForwardModel", "integration_weights", "midpoints", "project"]
+__all__ = ["Deflection", "ForwardModel", "bend", "integration_weights", "midpoints", "project"]
+
+MODELS = ("lever_arm", "paraxial", "curved")
 
 
 class ForwardModel(ABC):
@@ -36,7 +40,7 @@ class Deflection(ForwardModel):
 
     Parameters
     ----------
-    model : "lever_arm" or "paraxial"
+    model : "lever_arm", "paraxial" or "curved"
     samples : number of midpoint samples along a ray
     n_ambient : refractive index the excess is counted from
 
@@ -48,14 +52,19 @@ class Deflection(ForwardModel):
     n_ambient: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.model not in ("lever_arm", "paraxial"):
-            raise InputError(f"model: expected lever_arm or paraxial, got '{self.model}'")
+        if self.model not in MODELS:
+            raise InputError(f"model: expected one of {', '.join(MODELS)}, got '{self.model}'")
         if self.samples < 1:
             raise InputError(f"samples: expected at least one sample along a ray, got {self.samples}")
 
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n 2"]:
         s, step = midpoints(rays, self.samples)
         value, gradient = field.value_and_gradient(rays.at(s))
+        if self.model == "curved":
+            offset, angle = bend(gradient, rays, s, step, self.n_ambient)
+            along = torch.einsum("nmi,ni->nm", gradient, rays.direction)
+            value, gradient = field.value_and_gradient(rays.at(s) + offset)
+            gradient = gradient - angle * along[..., None]
         weights = integration_weights(rays, s, step, self.model) / (self.n_ambient + value)
         return torch.einsum("nm,nij,nmj->ni", weights, rays.sensitivity, gradient)
 
@@ -76,6 +85,25 @@ def integration_weights(
     else:
         lever = rays.background[:, None] - s
     return lever * step[:, None]
+
+
+def bend(
+    gradient: Float[Tensor, "n m 3"], rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, " n"], n_ambient: float
+) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"]]:
+    """Return how far (mm) and through which angle refraction has carried a ray off its straight line at each sample.
+
+    theta(s) = integral_near^s grad_perp(n) / n ds',      delta(s) = integral_near^s (s - s') grad_perp(n) / n ds'
+
+    Parameters
+    ----------
+    gradient : index gradient at the samples on the straight ray, 1/mm
+    s, step : path lengths of the samples and length of the intervals, mm
+    """
+    along = torch.einsum("nmi,ni->nm", gradient, rays.direction)
+    turn = (gradient - along[..., None] * rays.direction[:, None]) * (step / n_ambient)[:, None, None]
+    before = turn.cumsum(1) - turn  # of the intervals before the sample's own, of which half lies behind it
+    offset = s[..., None] * before - ((s[..., None] * turn).cumsum(1) - s[..., None] * turn)
+    return offset + turn * (step / 8)[:, None, None], before + turn / 2
 
 
 @torch.no_grad()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
 import sys
 from pathlib import Path
@@ -15,15 +16,17 @@ __all__ = ["autocast_dtype", "available_memory", "keep_freed_memory", "peak_memo
 
 
 def resolve_device(name: str) -> torch.device:
-    """Return the device called `name`; "auto" is the GPU where there is one.
+    """Return the device called `name`; "auto" is the GPU where there is one (under torchrun, the process's own).
 
     Raises
     ------
     InputError
         If the device does not exist here.
     """
+    if name == "auto" and torch.cuda.is_available():
+        return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))  # torchrun: a GPU for each process
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device("cpu")
     try:
         device = torch.device(name)
     except RuntimeError:

@@ -19,7 +19,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
-from nerif.physics.deflection import integration_weights
+from nerif.physics.deflection import bend, integration_weights
 from nerif.reconstruction.target import Target
 
 __all__ = ["Evaluator", "LossWeights", "loss_terms"]
@@ -83,12 +83,23 @@ def loss_terms(
     norm : "l2" (mean length of the residual vectors, the paper's) or "squared" (mean square)
     """
     rays, shape = target.rays, s.shape
-    p = field.normalise(rays.at(s)).reshape(-1, 3)
+    points, tilt = rays.at(s), None
     unit = field.index_scale / field.half_edge  # 1/mm of one unit of network gradient
+    if model == "curved":  # along the ray as the present field bends it
+        with torch.no_grad():
+            _, bending, _ = network.value_and_gradient(field.normalise(points).reshape(-1, 3), False)
+            bending = bending.float().reshape(*shape, 3)
+            offset, angle = bend(bending * unit, rays, s, step, n_ambient)
+            points = points + offset
+            tilt = angle * torch.einsum("nmi,ni->nm", bending, rays.direction)[..., None]
+    p = field.normalise(points).reshape(-1, 3)
     weight = integration_weights(rays, s, step, model) * (unit / n_ambient)
 
     def data(gradient: Float[Tensor, "p 3"]) -> Tensor:
-        d = torch.einsum("nm,nij,nmj->ni", weight, rays.sensitivity, gradient.float().reshape(*shape, 3))
+        gradient = gradient.float().reshape(*shape, 3)
+        if tilt is not None:
+            gradient = gradient - tilt
+        d = torch.einsum("nm,nij,nmj->ni", weight, rays.sensitivity, gradient)
         return reduce((d - target.displacement) * target.inverse_scale, norm)
 
     terms = {}

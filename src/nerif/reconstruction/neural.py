@@ -19,6 +19,8 @@ from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstru
 from nerif.reconstruction.device import autocast_dtype, peak_memory, resolve_device
 from nerif.reconstruction.gauge import AmbientRegion
 from nerif.reconstruction.losses import LossWeights, loss_terms
+from nerif.reconstruction.optimiser import OPTIMISERS, NetworkOptimiser
+from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.sampling import sample_count, sample_rays
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.warm_start import fit_network
@@ -26,7 +28,8 @@ from nerif.reconstruction.warm_start import fit_network
 __all__ = ["NeRIF"]
 
 CHOICES = {
-    "model": ("lever_arm", "paraxial"),
+    "model": ("lever_arm", "paraxial", "curved"),
+    "optimiser": OPTIMISERS,
     "sampling": ("random", "shifted", "regular"),
     "norm": ("l2", "squared"),
     "schedule": ("cosine", "constant"),
@@ -50,7 +53,7 @@ class NeRIF(Reconstructor):
     norm: str = "squared"
     """Either "squared" residuals (maximum likelihood for Gaussian noise) or "l2", the paper's."""
     model: str = "lever_arm"
-    """Forward model, "lever_arm" or "paraxial"."""
+    """Forward model: lever_arm, paraxial, or curved (along the ray that the present field bends)."""
     samples: tuple[int, int] = (24, 48)
     """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
     sample_jitter: int = 10
@@ -59,10 +62,16 @@ class NeRIF(Reconstructor):
     """One draw an interval ("random", the paper's), one a ray ("shifted"), or midpoints ("regular")."""
     points_per_batch: int = 8192
     """Sample points of a step; a step takes points_per_batch / N rays."""
+    optimiser: str = "muon"
+    """Muon for weight matrices and Adam for the rest, or adam for all (the paper's)."""
     learning_rate: float = 1.5e-2
     """Adam's, at its highest."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Adam's decay rates."""
+    matrix_rate: float = 2.0
+    """Muon's learning rate, in units of Adam's."""
+    momentum: float = 0.95
+    """Muon's."""
     schedule: str = "cosine"
     """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
     epochs: float = 40.0
@@ -96,7 +105,7 @@ class NeRIF(Reconstructor):
         for name, allowed in CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
-        for name in ("epochs", "learning_rate", "points_per_batch", "fit_steps", "rate_after_fit"):
+        for name in ("epochs", "learning_rate", "matrix_rate", "points_per_batch", "fit_steps", "rate_after_fit"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("max_steps", "time_limit", "stop_ratio", "sample_jitter"):
@@ -127,29 +136,36 @@ class NeRIF(Reconstructor):
 
 
 class _Training:
-    """One run: the data, the network, Adam, and the loop."""
+    """One run: the data, the network, its optimiser, and the loop."""
 
     def __init__(
         self, settings: NeRIF, measurement: Measurement, resume: State | None, start: Field | None = None
     ) -> None:
         self.settings, self.measurement = settings, measurement
+        self.ranks = Ranks.from_environment()
         self.device = resolve_device(settings.device)
+        self.ranks.join(self.device)
         self.generator = torch.Generator().manual_seed(settings.seed)
         faces = settings.ambient_faces or measurement.ambient_faces
         self.ambient = AmbientRegion.of(measurement, faces)
         self.target = Target.of(measurement, settings.open_faces).to(self.device)
         self.count = len(self.target)
+        if self.count < self.ranks.size:
+            raise InputError(
+                f"torchrun: expected at least a ray a process, got {self.count} rays for {self.ranks.size}"
+            )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
             network = Network(settings.network)
         self.field = NeuralField(network.to(self.device), measurement.box, self.target.index_scale)
-        self.adam = torch.optim.Adam(network.parameters(), lr=settings.learning_rate, betas=settings.betas)
+        self.optimiser = NetworkOptimiser(settings.optimiser, network, settings.betas, settings.momentum)
         self.network = _MixedPrecision(settings, network, self.device)
         self.history: list[dict[str, float]] = []
         self.order = torch.empty(0, dtype=torch.long)
         self.step, self.rays_done, self.retries, self.rate = 0, 0, 0, 1.0
         self.initial_loss, self.running = float("nan"), float("nan")
         self.spent, self.started = 0.0, time.perf_counter()
+        self.agreed_seconds = 0.0
         if resume is not None:
             self._restore(resume)
             start = None
@@ -163,21 +179,22 @@ class _Training:
         settings, outcome = self.settings, self._stop() or self._fit(on_step)
         clock, rays_then = time.perf_counter(), self.rays_done
         while outcome is None:
-            target, count = self._batch()
-            s, interval = sample_rays(target.rays, count, self.generator, settings.sampling)
+            self._agree()
+            target, s, interval, rays = self._batch()
             terms = self._terms(target, s, interval)
             loss = sum(getattr(settings.weights, name) * term for name, term in terms.items())
             assert isinstance(loss, Tensor)
-            self._set_learning_rate()
-            self.adam.zero_grad()
+            rate = self._learning_rate()
+            self.optimiser.zero_grad()
             loss.backward()
-            self.adam.step()
+            self.ranks.average_gradients(self.field.network, len(target), rays)
+            self.optimiser.step({"adam": rate, "muon": rate * settings.matrix_rate})
             self.step += 1
             outcome = self._stop()
             if self.device.type == "cuda" and self.step % LOG_EVERY and outcome is None:
                 continue  # looking at a number waits for the GPU, so look now and then
-            values = {name: float(term.detach()) for name, term in terms.items()}
-            values["loss"] = float(loss.detach())
+            figures = torch.stack([term.detach().float() for term in (*terms.values(), loss)])
+            values = dict(zip((*terms, "loss"), self.ranks.average(figures, len(target), rays).tolist(), strict=True))
             if not math.isfinite(values["loss"]) or (outcome is not None and not self._finite()):
                 outcome = self._take_back()
                 continue
@@ -187,9 +204,19 @@ class _Training:
                 self._log(values, speed)
             if self.step % KEEP_EVERY == 0 and self._finite():
                 self.good = self._capture()
-            if on_step is not None and on_step(self._tell(values, speed)) and outcome is None:
+            if self._asked(on_step, self._tell(values, speed)) and outcome is None:
                 outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
         return self._result(outcome)
+
+    def _agree(self) -> None:
+        """Let all processes go by the clock of the first (on GPUs now and then: it waits for them)."""
+        if self.ranks.size > 1 and (self.device.type == "cpu" or self.step % LOG_EVERY == 0):
+            (self.agreed_seconds,) = self.ranks.decided([self._clock()], self.device)
+
+    def _asked(self, on_step: OnStep | None, step: Step) -> bool:
+        """Tell of a step, and whether the first process is asked to stop."""
+        asked = on_step is not None and bool(on_step(step))
+        return bool(self.ranks.decided([float(asked)], self.device)[0])
 
     def _fit(self, on_step: OnStep | None) -> Outcome | None:
         """Fit the network to the field that the run starts from, if any; the steps after it are smaller."""
@@ -202,8 +229,9 @@ class _Training:
             values = {"fit_step": float(step), "fit_loss": loss}
             if step % LOG_EVERY == 0 or step == 1:
                 self.history.append({**self._where(), **values})
+            self._agree()
             outcome = self._stop()
-            if on_step is not None and on_step(self._tell(values, 0.0)) and outcome is None:
+            if self._asked(on_step, self._tell(values, 0.0)) and outcome is None:
                 outcome = Outcome("interrupted", "stopped while fitting the start; --resume goes on from here")
             return outcome is not None
 
@@ -215,16 +243,19 @@ class _Training:
         self.rate, self.good = settings.rate_after_fit, self._capture()
         return outcome
 
-    def _batch(self) -> tuple[Target, int]:
-        """The next rays of this epoch's random order, and the number of samples each gets."""
+    def _batch(self) -> tuple[Target, Tensor, Tensor, int]:
+        """The next rays of this epoch's random order and their samples: this process's share, and how many in all."""
         settings = self.settings
         count = sample_count(self.progress, *settings.samples, settings.sample_jitter, self.generator)
-        rays = min(max(1, settings.points_per_batch // count), self.count)
+        rays = min(max(self.ranks.size, settings.points_per_batch // count), self.count)
         if len(self.order) < rays:
             self.order = torch.cat([self.order, torch.randperm(self.count, generator=self.generator)])
         index, self.order = self.order[:rays], self.order[rays:]
         self.rays_done += rays
-        return self.target[index.to(self.device)], count
+        target = self.target[index.to(self.device)]
+        s, interval = sample_rays(target.rays, count, self.generator, settings.sampling)
+        mine = self.ranks.share
+        return target[mine], s[mine], interval[mine], rays
 
     def _terms(self, target: Target, s: Tensor, interval: Tensor) -> dict[str, Tensor]:
         settings = self.settings
@@ -237,19 +268,21 @@ class _Training:
         terms["gauge"] = self.field.network(self.field.normalise(points)).square().mean()
         return terms
 
-    def _set_learning_rate(self) -> None:
+    def _learning_rate(self) -> float:
         settings, rate = self.settings, self.rate * self.settings.learning_rate
         if settings.schedule == "cosine":
             rate *= min(1.0, (self.step + 1) / WARM_UP)
             rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(self.progress, 1.0)))
-        for group in self.adam.param_groups:
-            group["lr"] = rate
+        return rate
 
     # -- how far, and whether to stop -------------------------------------------------------------------------------
 
     @property
     def seconds(self) -> float:
         """Spent on training, earlier parts of a resumed run included."""
+        return self._clock() if self.ranks.size == 1 else self.agreed_seconds
+
+    def _clock(self) -> float:
         return self.spent + time.perf_counter() - self.started
 
     @property
@@ -320,8 +353,7 @@ class _Training:
 
     def _capture(self) -> State:
         tensors = {f"network.{k}": v.detach().clone() for k, v in self.field.network.state_dict().items()}
-        for i, moments in self.adam.state_dict()["state"].items():
-            tensors |= {f"adam.{i}.{k}": torch.as_tensor(v).clone() for k, v in moments.items()}
+        tensors |= {f"optimiser.{k}": v for k, v in self.optimiser.tensors().items()}
         tensors["generator"] = self.generator.get_state().clone()
         tensors["order"] = self.order.clone()
         names = ("step", "rays_done", "retries", "rate", "initial_loss", "running")
@@ -334,12 +366,7 @@ class _Training:
             self.field.network.load_state_dict(network)
         except RuntimeError:
             raise InputError("resume: the checkpoint is of another network; give the same settings") from None
-        moments: dict[int, dict[str, Tensor]] = {}
-        for key, tensor in state.tensors.items():
-            if key.startswith("adam."):
-                _, i, name = key.split(".")
-                moments.setdefault(int(i), {})[name] = tensor.clone()
-        self.adam.load_state_dict({"state": moments, "param_groups": self.adam.state_dict()["param_groups"]})
+        self.optimiser.restore({k[10:]: v for k, v in state.tensors.items() if k.startswith("optimiser.")})
         self.generator.set_state(state.tensors["generator"])
         self.order = state.tensors["order"].clone()
         scalars = dict(state.scalars)

@@ -29,6 +29,7 @@ PRESETS: dict[str, NeRIF] = {
         network=NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64, gradient_head=True),
         weights=LossWeights(consistency=1, numerical=1, head=1, automatic=0),
         norm="l2",
+        optimiser="adam",
         samples=(60, 200),
         sampling="random",
         points_per_batch=1 << 15,

@@ -65,7 +65,7 @@ class Target:
     def __len__(self) -> int:
         return len(self.rays)
 
-    def __getitem__(self, index: Tensor) -> Target:
+    def __getitem__(self, index: Tensor | slice) -> Target:
         return replace(
             self,
             rays=self.rays[index],

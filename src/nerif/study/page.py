@@ -1,0 +1,176 @@
+"""The page of a study: study.md with its figures beside it, and study.html, one file with everything inside."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from nerif.study.cases import SECTIONS, Case
+from nerif.study.claim import Claim, Verdict
+from nerif.study.claims import claims
+from nerif.study.page_html import render
+from nerif.study.plates import Plate, plates
+from nerif.study.results import Record, Results, finite
+from nerif.study.sections import section_text
+from nerif.study.words import NOTHING, bare, duration, listed, markdown_table
+
+__all__ = ["VERDICTS", "markdown", "write_page"]
+
+Pairs = Sequence[tuple[Case, Record | None]]
+
+PAPER = "[He et al., arXiv:2409.14722](https://arxiv.org/abs/2409.14722)"
+VERDICTS: dict[Verdict, str] = {
+    "reproduced": "✓ reproduced",
+    "not reproduced": "✗ not reproduced",
+    "not tested": "○ not tested",
+}
+PAPER_PIXELS = 200  # of an edge of each view
+
+FACTS = {
+    "command": "Command",
+    "machine": "Machine",
+    "device": "Device",
+    "preset": "Preset of NeRIF",
+    "date": "Date",
+    "nerif": "nerif",
+    "torch": "PyTorch",
+}
+NOTES = (
+    "**Phantoms 2 to 7 are not the paper's.** Its spray-flame data are not public. Here they are a simulated turbulent "
+    "Bunsen flame at six instants 0.1 ms apart; Phantom 1 is Gaussian balls placed at random, as in the paper. Rows "
+    "are comparable in kind, not number for number.",
+    "**L2 is the paper's**, |n_gt − n_rec| / |n_gt − 1|. Most of n − 1 is the ambient, which flatters it. The *error "
+    "of the variation* divides by |n_gt − n_ambient| instead and is the honest one; sections without figures of the "
+    "paper lead with it.",
+    "**The paper ran its voxel methods without noise only**; here they are run with it, too.",
+)
+
+
+def markdown(pairs: Pairs, about: Mapping[str, Any]) -> str:
+    """Return the page in Markdown; its figures are files in figures/.
+
+    Parameters
+    ----------
+    pairs : every case with its record, or None where there is none yet
+    about : scale, command, machine, device, preset, date, nerif and torch (versions), pixels, truth_voxels,
+        seconds (of training), voxels, tv_voxels, sections (asked for), total_seconds; what is missing is left out
+    """
+    results = Results(tuple(pairs), tuple(about.get("sections") or SECTIONS))
+    return _markdown(results, about, plates(results))
+
+
+def write_page(folder: Path, pairs: Pairs, about: Mapping[str, Any]) -> Path:
+    """Write folder/study.md, folder/figures/*.svg and folder/study.html, each atomically, and return the last."""
+    results = Results(tuple(pairs), tuple(about.get("sections") or SECTIONS))
+    shown = plates(results)
+    text = _markdown(results, about, shown)
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    pictures = {}
+    for plate in shown:
+        name = f"figures/{plate.name}.svg"
+        picture = _svg(plate)
+        _write(folder / name, picture)
+        pictures[name] = "data:image/svg+xml;base64," + base64.b64encode(picture).decode()
+    _write(folder / "study.md", text.encode())
+    page = folder / "study.html"
+    _write(page, render(text, pictures).encode())
+    return page
+
+
+def _markdown(results: Results, about: Mapping[str, Any], shown: list[Plate]) -> str:
+    blocks = [*_head(results, about), *_claims(claims(results))]
+    for name in results.sections:
+        blocks += [f"## {SECTIONS[name]}", *section_text(name, results)]
+        for plate in shown:
+            if plate.section == name:
+                blocks += [f"![{plate.caption}](figures/{plate.name}.svg)", f"*{plate.caption}*"]
+    left_out = [SECTIONS[name] for name in SECTIONS if name not in results.sections]
+    if left_out:
+        blocks += ["## Left out", f"Not asked for, and so neither run nor shown: {listed(left_out, len(left_out))}."]
+    if results.failed:
+        rows = [[f"{case.key}", bare(reason)] for case, reason in results.failed]
+        blocks += ["## Failed reconstructions", markdown_table(["Reconstruction", "Reason"], rows, left=2)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _head(results: Results, about: Mapping[str, Any]) -> list[str]:
+    """What this is, how far it is, and where it was computed."""
+    count, failed, todo = results.done, len(results.failed), len(results.pairs)
+    state = f"**{count} of {todo} reconstructions are done"
+    state += f", {failed} failed (listed at the end)" if failed else ""
+    waiting = todo - count - failed
+    state += f"; {waiting} are still to come and show as {NOTHING}.**" if waiting else ".**"
+    scale = str(about.get("scale", ""))
+    rows = [["Scale", bare(f"{scale}: {_settings(about)}".strip(": "))]] if scale or _settings(about) else []
+    rows += [[title, bare(about[name])] for name, title in FACTS.items() if about.get(name)]
+    seconds = sum(finite(record.get("seconds")) or 0.0 for _, record in results.pairs if record)
+    rows += [["Reconstructing took", duration(seconds)]] if seconds else []
+    rows += [["Time in all", duration(float(about["total_seconds"]))]] if about.get("total_seconds") else []
+    blocks = [
+        "# The numerical study of the NeRIF paper, repeated",
+        f"What the numerical section and Apps. A and D of {PAPER} report, reconstructed with nerif from simulated "
+        "measurements; the paper's figures stand beside ours.",
+        state,
+        markdown_table(["", ""], rows, left=2),
+    ]
+    if 0 < float(about.get("pixels") or PAPER_PIXELS) < PAPER_PIXELS:
+        text = (
+            f"Views of {about['pixels']} px and short runs: this shows that everything works. Its figures and verdicts "
+        )
+        blocks.append(f"{text}are no test of the paper's, which has {PAPER_PIXELS} px.")
+    return [*blocks, "\n".join(f"- {note}" for note in NOTES)]
+
+
+def _settings(about: Mapping[str, Any]) -> str:
+    """The settings of the scale, in words."""
+    form = {
+        "pixels": "views of {0} × {0} px",
+        "seconds": "{0:g} s of training of each NeRIF reconstruction",
+        "voxels": "Tikhonov and Landweber on {0}³ voxels",
+        "tv_voxels": "total variation on {0}³",
+        "truth_voxels": "errors taken on {0}³",
+    }
+    return ", ".join(text.format(about[name]) for name, text in form.items() if about.get(name))
+
+
+def _claims(found: list[Claim]) -> list[str]:
+    """The table of claims, and how many hold."""
+    counts = Counter(claim.verdict for claim in found)
+    parts = [f"{counts[verdict]} {verdict}" for verdict in VERDICTS if counts[verdict]]
+    rows = [
+        [f"{i}", VERDICTS[claim.verdict], bare(claim.text), bare(claim.paper), bare(claim.here)]
+        for i, claim in enumerate(found, start=1)
+    ]
+    return [
+        "## Claims",
+        f"Of {len(found)} claims: {', '.join(parts)}. Every verdict is computed from the reconstructions below.",
+        markdown_table(["", "Verdict", "Claim", "Paper", "Here"], rows, left=5),
+    ]
+
+
+def _svg(plate: Plate) -> bytes:
+    """A figure as SVG; letters as outlines, so that it looks the same everywhere."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    from nerif.report.pages import style
+
+    with style(size=10), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": plate.name}):
+        figure = Figure(figsize=plate.size, layout="constrained")
+        FigureCanvasSVG(figure)
+        plate.draw(figure)
+        picture = io.BytesIO()
+        figure.savefig(picture, format="svg", metadata={"Date": None, "Creator": None, "Title": plate.caption})
+    return picture.getvalue()
+
+
+def _write(path: Path, content: bytes) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(content)
+    os.replace(part, path)

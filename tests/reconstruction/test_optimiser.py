@@ -1,0 +1,74 @@
+"""The optimiser: every weight is in one part, and a restored one goes on as if nothing had been."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.mlp import Network, NetworkShape
+from nerif.reconstruction.optimiser import NetworkOptimiser
+
+SHAPE = NetworkShape(depth=2, width=16, octaves=2)
+
+
+def network() -> Network:
+    torch.manual_seed(0)
+    return Network(SHAPE)
+
+
+def take_steps(optimiser: NetworkOptimiser, net: Network, steps: int) -> None:
+    p = torch.linspace(-1, 1, 60).reshape(-1, 3)
+    for _ in range(steps):
+        optimiser.zero_grad()
+        (net(p) - p.sum(1).sin()).square().mean().backward()
+        optimiser.step({"adam": 1e-2, "muon": 2e-2})
+
+
+@pytest.mark.parametrize("kind", ["muon", "adam"])
+def test_every_weight_moves_and_the_loss_falls(kind):
+    net = network()
+    before = [p.detach().clone() for p in net.parameters()]
+    optimiser = NetworkOptimiser(kind, net, (0.9, 0.99), 0.9)
+    take_steps(optimiser, net, 40)
+    p = torch.linspace(-1, 1, 60).reshape(-1, 3)
+    assert float((net(p) - p.sum(1).sin()).square().mean().detach()) < 0.05
+    assert all(not torch.equal(a, b) for a, b in zip(before, net.parameters(), strict=True))
+
+
+def test_muon_takes_the_matrices_and_turns_them_by_equal_amounts():
+    net = network()
+    optimiser = NetworkOptimiser("muon", net, (0.9, 0.99), 0.9)
+    (group,) = optimiser.parts["muon"].param_groups
+    assert {p.shape for p in group["params"]} == {(16, 15), (16, 16)}  # neither biases nor the single output
+    before = net.layers[1].weight.detach().clone()
+    take_steps(optimiser, net, 1)
+    step = torch.linalg.svdvals(net.layers[1].weight.detach() - before) / (2e-2 * 0.2 * 16**0.5)
+    gradient = torch.linalg.svdvals(net.layers[1].weight.grad)
+    assert 0.7 < float(step[0]) < 1.3
+    assert float(step[4] / step[0]) > 5 * float(gradient[4] / gradient[0])
+
+
+@pytest.mark.parametrize("kind", ["muon", "adam"])
+def test_restored_goes_on_bit_for_bit(kind):
+    whole = network()
+    optimiser = NetworkOptimiser(kind, whole, (0.9, 0.99), 0.9)
+    take_steps(optimiser, whole, 5)
+    weights = {k: v.clone() for k, v in whole.state_dict().items()}
+    tensors = optimiser.tensors()
+    take_steps(optimiser, whole, 5)
+
+    again = network()
+    again.load_state_dict(weights)
+    restored = NetworkOptimiser(kind, again, (0.9, 0.99), 0.9)
+    restored.restore(tensors)
+    take_steps(restored, again, 5)
+    assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), again.parameters(), strict=True))
+
+
+def test_a_checkpoint_of_another_optimiser_is_refused():
+    net = network()
+    muon = NetworkOptimiser("muon", net, (0.9, 0.99), 0.9)
+    take_steps(muon, net, 1)
+    with pytest.raises(InputError, match="another optimiser"):
+        NetworkOptimiser("adam", net, (0.9, 0.99), 0.9).restore(muon.tensors())

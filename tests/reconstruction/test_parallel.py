@@ -1,0 +1,63 @@
+"""Two processes under torchrun do what one does with the same batch."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerif.cli import main
+from nerif.reconstruction.files import read_field
+from nerif.reconstruction.parallel import Ranks
+
+SMALL = [
+    "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "30", "--epochs", "1000",
+    "--samples", "12", "16", "--sample-jitter", "2", "--points-per-batch", "600", "--voxels", "12", "--device", "cpu",
+    "--precision", "float32", "--no-report",
+]  # fmt: skip
+
+
+def torchrun(*words: object) -> subprocess.CompletedProcess[str]:
+    """Run nerif in two processes on this machine."""
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "nerif"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run([*launch, *map(str, words)], capture_output=True, text=True, env=environment, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("parallel") / "m.nc"
+    tiny = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]
+    assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", str(path), *tiny]) == 0
+    return path
+
+
+@pytest.mark.parametrize("norm", ["squared", "l2"])
+def test_two_processes_find_the_field_of_one(measured, tmp_path, norm):
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert main(["reconstruct", str(measured), "-o", str(one), "--norm", norm, *SMALL]) == 0
+    done = torchrun("reconstruct", measured, "-o", two, "--norm", norm, *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("all 30 steps done") == 1  # the first process alone tells
+    points = 40 * torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 20
+    a, b = read_field(one)[0](points), read_field(two)[0](points)
+    assert float(a.abs().max()) > 0
+    torch.testing.assert_close(a, b, rtol=0, atol=2e-4 * float(a.abs().max()))
+
+
+def test_what_does_not_split_is_refused(measured, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), "--method", "tv"]) == 2
+    assert "under torchrun" in capsys.readouterr().err
+    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), "--ensemble", "2"]) == 2
+    assert "under torchrun" in capsys.readouterr().err
+
+
+def test_every_ray_is_in_one_share():
+    rays = torch.arange(11)
+    shares = [rays[Ranks(rank, 3).share] for rank in range(3)]
+    assert sorted(torch.cat(shares).tolist()) == rays.tolist()
