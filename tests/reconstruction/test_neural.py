@@ -85,7 +85,7 @@ def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(
     )
     errors = []
     for reach in (1.6, 0.8, 0.4):
-        d = numerical_displacement(field.network, rays, p, torch.full((50,), reach / field.half_edge), weight)
+        d = numerical_displacement(field.network, rays, p, torch.full(s.shape, reach / field.half_edge), weight)
         errors.append(float((d - exact).norm()))
     assert 3.5 < errors[0] / errors[1] < 4.5
     assert 3.5 < errors[1] / errors[2] < 4.5
@@ -276,7 +276,7 @@ def test_presets(measurement: Measurement):
     ("change", "word"),
     [
         ({"norm": "l3"}, "norm"),
-        ({"model": "curved"}, "model"),
+        ({"model": "round"}, "model"),
         ({"epochs": 0}, "epochs"),
         ({"learning_rate": -1}, "learning_rate"),
         ({"time_limit": -1}, "time_limit"),

@@ -36,17 +36,19 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("norm", ["squared", "l2"])
-def test_two_processes_find_the_field_of_one(measured, tmp_path, norm):
+# Muon makes its steps from bfloat16, in which the last bit of a sum is 0.4 %
+@pytest.mark.parametrize(("norm", "optimiser", "tolerance"), [("squared", "muon", 2e-3), ("l2", "adam", 2e-5)])
+def test_two_processes_find_the_field_of_one(measured, tmp_path, norm, optimiser, tolerance):
     one, two = tmp_path / "one", tmp_path / "two"
-    assert main(["reconstruct", str(measured), "-o", str(one), "--norm", norm, *SMALL]) == 0
-    done = torchrun("reconstruct", measured, "-o", two, "--norm", norm, *SMALL)
+    words = ["--norm", norm, "--optimiser", optimiser, *SMALL]
+    assert main(["reconstruct", str(measured), "-o", str(one), *words]) == 0
+    done = torchrun("reconstruct", measured, "-o", two, *words)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("all 30 steps done") == 1  # the first process alone tells
     points = 40 * torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 20
     a, b = read_field(one)[0](points), read_field(two)[0](points)
     assert float(a.abs().max()) > 0
-    torch.testing.assert_close(a, b, rtol=0, atol=2e-4 * float(a.abs().max()))
+    torch.testing.assert_close(a, b, rtol=0, atol=tolerance * float(a.abs().max()))
 
 
 def test_what_does_not_split_is_refused(measured, tmp_path, monkeypatch, capsys):

@@ -69,26 +69,26 @@ class Deflection(ForwardModel):
         return torch.einsum("nm,nij,nmj->ni", weights, rays.sensitivity, gradient)
 
 
-def midpoints(rays: Rays, samples: int) -> tuple[Float[Tensor, "n m"], Float[Tensor, " n"]]:
-    """Return the midpoints of `samples` equal intervals between near and far, and the interval length, both mm."""
-    step = (rays.far - rays.near) / samples
+def midpoints(rays: Rays, samples: int) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+    """Return the midpoints of `samples` equal intervals between near and far, and their length, both mm."""
+    step = ((rays.far - rays.near) / samples)[:, None].expand(-1, samples)
     index = torch.arange(samples, dtype=rays.near.dtype, device=rays.near.device) + 0.5
-    return rays.near[:, None] + index * step[:, None], step
+    return rays.near[:, None] + index * step, step
 
 
 def integration_weights(
-    rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, " n"], model: str
+    rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"], model: str
 ) -> Float[Tensor, "n m"]:
     """Return lever arm times step, mm^2: what each sample of S grad(n) counts for."""
     if model == "paraxial":
         lever = (rays.background - 0.5 * (rays.near + rays.far))[:, None].expand_as(s)
     else:
         lever = rays.background[:, None] - s
-    return lever * step[:, None]
+    return lever * step
 
 
 def bend(
-    gradient: Float[Tensor, "n m 3"], rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, " n"], n_ambient: float
+    gradient: Float[Tensor, "n m 3"], rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"], n_ambient: float
 ) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"]]:
     """Return how far (mm) and through which angle refraction has carried a ray off its straight line at each sample.
 
@@ -100,10 +100,10 @@ def bend(
     s, step : path lengths of the samples and length of the intervals, mm
     """
     along = torch.einsum("nmi,ni->nm", gradient, rays.direction)
-    turn = (gradient - along[..., None] * rays.direction[:, None]) * (step / n_ambient)[:, None, None]
+    turn = (gradient - along[..., None] * rays.direction[:, None]) * (step / n_ambient)[..., None]
     before = turn.cumsum(1) - turn  # of the intervals before the sample's own, of which half lies behind it
     offset = s[..., None] * before - ((s[..., None] * turn).cumsum(1) - s[..., None] * turn)
-    return offset + turn * (step / 8)[:, None, None], before + turn / 2
+    return offset + turn * (step / 8)[..., None], before + turn / 2
 
 
 @torch.no_grad()

@@ -66,7 +66,7 @@ def loss_terms(
     network: Evaluator,
     target: Target,
     s: Float[Tensor, "n m"],
-    step: Float[Tensor, " n"],
+    step: Float[Tensor, "n m"],
     weights: LossWeights,
     model: str,
     norm: str,
@@ -79,7 +79,7 @@ def loss_terms(
     Parameters
     ----------
     s : path lengths of the samples, mm
-    step : length of the intervals, mm; the central differences reach half of it to either side
+    step : length that each sample stands for, mm; the central differences reach half of it to either side
     norm : "l2" (mean length of the residual vectors, the paper's) or "squared" (mean square)
     """
     rays, shape = target.rays, s.shape
@@ -123,7 +123,7 @@ def numerical_displacement(
     value: Callable[[Float[Tensor, "n 3"]], Float[Tensor, " n"]],
     rays: Rays,
     p: Float[Tensor, "n m 3"],
-    reach: Float[Tensor, " n"],
+    reach: Float[Tensor, "n m"],
     weight: Float[Tensor, "n m"],
 ) -> Float[Tensor, "n 2"]:
     """Return the displacement by central differences of n (paper, Eq. (samplegrad)), px.
@@ -139,11 +139,11 @@ def numerical_displacement(
     """
     length = rays.sensitivity.norm(dim=-1)  # px/mm
     along = rays.sensitivity / length[..., None]
-    offset = (reach[:, None, None] * along)[:, None]  # n 1 2 3
+    offset = reach[..., None, None] * along[:, None]  # n m 2 3
     centre = p[:, :, None, :]
     points = torch.stack([centre + offset, centre - offset])  # 2 n m 2 3
     n = value(points.reshape(-1, 3)).float().reshape(points.shape[:-1])
-    slope = (n[0] - n[1]) / (2 * reach[:, None, None])  # n m 2
+    slope = (n[0] - n[1]) / (2 * reach[..., None])  # n m 2
     return (weight[..., None] * slope).sum(dim=1) * length
 
 

@@ -21,7 +21,7 @@ from nerif.reconstruction.gauge import AmbientRegion
 from nerif.reconstruction.losses import LossWeights, loss_terms
 from nerif.reconstruction.optimiser import OPTIMISERS, NetworkOptimiser
 from nerif.reconstruction.parallel import Ranks
-from nerif.reconstruction.sampling import sample_count, sample_rays
+from nerif.reconstruction.sampling import Guide, sample_count, sample_rays
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.warm_start import fit_network
 
@@ -30,7 +30,7 @@ __all__ = ["NeRIF"]
 CHOICES = {
     "model": ("lever_arm", "paraxial", "curved"),
     "optimiser": OPTIMISERS,
-    "sampling": ("random", "shifted", "regular"),
+    "sampling": ("adaptive", "random", "shifted", "regular"),
     "norm": ("l2", "squared"),
     "schedule": ("cosine", "constant"),
     "precision": ("auto", "float32", "tf32", "bf16"),
@@ -39,6 +39,7 @@ CHOICES = {
 WARM_UP = 50  # steps over which the learning rate rises
 RETRIES = 5  # times a run that turned non-finite is taken back before it gives up
 GAUGE_POINTS = 256  # a step
+GUIDE_EVERY = 60  # steps between looks at where the field varies
 LOG_EVERY, KEEP_EVERY = 20, 200  # steps
 
 
@@ -54,12 +55,13 @@ class NeRIF(Reconstructor):
     """Either "squared" residuals (maximum likelihood for Gaussian noise) or "l2", the paper's."""
     model: str = "lever_arm"
     """Forward model: lever_arm, paraxial, or curved (along the ray that the present field bends)."""
-    samples: tuple[int, int] = (24, 48)
+    samples: tuple[int, int] = (12, 24)
     """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
-    sample_jitter: int = 10
+    sample_jitter: int = 4
     """Half-range of the random number of samples a ray, see samples."""
-    sampling: str = "shifted"
-    """One draw an interval ("random", the paper's), one a ray ("shifted"), or midpoints ("regular")."""
+    sampling: str = "adaptive"
+    """In equal intervals, one draw each ("random", the paper's), one a ray ("shifted") or midpoints ("regular"), or
+    "adaptive", where the field varies."""
     points_per_batch: int = 8192
     """Sample points of a step; a step takes points_per_batch / N rays."""
     optimiser: str = "muon"
@@ -70,7 +72,7 @@ class NeRIF(Reconstructor):
     """Adam's decay rates."""
     matrix_rate: float = 2.0
     """Muon's learning rate, in units of Adam's."""
-    momentum: float = 0.95
+    momentum: float = 0.9
     """Muon's."""
     schedule: str = "cosine"
     """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
@@ -158,6 +160,7 @@ class _Training:
             torch.manual_seed(settings.seed)
             network = Network(settings.network)
         self.field = NeuralField(network.to(self.device), measurement.box, self.target.index_scale)
+        self.guide = Guide(self.field)
         self.optimiser = NetworkOptimiser(settings.optimiser, network, settings.betas, settings.momentum)
         self.network = _MixedPrecision(settings, network, self.device)
         self.history: list[dict[str, float]] = []
@@ -253,7 +256,9 @@ class _Training:
         index, self.order = self.order[:rays], self.order[rays:]
         self.rays_done += rays
         target = self.target[index.to(self.device)]
-        s, interval = sample_rays(target.rays, count, self.generator, settings.sampling)
+        if settings.sampling == "adaptive" and self.step and self.step % GUIDE_EVERY == 0:
+            self.guide.update(self.network)
+        s, interval = sample_rays(target.rays, count, self.generator, settings.sampling, self.guide)
         mine = self.ranks.share
         return target[mine], s[mine], interval[mine], rays
 
@@ -356,6 +361,8 @@ class _Training:
         tensors |= {f"optimiser.{k}": v for k, v in self.optimiser.tensors().items()}
         tensors["generator"] = self.generator.get_state().clone()
         tensors["order"] = self.order.clone()
+        if self.guide.values is not None:
+            tensors["guide"] = self.guide.values.clone()
         names = ("step", "rays_done", "retries", "rate", "initial_loss", "running")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
         return State(tensors, {**scalars, "seconds": self.seconds, "history": list(self.history)})
@@ -369,6 +376,8 @@ class _Training:
         self.optimiser.restore({k[10:]: v for k, v in state.tensors.items() if k.startswith("optimiser.")})
         self.generator.set_state(state.tensors["generator"])
         self.order = state.tensors["order"].clone()
+        guide = state.tensors.get("guide")
+        self.guide.values = None if guide is None else guide.clone().to(self.device)
         scalars = dict(state.scalars)
         self.history = list(scalars.pop("history"))
         self.spent, self.started = scalars.pop("seconds"), time.perf_counter()

@@ -19,7 +19,7 @@ PRESETS: dict[str, NeRIF] = {
     # the paper's network, trained by the exact gradient: made for a GPU
     "best": NeRIF(
         network=NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64),
-        samples=(48, 128),
+        samples=(24, 64),
         points_per_batch=1 << 17,
         learning_rate=2e-3,
         epochs=60,
@@ -31,6 +31,7 @@ PRESETS: dict[str, NeRIF] = {
         norm="l2",
         optimiser="adam",
         samples=(60, 200),
+        sample_jitter=10,
         sampling="random",
         points_per_batch=1 << 15,
         learning_rate=1e-3,

@@ -1,14 +1,61 @@
-"""Where a ray is sampled: one random point in each of N equal intervals (paper, Eq. (sample))."""
+"""Where a ray is sampled: one random point in each of N intervals (paper, Eq. (sample)).
+
+The paper's intervals are equal. The adaptive ones are short where the field found so far varies and long where it does
+not: their bounds are quantiles of a density that follows |grad N| on a coarse grid, and each sample counts for the
+length of its interval. The integral keeps its expectation and loses most of its scatter.
+"""
 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as functional
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
+from nerif.reconstruction.losses import Evaluator
 
-__all__ = ["sample_count", "sample_rays"]
+__all__ = ["Guide", "sample_count", "sample_rays"]
+
+EVEN = 0.1  # share of the samples that are spread evenly, whatever the guide says
+BINS = 40  # along a ray, in each of which the density is constant
+RESOLUTION = 24  # of the grid, along each edge of the cube that the network's coordinates span
+
+
+class Guide:
+    """Where the field varies: |grad N| on a coarse grid, the largest of each voxel and its neighbours.
+
+    Parameters
+    ----------
+    field : whose box and coordinates it is in
+    """
+
+    def __init__(self, field: NeuralField) -> None:
+        self.field = field
+        self.values: Float[Tensor, "z y x"] | None = None  # nothing known yet
+
+    @torch.no_grad()
+    def update(self, network: Evaluator) -> None:
+        """Look at the network as it is now."""
+        device = next(self.field.network.parameters()).device
+        axis = (torch.arange(RESOLUTION, device=device) + 0.5) / RESOLUTION * 2 - 1
+        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+        _, gradient, _ = network.value_and_gradient(torch.stack([x, y, z], dim=-1).reshape(-1, 3), False)
+        size = gradient.float().norm(dim=-1).reshape(1, 1, *x.shape)
+        self.values = functional.max_pool3d(size, 3, 1, 1)[0, 0]
+
+    def density(self, rays: Rays) -> Float[Tensor, "n bins"]:
+        """Return the density of samples in equal bins along each ray; its mean along a ray is 1."""
+        assert self.values is not None
+        share = (torch.arange(BINS, device=rays.near.device) + 0.5) / BINS
+        p = self.field.normalise(rays.at(rays.near[:, None] + share * (rays.far - rays.near)[:, None]))
+        found = functional.grid_sample(
+            self.values[None, None], p[None, :, :, None], padding_mode="border", align_corners=False
+        )[0, 0, :, :, 0]
+        found = found / found.mean(dim=1, keepdim=True).clamp_min(1e-12)
+        density = EVEN + (1 - EVEN) * found
+        return density / density.mean(dim=1, keepdim=True)
 
 
 def sample_count(progress: float, first: int, last: int, jitter: int, generator: torch.Generator) -> int:
@@ -18,22 +65,30 @@ def sample_count(progress: float, first: int, last: int, jitter: int, generator:
 
 
 def sample_rays(
-    rays: Rays, count: int, generator: torch.Generator, sampling: str = "random"
-) -> tuple[Float[Tensor, "n m"], Float[Tensor, " n"]]:
-    """Return path lengths t_i ~ U(t_n + (i-1)/N (t_f - t_n), t_n + i/N (t_f - t_n)) and the interval length, mm.
+    rays: Rays, count: int, generator: torch.Generator, sampling: str = "random", guide: Guide | None = None
+) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+    """Return path lengths t_i ~ U(t_n + (i-1)/N (t_f - t_n), t_n + i/N (t_f - t_n)) and the length each stands for, mm.
 
     Parameters
     ----------
-    sampling : "random" (one draw an interval, the paper's), "shifted" (one draw a ray, the same in each interval) or
-        "regular" (midpoints)
+    sampling : "random" (one draw an interval, the paper's), "shifted" (one draw a ray, the same in each interval),
+        "adaptive" (as shifted, in intervals as the guide has them) or "regular" (midpoints)
+    guide : for "adaptive"; equal intervals as long as it knows nothing
     """
-    n = len(rays)
+    n, device = len(rays), rays.near.device
     if sampling == "random":
         draw = torch.rand(n, count, generator=generator)
-    elif sampling == "shifted":
-        draw = torch.rand(n, 1, generator=generator)
-    else:
+    elif sampling == "regular":
         draw = torch.full((1, 1), 0.5)
-    step = (rays.far - rays.near) / count
-    index = torch.arange(count, device=step.device)
-    return rays.near[:, None] + (index + draw.to(step.device)) * step[:, None], step
+    else:
+        draw = torch.rand(n, 1, generator=generator)
+    share = (torch.arange(count, device=device) + draw.to(device)) / count
+    length = (rays.far - rays.near)[:, None]
+    if sampling != "adaptive" or guide is None or guide.values is None:
+        return rays.near[:, None] + share * length, (length / count).expand(n, count)
+    density = guide.density(rays)
+    reached = functional.pad(density.cumsum(dim=1) / BINS, (1, 0))  # share of the samples before each bin
+    cell = torch.searchsorted(reached, share, right=True).clamp(1, BINS) - 1
+    here = density.gather(1, cell)
+    share = (cell + (share - reached.gather(1, cell)) * BINS / here) / BINS
+    return rays.near[:, None] + share * length, length / (count * here)

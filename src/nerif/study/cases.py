@@ -164,10 +164,12 @@ def _all(scale: Scale) -> Iterator[Case]:
     # each section below changes one thing of NeRIF as it stands in the tables; most of them on Phantom 2 at noise 0.1
     as_is = "2-0.1-nerif"
     exact, differences = "exact gradient (automatic)", "central differences (numerical)"
-    yield case(as_is, {"network": "plain", "differentiation": exact}, base)
+    yield case(as_is, {"differentiation": exact}, base)
     numerical = LossWeights(numerical=1, automatic=0)
     yield case("numerical", {"differentiation": differences}, replace(base, weights=numerical))
-    heads = replace(base.network, head_width=64)
+    plain, heads = replace(base.network, head_width=0, gradient_head=False), replace(base.network, head_width=64)
+    key = as_is if plain == base.network else "plain"
+    yield case(key, {"network": "plain"}, replace(base, network=plain))
     yield case("multi-head", {"network": "multi-head, without gradient head"}, replace(base, network=heads))
     three = LossWeights(consistency=1, numerical=1, head=1, automatic=0)
     gradient = replace(base, network=replace(heads, gradient_head=True), weights=three)

@@ -89,9 +89,12 @@ def _markdown(results: Results, about: Mapping[str, Any], shown: list[Plate]) ->
         for plate in shown:
             if plate.section == name:
                 blocks += [f"![{plate.caption}](figures/{plate.name}.svg)", f"*{plate.caption}*"]
-    left_out = [SECTIONS[name] for name in SECTIONS if name not in results.sections]
+    left_out = [name for name in SECTIONS if name not in results.sections]
     if left_out:
-        blocks += ["## Left out", f"Not asked for, and so neither run nor shown: {listed(left_out, len(left_out))}."]
+        blocks += [
+            "## Left out",
+            f"Not asked for by --only, and so neither run nor shown: {listed(left_out, len(left_out))}.",
+        ]
     if results.failed:
         rows = [[f"{case.key}", bare(reason)] for case, reason in results.failed]
         blocks += ["## Failed reconstructions", markdown_table(["Reconstruction", "Reason"], rows, left=2)]

@@ -113,7 +113,9 @@ def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, sh
         "loss": last.get("loss"),
     }
     if case.snapshots:
-        record["curve"] = [_point(r, truth) for r in _earlier(case, measurement, snapshots)] + [_point(result, truth)]
+        rays = len(measurement.rays()[0])
+        followed = [*_earlier(case, measurement, snapshots), result]
+        record["curve"] = [_point(r, truth, rays) for r in followed]
     if "model" in case.labels and case.key.endswith("-nerif"):
         record["forward"] = _forward_models(phantom, measurement)
     if isinstance(phantom, Octahedron):
@@ -155,16 +157,16 @@ def _earlier(case: Case, measurement: Measurement, states: list[State]) -> Itera
         yield stop(measurement, resume=state)
 
 
-def _point(result: Reconstruction, truth: Volume) -> dict[str, float]:
-    last = result.state.scalars if result.state is not None else {}
-    errors = volume_errors(truth.values.numpy(), result.field.sample(truth.grid, result.device).numpy(), N_AMBIENT)
-    record = result.history[-1] if result.history else {}
+def _point(result: Reconstruction, truth: Volume, rays: int) -> dict[str, float]:
+    assert result.state is not None
+    at = result.state.scalars
+    rec = result.field.sample(truth.grid, result.device).numpy()
     return {
-        "step": float(last.get("step", record.get("step", 0))),
-        "epoch": record.get("epoch", 0.0),
-        "seconds": float(last.get("seconds", result.seconds)),
-        "loss": record.get("loss", float("nan")),
-        **errors,
+        "step": float(at["step"]),
+        "epoch": at["rays_done"] / rays,
+        "seconds": float(at["seconds"]),
+        "loss": result.history[-1].get("loss", float("nan")),
+        **volume_errors(truth.values.numpy(), rec, N_AMBIENT),
     }
 
 
@@ -184,6 +186,7 @@ def _process(case: Case, folder: Path) -> Iterator[Connection]:
     there.close()
     try:
         yield here
+        process.join(10)  # it has told all; let it clear up after itself
     finally:
         process.terminate()
         process.join()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from nerif.report.summary import number
 from nerif.study import tables
 from nerif.study.cases import METHODS, SECTIONS
 from nerif.study.claims_of_method import MARGIN, resolution_of, to_paper_error
@@ -65,13 +66,8 @@ def _model(results: Results) -> list[str]:
     if not found:
         return blocks
     head = ["Model, on the true field", "rms difference from curved rays [px]", "of the rms displacement"]
-    rows = [[bare(n), _three(v.get("rms_px")), share(finite(v.get("relative")))] for n, v in found.items()]
+    rows = [[bare(n), number(v.get("rms_px"), 3), share(finite(v.get("relative")))] for n, v in found.items()]
     return [*blocks, "How far the forward models alone are from the curved rays:", markdown_table(head, rows)]
-
-
-def _three(value: object) -> str:
-    number = finite(value)
-    return NOTHING if number is None else f"{number:.3g}"
 
 
 def _resolution(results: Results) -> list[str]:
