@@ -111,7 +111,11 @@ def main() -> None:
     base = NeRIF(time_limit=arguments.time_limit, epochs=1e6, device="cpu")
     variants = {
         "fast preset": base,
-        "one draw an interval (the paper's sampling)": replace(base, sampling="random"),
+        "Adam for all weights": replace(base, optimiser="adam"),
+        "equal intervals, one draw a ray": replace(base, sampling="shifted"),
+        "equal intervals, one draw each (the paper's sampling)": replace(base, sampling="random"),
+        "equal intervals, twice the samples a ray": replace(base, sampling="shifted", samples=(24, 48)),
+        "Adam and equal intervals": replace(base, optimiser="adam", sampling="shifted", samples=(24, 48)),
         "float32 throughout": replace(base, precision="float32"),
         "bf16 throughout": replace(base, full_precision_from=2.0),
         "central differences alone": replace(base, weights=LossWeights(numerical=1, automatic=0)),

@@ -10,6 +10,7 @@ from typing import Any
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor
+from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
@@ -49,7 +50,8 @@ class Scale:
     name : quick or full
     pixels : of an edge of each view (paper: 200)
     truth_voxels : of the grid that errors are taken on
-    seconds : of training of each NeRIF reconstruction
+    seconds : of training of each NeRIF reconstruction, at most
+    steps, points : of training, and sample points of each; 0 for no such limit, and for as many as the preset has
     voxels : of the grid of Tikhonov and Landweber (paper: 40)
     tv_voxels, tv_basis : of total variation, the best of the classical methods here
     octaves, views : values that the sections of those names compare
@@ -66,12 +68,14 @@ class Scale:
     tv_basis: str
     octaves: tuple[int, ...]
     views: tuple[int, ...]
+    steps: int = 0
+    points: int = 0
     preset: str = "auto"
     device: str = "auto"
 
 
 FULL = Scale("full", 200, 100, 120.0, 40, 64, "cubic", (0, 2, 4, 5, 6, 8), (3, 4, 6, 9, 12, 18))
-QUICK = Scale("quick", 48, 48, 6.0, 40, 40, "linear", (0, 3, 5, 7), (3, 6, 9, 18))
+QUICK = Scale("quick", 48, 48, 30.0, 40, 40, "linear", (0, 3, 5, 7), (3, 6, 9, 18), steps=350, points=4096)
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,9 @@ def cases(scale: Scale, only: tuple[str, ...] = ()) -> list[Case]:
 def nerif(scale: Scale, **changes: Any) -> NeRIF:
     """NeRIF as the study runs it: a preset, so many seconds, and what a section changes."""
     base = preset(scale.preset)
-    return replace(base, **{"time_limit": scale.seconds, "epochs": 1e6, "device": scale.device, **changes})
+    limits = {"time_limit": scale.seconds, "max_steps": scale.steps, "epochs": 1e6}
+    points = scale.points or base.points_per_batch
+    return replace(base, **{**limits, "points_per_batch": points, "device": scale.device, **changes})
 
 
 def _all(scale: Scale) -> Iterator[Case]:
@@ -197,18 +203,33 @@ def _all(scale: Scale) -> Iterator[Case]:
         half_circle = replace(ring, views=views, arc=(0.0, 180.0 - 180.0 / views))
         yield case(f"views-{views}", {"views": str(views)}, base, ring=half_circle)
 
-    for label, variant in variants(base).items():
-        yield case(f"speed-{label.replace(' ', '-')}", {"speed": label}, variant, noise=0.0, snapshots=True)
+    for label, variant in variants(base, resolve_device(scale.device).type == "cuda").items():
+        key = "2-0-nerif" if variant == base else f"speed-{label.replace(' ', '-')}"
+        yield case(key, {"speed": label}, variant, noise=0.0, snapshots=True)
 
 
-def variants(base: NeRIF) -> dict[str, NeRIF]:
-    """What the speed is compared of: the presets, and the default with one of its choices taken back."""
+def variants(base: NeRIF, gpu: bool) -> dict[str, NeRIF]:
+    """What the speed is compared of: as it is, one choice taken back, and on a GPU the presets (a step of the larger
+    ones takes a CPU ten seconds and more).
+    """
 
     def limited(settings: NeRIF) -> NeRIF:
         return replace(settings, time_limit=base.time_limit, epochs=base.epochs, device=base.device, stop_ratio=0.0)
 
+    network = base.network
     return {
-        **{f"preset {name}": limited(settings) for name, settings in PRESETS.items()},
-        "float32": replace(base, precision="float32"),
+        "as it is": base,
+        **({f"preset {name}": limited(settings) for name, settings in PRESETS.items()} if gpu else {}),
+        "Adam": replace(base, optimiser="adam"),
+        "equal intervals": replace(base, sampling="shifted", samples=EQUAL[0], sample_jitter=EQUAL[1]),
+        "Adam and equal intervals": replace(base, optimiser="adam", sampling="shifted", samples=EQUAL[0], sample_jitter=EQUAL[1]),
         "central differences": replace(base, weights=LossWeights(numerical=1, automatic=0)),
+        "mean length of residuals": replace(base, norm="l2"),
+        "float32": replace(base, precision="float32"),
+        "half the width": replace(base, network=replace(network, width=network.width // 2)),
+        "twice the width": replace(base, network=replace(network, width=2 * network.width)),
+        "half the batch": replace(base, points_per_batch=base.points_per_batch // 2),
     }
+
+
+EQUAL = ((24, 48), 10)  # samples and their jitter where intervals are equal

@@ -133,7 +133,8 @@ def _settings(about: Mapping[str, Any]) -> str:
     """The settings of the scale, in words."""
     form = {
         "pixels": "views of {0} × {0} px",
-        "seconds": "{0:g} s of training of each NeRIF reconstruction",
+        "seconds": "at most {0:g} s of training of each NeRIF reconstruction",
+        "steps": "at most {0} steps",
         "voxels": "Tikhonov and Landweber on {0}³ voxels",
         "tv_voxels": "total variation on {0}³",
         "truth_voxels": "errors taken on {0}³",

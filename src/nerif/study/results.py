@@ -11,7 +11,7 @@ from typing import Any
 from nerif.reconstruction.neural import NeRIF
 from nerif.study.cases import NOISES, PHANTOMS, SECTIONS, Case
 
-__all__ = ["Missing", "Record", "Results", "finite", "first_at", "score", "typical"]
+__all__ = ["Missing", "Results", "finite", "first_at", "score", "typical"]
 
 Record = dict[str, Any]
 Cell = tuple[str, float, str]
