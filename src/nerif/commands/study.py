@@ -70,13 +70,17 @@ def run(settings: Study) -> Path:
         return _page(settings.out, todo, about)
     started = written = time.monotonic()
     failed = []
-    with _bar(len(todo)) as tell:
-        for case, record in zip(todo, run_cases(todo, settings.out, tell), strict=True):
-            if "failed" in record:
-                failed.append(f"{case.key}: {record['failed']}")
-            if time.monotonic() - written > PAGE_EVERY:
-                _page(settings.out, todo, about)
-                written = time.monotonic()
+    try:
+        with _bar(len(todo)) as tell:
+            for case, record in zip(todo, run_cases(todo, settings.out, tell), strict=True):
+                if "failed" in record:
+                    failed.append(f"{case.key}: {record['failed']}")
+                if time.monotonic() - written > PAGE_EVERY:
+                    _page(settings.out, todo, about)
+                    written = time.monotonic()
+    except KeyboardInterrupt:
+        say(f"{_page(settings.out, todo, about)}: the page of what is done; the same command goes on from here")
+        raise
     page = _page(settings.out, todo, about)
     minutes = (time.monotonic() - started) / 60
     say(f"{len(todo) - len(failed)} of {len(todo)} reconstructions are there, after {minutes:.1f} min")

@@ -216,13 +216,14 @@ def variants(base: NeRIF, gpu: bool) -> dict[str, NeRIF]:
     def limited(settings: NeRIF) -> NeRIF:
         return replace(settings, time_limit=base.time_limit, epochs=base.epochs, device=base.device, stop_ratio=0.0)
 
-    network = base.network
+    network, (samples, jitter) = base.network, EQUAL
+    equal = replace(base, sampling="shifted", samples=samples, sample_jitter=jitter)
     return {
         "as it is": base,
         **({f"preset {name}": limited(settings) for name, settings in PRESETS.items()} if gpu else {}),
         "Adam": replace(base, optimiser="adam"),
-        "equal intervals": replace(base, sampling="shifted", samples=EQUAL[0], sample_jitter=EQUAL[1]),
-        "Adam and equal intervals": replace(base, optimiser="adam", sampling="shifted", samples=EQUAL[0], sample_jitter=EQUAL[1]),
+        "equal intervals": equal,
+        "Adam and equal intervals": replace(equal, optimiser="adam"),
         "central differences": replace(base, weights=LossWeights(numerical=1, automatic=0)),
         "mean length of residuals": replace(base, norm="l2"),
         "float32": replace(base, precision="float32"),

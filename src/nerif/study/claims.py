@@ -132,6 +132,8 @@ def _as_the_paper(results: Results) -> tuple[str, bool]:
             f"{name.upper()} in {count} of {len(records)} cells" + (f", not {listed(where, 7)}" if bad else "")
         )
         lost |= bool(bad)
+    if lost:
+        parts.append("why: see √(1 − CC²) below the tables, which no ambient flatters")
     return "; ".join(parts), not lost
 
 

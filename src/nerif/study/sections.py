@@ -123,6 +123,9 @@ def _speed(results: Results) -> list[str]:
     head += [f"to the error of {m} ({share(v)})" for m, v in rivals.items()] + ["Epochs", "Time in all"]
     times = [f"{m} {duration(r['seconds'])}" for m in METHODS[1:] if (r := results.cell("2", 0.0, m)) is not None]
     text = "Phantom 2 without noise. Upper bounds: the error is looked at twelve times in a run."
+    text += (
+        " The learning rate falls with the time that a run has, so that a shorter run ends below the curve of this one."
+    )
     text += f" The classical methods took: {', '.join(times)}." if times else ""
     return [text, markdown_table(head, rows)]
 

@@ -18,7 +18,7 @@ def share(value: float | None) -> str:
 
 def cc(value: float | None) -> str:
     """Return a correlation or similarity with the paper's four decimals."""
-    return NOTHING if value is None else f"{value:.4f}"
+    return NOTHING if value is None else f"{value:z.4f}"
 
 
 def duration(seconds: float | None) -> str:
