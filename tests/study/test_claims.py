@@ -8,7 +8,7 @@ import pytest
 
 from nerif.study.cases import Case
 from nerif.study.claim import Claim
-from nerif.study.claims import claims, worse_than_paper
+from nerif.study.claims import WHY, claims, worse_than_paper
 from nerif.study.paper import CORRELATION, L2, paper_value
 from study.records import Change, resolution, results
 
@@ -134,7 +134,7 @@ def test_cells_less_accurate_than_the_paper_are_listed():
     found = claim(
         "Asked of nerif", lambda case: as_the_paper(case) | ({"l2": 0.0043} if case.key == "2-0.1-nerif" else {})
     )
-    assert found.here == "L2 in 20 of 21 cells, not Phantom 2 (noise 0.1); CC in 21 of 21 cells"
+    assert found.here == "L2 in 20 of 21 cells, not Phantom 2 (noise 0.1); CC in 21 of 21 cells" + WHY
 
 
 def test_comparison_is_at_the_digits_of_the_paper():

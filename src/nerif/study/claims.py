@@ -18,6 +18,7 @@ VOXEL_METHODS = ("Tikhonov", "Landweber")  # the paper's
 DIGITS = {"cc": 4, "l2": 5}
 """Of the paper's tables, after the point; what is compared with them is rounded alike."""
 
+WHY = "; why: see √(1 − CC²) below the tables, which no ambient flatters"
 AROUND, NEAR_1 = (0.85, 0.95), 0.95  # what "around 0.9" and "approaching 1" are taken for
 
 
@@ -132,9 +133,7 @@ def _as_the_paper(results: Results) -> tuple[str, bool]:
             f"{name.upper()} in {count} of {len(records)} cells" + (f", not {listed(where, 7)}" if bad else "")
         )
         lost |= bool(bad)
-    if lost:
-        parts.append("why: see √(1 − CC²) below the tables, which no ambient flatters")
-    return "; ".join(parts), not lost
+    return "; ".join(parts) + (WHY if lost else ""), not lost
 
 
 def _paper(table: dict[str, tuple[float, ...]], phantom: str, method: str, noise: float) -> float:
