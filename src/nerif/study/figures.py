@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LABELS",
-    "Line",
     "draw_by_phantom",
     "draw_costs",
     "draw_curves",
