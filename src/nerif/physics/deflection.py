@@ -21,7 +21,7 @@ from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Rays
 
-__all__ = ["Deflection", "ForwardModel", "bend", "integration_weights", "midpoints", "project"]
+__all__ = ["MODELS", "Deflection", "ForwardModel", "bend", "integration_weights", "midpoints", "project"]
 
 MODELS = ("lever_arm", "paraxial", "curved")
 

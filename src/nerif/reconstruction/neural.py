@@ -8,19 +8,20 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError, parse_faces
 from nerif.fields.base import Field
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.measurement import Measurement
+from nerif.physics.deflection import MODELS
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step
-from nerif.reconstruction.device import autocast_dtype, peak_memory, resolve_device
+from nerif.reconstruction.device import peak_memory, resolve_device
 from nerif.reconstruction.gauge import AmbientRegion
 from nerif.reconstruction.losses import LossWeights, loss_terms
 from nerif.reconstruction.optimiser import OPTIMISERS, NetworkOptimiser
 from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.sampling import Guide, sample_count, sample_rays
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.warm_start import fit_network
@@ -28,7 +29,7 @@ from nerif.reconstruction.warm_start import fit_network
 __all__ = ["NeRIF"]
 
 CHOICES = {
-    "model": ("lever_arm", "paraxial", "curved"),
+    "model": MODELS,
     "optimiser": OPTIMISERS,
     "sampling": ("adaptive", "random", "shifted", "regular"),
     "norm": ("l2", "squared"),
@@ -162,7 +163,7 @@ class _Training:
         self.field = NeuralField(network.to(self.device), measurement.box, self.target.index_scale)
         self.guide = Guide(self.field)
         self.optimiser = NetworkOptimiser(settings.optimiser, network, settings.betas, settings.momentum)
-        self.network = _MixedPrecision(settings, network, self.device)
+        self.network = MixedPrecision(network, self.device, settings.precision, settings.compile)
         self.history: list[dict[str, float]] = []
         self.order = torch.empty(0, dtype=torch.long)
         self.step, self.rays_done, self.retries, self.rate = 0, 0, 0, 1.0
@@ -409,30 +410,3 @@ class _Training:
         """Mean network output over the ambient region: the constant that the data leave open."""
         points = self.ambient.sample(1 << 14, torch.Generator().manual_seed(0)).to(self.device)
         return float(self.field.network(self.field.normalise(points)).mean())
-
-
-class _MixedPrecision:
-    """The network, compiled where that is asked for, in bf16 while `low` is set and the settings allow it."""
-
-    def __init__(self, settings: NeRIF, network: Network, device: torch.device) -> None:
-        self.network, self.device, self.low = network, device, True
-        self.dtype = autocast_dtype(settings.precision, device)
-        self.both = network.value_and_gradient
-        if settings.compile == "on" or (settings.compile == "auto" and device.type == "cuda"):
-            self.both = torch.compile(network.value_and_gradient, dynamic=True)
-
-    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the n head."""
-        with self._precision():
-            return self.network(p)
-
-    def value_and_gradient(
-        self, p: Float[Tensor, "n 3"], heads: bool
-    ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
-        """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
-        with self._precision():
-            return self.both(p, heads)
-
-    def _precision(self) -> torch.autocast:
-        bf16 = self.low and self.dtype is not None
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=bf16)

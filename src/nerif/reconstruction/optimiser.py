@@ -65,11 +65,16 @@ class NetworkOptimiser:
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take back what `tensors` gave; those of another optimiser are an error."""
+        found = {key.split(".")[0] for key in tensors}
+        if tensors and found != set(self.parts):  # before the first step there is nothing to take back
+            asked = " and ".join(sorted(self.parts))
+            raise InputError(
+                f"resume: expected a checkpoint of {asked}, got one of {' and '.join(sorted(found))}; "
+                "give the same --optimiser"
+            )
         moments: dict[str, dict[int, dict[str, Tensor]]] = {name: {} for name in self.parts}
         for key, tensor in tensors.items():
             name, i, entry = key.split(".")
-            if name not in moments:
-                raise InputError(f"resume: the checkpoint is of another optimiser ({name}); give the same settings")
             moments[name].setdefault(int(i), {})[entry] = tensor.clone()
         for name, part in self.parts.items():
             part.load_state_dict({"state": moments[name], "param_groups": part.state_dict()["param_groups"]})

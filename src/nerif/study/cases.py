@@ -39,6 +39,7 @@ SECTIONS = {
 PHANTOMS = ("1", "2", "3", "4", "5", "6", "7")
 NOISES = (0.0, 0.1, 0.15)
 METHODS = ("NeRIF", "Tikhonov", "Landweber", "TV")
+EQUAL = ((24, 48), 10)  # samples and their jitter where intervals are equal
 
 
 @dataclass(frozen=True)
@@ -231,6 +232,3 @@ def variants(base: NeRIF, gpu: bool) -> dict[str, NeRIF]:
         "twice the width": replace(base, network=replace(network, width=2 * network.width)),
         "half the batch": replace(base, points_per_batch=base.points_per_batch // 2),
     }
-
-
-EQUAL = ((24, 48), 10)  # samples and their jitter where intervals are equal

@@ -87,9 +87,8 @@ def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, sh
 
     def follow(step: Step) -> None:
         on_progress("reconstructing", step.progress)
-        if case.snapshots and len(snapshots) < len(SHARES) and step.progress >= SHARES[len(snapshots)]:
-            while len(snapshots) < len(SHARES) and step.progress >= SHARES[len(snapshots)]:
-                snapshots.append(step.capture())
+        if case.snapshots and any(share <= step.progress for share in SHARES[len(snapshots) :]):
+            snapshots.append(step.capture())
 
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
@@ -116,7 +115,7 @@ def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, sh
         rays = len(measurement.rays()[0])
         followed = [*_earlier(case, measurement, snapshots), result]
         record["curve"] = [_point(r, truth, rays) for r in followed]
-    if "model" in case.labels and case.key.endswith("-nerif"):
+    if case.labels.get("model") == "lever_arm":
         record["forward"] = _forward_models(phantom, measurement)
     if isinstance(phantom, Octahedron):
         record["resolution"] = measure_resolution(result.field, phantom).as_dict()
