@@ -113,7 +113,7 @@ def _about(settings: Study, scale: Scale, sections: tuple[str, ...]) -> dict[str
     return {
         **asdict(scale),
         "scale": scale.name,
-        "command": shlex.join(["nerif", "study", *sys.argv[2:]]),
+        "command": shlex.join(["nerif", "study", *(word for word in sys.argv[2:] if word != "--page-only")]),
         "machine": _machine(scale.device, found["machine"]),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "nerif": __version__,
