@@ -216,7 +216,9 @@ CLAIMS_OF_METHOD = (
         _network,
     ),
     Question(
-        "Positional encoding speeds up convergence (taken as: a lower error after the same time)", "a figure", _encoding
+        "Positional encoding speeds up convergence (taken as: a lower error at the end of equally long runs)",
+        "a figure",
+        _encoding,
     ),
     Question("Too many octaves overfit (taken as: a higher error at a loss that is no higher)", "a remark", _too_many),
     Question("Random sampling along the rays is more accurate than regular sampling", "a remark", _sampling),

@@ -138,7 +138,7 @@ def _metric(record: Record | None, name: str) -> float | None:
     return None if record is None else finite(record["metrics"].get(name))
 
 
-SETTING = "Phantom 2 at noise 0.1; each run changes only this, and has the same time."
+SETTING = "Phantom 2 at noise 0.1; each run changes only this, and has the same limits of time and steps."
 
 TEXTS: dict[str, Callable[[Results], list[str]]] = {
     "tables": tables.accuracy,
