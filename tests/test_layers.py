@@ -14,7 +14,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 LAYERS = (
     ("conventions",),
     ("geometry",),
-    ("measurement", "volume", "vti", "reprojection"),
+    ("measurement", "measurement_sequence", "volume", "volume_sequence", "vti", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),
@@ -22,7 +22,7 @@ LAYERS = (
     ("experiment",),
     ("reconstruction",),
     ("evaluation", "consistency", "mistakes"),
-    ("report",),
+    ("report", "sequence"),
     ("study",),
     ("commands",),
     ("cli", "__main__"),
@@ -94,6 +94,9 @@ HEAVY = (
     "cv2",
     "tifffile",
     "imageio",
+    "zarr",
+    "dask",
+    "distributed",
 )
 
 

@@ -18,7 +18,7 @@ from nerif.geometry import Box, Camera, Plane, Rays
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["CONVENTIONS", "Measurement"]
+__all__ = ["CONVENTIONS", "MAPS", "Measurement"]
 
 CONVENTIONS = "BOST-1.0"
 
@@ -37,6 +37,9 @@ VARIABLES = {
     "image_size": (("view", "side"), "px"),
 }
 """Dimensions and unit of every variable of the file."""
+
+MAPS = ("displacement", "sigma", "valid", "flow_mask")
+"""What is measured; the rest is known of the rig."""
 
 OPTIONAL = ("sigma", "valid", "flow_mask", "distortion", "image_size")
 SIZES = {"component": 2, "i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2}
@@ -214,6 +217,14 @@ class Measurement:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file of docs/formats.md, atomically."""
+        dataset = self.to_dataset()
+        temporary = Path(f"{os.fspath(path)}.part")
+        packed = {k: {"zlib": True, "complevel": 3} for k in MAPS if k in dataset}
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=packed)
+        os.replace(temporary, path)
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return the variables and attributes of the file."""
         import numpy as np
         import xarray as xr
 
@@ -232,7 +243,7 @@ class Measurement:
             "box": np.array([self.box.lower, self.box.upper]),
             "image_size": np.array([c.image_size for c in cameras], dtype=np.int32),
         }
-        for name in ("sigma", "valid", "flow_mask"):
+        for name in MAPS[1:]:
             value = getattr(self, name)
             if value is not None:
                 data[name] = value.to(torch.int8 if value.dtype == torch.bool else torch.float32).numpy()
@@ -245,11 +256,7 @@ class Measurement:
         }
         if self.wavelength_nm is not None:
             dataset.attrs["wavelength_nm"] = self.wavelength_nm
-        temporary = Path(f"{os.fspath(path)}.part")
-        maps = ("displacement", "sigma", "valid", "flow_mask")
-        packed = {k: {"zlib": True, "complevel": 3} for k in maps if k in data}
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=packed)
-        os.replace(temporary, path)
+        return dataset
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Measurement:
@@ -271,12 +278,19 @@ class Measurement:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"{path}: not a readable NetCDF-4 file, or truncated ({reason})") from None
         try:
-            return cls._from_dataset(dataset)
+            return cls.from_dataset(dataset)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
     @classmethod
-    def _from_dataset(cls, dataset: xr.Dataset) -> Measurement:
+    def from_dataset(cls, dataset: xr.Dataset) -> Measurement:
+        """Return the measurement that such variables and attributes describe.
+
+        Raises
+        ------
+        InputError
+            If they break the contract; the message names the variable.
+        """
         import numpy as np
 
         found = dataset.attrs.get("Conventions")

@@ -1,8 +1,8 @@
-"""nerif simulate: a measurement of a phantom, and its truth."""
+"""nerif simulate: a measurement of a phantom, or of a moving one over time, and its truth."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,8 +15,10 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
+from nerif.measurement_sequence import MeasurementSequence
 from nerif.simulation import STEPS, simulate
 from nerif.volume import Volume, read_volume, write_netcdf
+from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["Simulate", "main", "run"]
 
@@ -26,7 +28,7 @@ class Simulate:
     """Trace curved rays through a phantom and write a measurement, with its truth as a volume beside it."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Measurement to write, NAME.nc; the truth becomes NAME.truth.nc."""
+    """Measurement to write, NAME.nc; the truth becomes NAME.truth.nc. With --times NAME.zarr and NAME.truth.zarr."""
     phantom: str = "flame"
     """One of gaussians, flame, octahedron, 1-7 (the paper's numbers), or a volume file (.nc, .vti) of your own."""
     noise: float = 0.0
@@ -35,6 +37,8 @@ class Simulate:
     """Of phantom and noise."""
     time: float = 0.0
     """Instant of the flame, s."""
+    times: str = ""
+    """Many instants of the flame, FIRST:LAST:COUNT in s (0:2.3e-3:24): a sequence."""
     box: tuple[float, float, float] = (50.0, 50.0, 50.0)
     """Edges of the box around the origin, along x y z, mm; a volume file brings its own."""
     n_ambient: float = 1.00027
@@ -55,16 +59,20 @@ class Simulate:
 
 
 def truth_path(out: Path) -> Path:
-    """Return NAME.truth.nc for NAME.nc."""
-    return out.with_name(out.stem + ".truth.nc")
+    """Return NAME.truth.nc for NAME.nc, NAME.truth.zarr for NAME.zarr."""
+    return out.with_name(f"{out.stem}.truth{out.suffix}")
 
 
 def run(settings: Simulate) -> None:
     """Write the measurement and its truth."""
-    if settings.out.suffix != ".nc":
-        raise InputError(f"out: expected a name ending in .nc, got '{settings.out.name}'")
+    ending = ".zarr" if settings.times else ".nc"
+    if settings.out.suffix != ending:
+        raise InputError(f"out: expected a name ending in {ending}, got '{settings.out.name}'")
     if settings.truth_voxels < 1:
         raise InputError(f"truth_voxels: expected at least 1, got {settings.truth_voxels}")
+    if settings.times:
+        run_over_time(settings)
+        return
     check_file(settings.out, settings.force, truth_path(settings.out))
     phantom, box = _phantom(settings)
     cameras = settings.ring.cameras()
@@ -81,6 +89,50 @@ def run(settings: Simulate) -> None:
     rms = float(d.square().mean().sqrt())
     say(f"{settings.out}: {len(cameras)} views, {len(rays)} rays cross the box, rms displacement {rms:.3f} px")
     say(f"{truth_path(settings.out)}: the truth on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
+
+
+def instants(text: str) -> tuple[float, ...]:
+    """Return the instants that FIRST:LAST:COUNT stands for, s.
+
+    Raises
+    ------
+    InputError
+        If it stands for none.
+    """
+    try:
+        first, last, count = (kind(word) for kind, word in zip((float, float, int), text.split(":"), strict=True))
+        if not (count == 1 or (count > 1 and last > first)):
+            raise ValueError
+    except ValueError:
+        raise InputError(f"times: expected FIRST:LAST:COUNT in s, such as 0:2.3e-3:24, got '{text}'") from None
+    return tuple(first + (last - first) * i / max(count - 1, 1) for i in range(count))
+
+
+def run_over_time(settings: Simulate) -> None:
+    """Write a measurement of every instant and its truth, as two stores."""
+    times = instants(settings.times)
+    if settings.phantom not in ("flame", "2", "3", "4", "5", "6", "7"):
+        raise InputError(f"times: expected a phantom that moves (flame, 2-7), got '{settings.phantom}'")
+    cameras, truth = settings.ring.cameras(), truth_path(settings.out)
+    for path in (settings.out, truth):
+        if path.exists() and not settings.force:
+            raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
+    with counting_bar("simulating frames", len(times)) as bar:
+        for i, time in enumerate(times):
+            phantom, box = _phantom(replace(settings, time=time))
+            measurement = simulate(
+                phantom, cameras, box, settings.n_ambient, settings.noise, settings.seed + i, settings.steps,
+                settings.wavelength_nm, settings.ambient_faces,
+            )  # fmt: skip
+            if i == 0:
+                sequence = MeasurementSequence.create(settings.out, times, measurement, settings.force)
+                grid = Grid.of_resolution(box, settings.truth_voxels)
+                store = VolumeSequence.create(truth, times, grid, ("index_excess",), settings.n_ambient)
+            sequence.write_frame(i, measurement)
+            store.write(i, [Volume(phantom.sample(grid), grid)])
+            bar(i + 1)
+    say(f"{settings.out}: {len(times)} frames of {len(cameras)} views")
+    say(f"{truth}: the truth on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
 
 
 def _phantom(settings: Simulate) -> tuple[Field, Box]:

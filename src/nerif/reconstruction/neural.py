@@ -24,7 +24,7 @@ from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.sampling import Guide, sample_count, sample_rays
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.warm_start import fit_network
+from nerif.reconstruction.warm_start import adopt, fit_network
 
 __all__ = ["NeRIF"]
 
@@ -223,7 +223,7 @@ class _Training:
         return bool(self.ranks.decided([float(asked)], self.device)[0])
 
     def _fit(self, on_step: OnStep | None) -> Outcome | None:
-        """Fit the network to the field that the run starts from, if any; the steps after it are smaller."""
+        """Take over the field that the run starts from, or fit the network to it; the steps after it are smaller."""
         if self.start is None:
             return None
         settings, outcome = self.settings, None
@@ -240,10 +240,12 @@ class _Training:
             return outcome is not None
 
         self.network.low = True
-        fit_network(
-            self.field, self.network, self.start, settings.fit_steps, settings.points_per_batch,
-            settings.learning_rate, self.generator, log,
-        )  # fmt: skip
+        if not adopt(self.field, self.start):
+            fit_network(
+                self.field, self.network, self.start, settings.fit_steps, settings.points_per_batch,
+                settings.learning_rate, self.generator, log,
+            )  # fmt: skip
+        self.guide.update(self.network)
         self.rate, self.good = settings.rate_after_fit, self._capture()
         return outcome
 

@@ -1,5 +1,7 @@
 """Starting the network from a field that is there already, such as a classical reconstruction of the same data.
 
+The weights of a network of the same shape are taken over (adopt); to any other field the network is fitted:
+
 min  mean (N - n)^2 / mean n^2  +  mean |grad N - grad n|^2 / mean |grad n|^2       over random points of the box
 """
 
@@ -9,14 +11,32 @@ import math
 from collections.abc import Callable
 
 import torch
+from torch import nn
 
 from nerif.fields.base import Field
 from nerif.fields.mlp import NeuralField
 from nerif.reconstruction.losses import Evaluator
 
-__all__ = ["fit_network"]
+__all__ = ["adopt", "fit_network"]
 
 WARM_UP = 20  # steps
+
+
+def adopt(field: NeuralField, start: Field) -> bool:
+    """Take over the weights of a neural field, exactly; False, and nothing done, if it has another shape or box."""
+    if not isinstance(start, NeuralField) or start.network.shape != field.network.shape or start.box != field.box:
+        return False
+    field.network.load_state_dict(start.network.state_dict())
+    ratio = start.index_scale / field.index_scale
+    with torch.no_grad():
+        for output in field.network.outputs:
+            assert isinstance(output, nn.Linear)  # so that a change of scale goes over
+            output.weight.mul_(ratio)
+            output.bias.mul_(ratio)
+        value = field.network.outputs[0]
+        assert isinstance(value, nn.Linear)
+        value.bias.sub_(start.offset * ratio)
+    return True
 
 
 def fit_network(

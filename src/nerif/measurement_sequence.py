@@ -1,0 +1,177 @@
+"""Measurements over time: a Zarr store of the measurement's variables, with a leading dimension `time` (BOST-1.0).
+
+Each frame has chunks of its own, so frames are written and read one by one, by as many processes as there are.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerif.conventions import InputError
+from nerif.measurement import CONVENTIONS, MAPS, Measurement
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["MeasurementSequence", "require_zarr"]
+
+
+def require_zarr() -> None:
+    """Raise InputError, with the remedy, where zarr is not installed."""
+    try:
+        import zarr  # noqa: F401
+    except ImportError:
+        raise InputError("sequences: zarr is not installed; pip install 'nerif[sequence]'") from None
+
+
+@dataclass(frozen=True)
+class MeasurementSequence:
+    """A measurement for every instant, on disc.
+
+    Parameters
+    ----------
+    path : of the Zarr store
+    times : of the frames, s, increasing
+    """
+
+    path: Path
+    times: tuple[float, ...]
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    # -- reading -------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> MeasurementSequence:
+        """Open a store; frames are read when they are asked for.
+
+        Raises
+        ------
+        InputError
+            If it is missing, foreign, or has no `time`.
+        """
+        path = Path(path)
+        with _opened(path) as dataset:
+            if dataset.attrs.get("Conventions") != CONVENTIONS:
+                found = dataset.attrs.get("Conventions")
+                raise InputError(f"{path}: attribute Conventions: expected '{CONVENTIONS}', got '{found}'")
+            if "displacement" not in dataset or dataset["displacement"].dims[:1] != ("time",):
+                got = dataset["displacement"].dims if "displacement" in dataset else "none"
+                raise InputError(f"{path}: variable 'displacement': expected a leading dimension time, got {got}")
+            count = dataset.sizes["time"]
+            times = dataset["time"].values.tolist() if "time" in dataset.coords else list(range(count))
+        times = tuple(float(t) for t in times)
+        if not times or any(not b > a for a, b in pairwise(times)):
+            raise InputError(f"{path}: coordinate time: expected increasing instants in s, got {_short(times)}")
+        return cls(path, times)
+
+    def frame(self, index: int) -> Measurement:
+        """Return the measurement of one instant.
+
+        Raises
+        ------
+        InputError
+            If the frame breaks the contract of a measurement, such as a view with no valid pixel.
+        """
+        with _opened(self.path) as dataset:
+            one = dataset.isel(time=index).load() if "time" in dataset.dims else dataset.load()
+        try:
+            return Measurement.from_dataset(one.drop_vars("time", errors="ignore"))
+        except InputError as error:
+            raise InputError(f"{self.path}, frame {index}: {error}") from None
+
+    def first_good(self) -> Measurement:
+        """Return the first frame that is a measurement: cameras and box are those of all.
+
+        Raises
+        ------
+        InputError
+            If there is none, with what is wrong with the first.
+        """
+        wrong = None
+        for index in range(len(self)):
+            try:
+                return self.frame(index)
+            except InputError as error:
+                wrong = wrong or error
+        raise InputError(f"no frame can be used; the first: {wrong}")
+
+    # -- writing -------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def create(
+        cls, path: str | os.PathLike[str], times: Sequence[float], like: Measurement, force: bool = False
+    ) -> MeasurementSequence:
+        """Make a store for frames of the cameras, box and optional variables of `like`, with nothing measured yet.
+
+        Raises
+        ------
+        InputError
+            If the store exists, unless forced, or the times do not increase.
+        """
+        import numpy as np
+        import zarr
+
+        path = Path(path)
+        if any(not b > a for a, b in pairwise(times)) or not len(times):
+            raise InputError(f"times: expected increasing instants in s, got {_short(times)}")
+        if path.exists():
+            if not force:
+                raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        dataset = like.to_dataset()
+        # the static variables by xarray, those of each frame as empty arrays of one chunk a frame
+        fixed = dataset.drop_vars([name for name in MAPS if name in dataset])
+        # names as text of any length: the fixed one has no place in Zarr's third format
+        names = {k: (k, fixed[k].values.astype(object)) for k in ("view", "component")}
+        time = ("time", np.asarray(times, dtype=np.float64), {"units": "s", "axis": "T"})
+        fixed.assign_coords(names).assign_coords(time=time).to_zarr(path, mode="w", consolidated=False, zarr_format=3)
+        group = zarr.open_group(path, mode="r+")
+        for name in MAPS:
+            if name in dataset:
+                v = dataset[name]
+                fill = np.nan if v.dtype.kind == "f" else 0
+                group.create_array(
+                    name, shape=(len(times), *v.shape), chunks=(1, *v.shape), dtype=v.dtype, fill_value=fill,
+                    dimension_names=["time", *map(str, v.dims)], attributes=dict(v.attrs),
+                )  # fmt: skip
+        return cls(path, tuple(float(t) for t in times))
+
+    def write_frame(self, index: int, measurement: Measurement) -> None:
+        """Write one frame; cameras and box are those the store was made with."""
+        import zarr
+
+        group: Any = zarr.open_group(self.path, mode="r+")
+        dataset = measurement.to_dataset()
+        for name in MAPS:
+            if (name in dataset) != (name in group):
+                has = "with" if name in group else "without"
+                raise InputError(f"{self.path}, frame {index}: expected a measurement {has} '{name}' as the others")
+            if name in dataset:
+                group[name][index] = dataset[name].values
+
+
+def _opened(path: Path) -> xr.Dataset:
+    """The store as a dataset of which nothing is read yet."""
+    import xarray as xr
+
+    require_zarr()
+    if not path.exists():
+        raise InputError(f"{path}: no such store; expected a measurement sequence (Zarr, {CONVENTIONS})")
+    try:
+        return xr.open_dataset(path, engine="zarr", chunks=None, consolidated=False)
+    except (OSError, ValueError, KeyError, FileNotFoundError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: not a readable Zarr store ({reason})") from None
+
+
+def _short(times: Sequence[float]) -> str:
+    shown = ", ".join(f"{t:g}" for t in times[:4])
+    return f"{shown}, ..." if len(times) > 4 else shown or "none"

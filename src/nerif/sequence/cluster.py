@@ -1,0 +1,152 @@
+"""Where the frames are reconstructed: workers on this machine, jobs of SLURM, or a Dask scheduler that runs already."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from nerif.conventions import InputError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+__all__ = ["open_cluster", "slurm_cluster", "worker_count"]
+
+CONFIG = {
+    "distributed.scheduler.allowed-failures": 0,  # deaths are counted by frame, in run.py
+    "distributed.scheduler.worker-saturation": 1.0,  # a chunk waits for a worker, not at one
+    "distributed.comm.timeouts.connect": "60s",
+}
+PREFIX = ("tcp://", "tls://", "ucx://", "ws://", "wss://")
+
+
+def require_dask() -> None:
+    """Raise InputError, with the remedy, where Dask is not installed."""
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("cluster: Dask is not installed; pip install 'nerif[sequence]'") from None
+
+
+def worker_count(workers: int) -> int:
+    """Return the workers of this machine: as asked, or one for each GPU, or one for each two cores."""
+    if workers < 0:
+        raise InputError(f"workers: expected 1 or more, or 0 for as many as fit, got {workers}")
+    return workers or torch.cuda.device_count() or max(1, _cores() // 2)
+
+
+def _cores() -> int:
+    from dask.system import CPU_COUNT
+
+    return int(CPU_COUNT)  # what a container or job leaves of the machine
+
+
+@contextmanager
+def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
+    """Give a client of the cluster and the threads that each worker may use (0: as it finds them); close it at the end.
+
+    Parameters
+    ----------
+    where : "local"; "tcp://host:port" of a scheduler; or a YAML file for SLURM (docs/sequences.md)
+    workers : of a local cluster; 0 for as many as fit
+
+    Raises
+    ------
+    InputError
+        If there is no such file or scheduler, or the file is not understood.
+    """
+    require_dask()
+    import dask
+    from distributed import Client
+
+    if where.startswith(PREFIX):
+        with dask.config.set({"distributed.comm.timeouts.connect": "10s"}):
+            try:
+                client = Client(where)
+            except (OSError, TimeoutError, ValueError) as error:
+                reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+                raise InputError(f"cluster: no scheduler answers at {where} ({reason})") from None
+        with client:
+            yield client, 0
+        return
+    with dask.config.set(CONFIG):
+        if where == "local":
+            count = worker_count(workers)
+            cluster, threads = _local_cluster(count), max(1, _cores() // count)
+        else:
+            cluster, threads = slurm_cluster(Path(where)), 0
+        with cluster, Client(cluster) as client:
+            yield client, threads
+
+
+def _local_cluster(workers: int) -> Any:
+    """A process for each worker, each with a GPU of its own where there are GPUs."""
+    from distributed import Nanny, Scheduler, SpecCluster
+
+    gpus = torch.cuda.device_count()
+    specification = {}
+    for i in range(workers):
+        environment = {"CUDA_VISIBLE_DEVICES": str(i % gpus)} if gpus else {}
+        specification[i] = {
+            "cls": Nanny,
+            "options": {"nthreads": 1, "env": environment, "memory_limit": 0, "dashboard": False},
+        }
+    dashboard = {"dashboard": True, "dashboard_address": "localhost:0"} if _has_bokeh() else {"dashboard": False}
+    scheduler = {"cls": Scheduler, "options": {"host": "localhost", "port": 0, **dashboard}}
+    return SpecCluster(workers=specification, scheduler=scheduler, silence_logs="ERROR")
+
+
+def _has_bokeh() -> bool:
+    try:
+        import bokeh  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def slurm_cluster(path: Path) -> Any:
+    """Return the SLURM cluster of a YAML file: `jobs`, and what dask_jobqueue.SLURMCluster takes.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or no YAML, a key is unknown, or dask-jobqueue is not installed.
+    """
+    settings = read_slurm(path)
+    jobs = settings.pop("jobs", 1)
+    if not isinstance(jobs, int) or jobs < 1:
+        raise InputError(f"{path}: jobs: expected a number of jobs of 1 or more, got {jobs!r}")
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError:
+        raise InputError("cluster: dask-jobqueue is not installed; pip install 'nerif[cluster]'") from None
+    try:
+        cluster = SLURMCluster(**settings)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: not what SLURM jobs are made of ({error}); see docs/sequences.md") from None
+    cluster.scale(jobs=jobs)
+    return cluster
+
+
+def read_slurm(path: Path) -> dict[str, Any]:
+    """Read the settings of a SLURM cluster, with the defaults that a worker of ours wants: one process, one thread."""
+    import yaml
+
+    if not path.is_file():
+        raise InputError(f"cluster: expected local, tcp://HOST:PORT or a YAML file for SLURM, got '{path}'")
+    try:
+        found = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: expected names and values such as 'queue: gpu', got {type(found).__name__}")
+    wanted = {str(k).replace("-", "_"): v for k, v in found.items()}
+    for name in ("cores", "memory"):
+        if name not in wanted:
+            raise InputError(f"{path}: expected '{name}' of a job, e.g. '{name}: {'8' if name == 'cores' else '32GB'}'")
+    # a job is one worker that takes one chunk of time at once, on all cores of the job
+    return {"processes": 1, "job_cpu": wanted["cores"], **wanted, "cores": 1}

@@ -1,0 +1,146 @@
+"""The frames of one chunk of time, one after the other, each from the one before. Runs in a worker.
+
+    frame 0: from nothing  ->  frame 1: from the weights of 0, fewer steps  ->  ...
+
+A frame that fails is tried again from nothing, then with half the learning rate, then recorded; the next one starts
+from the last that is done. The weights are read back from the store, so a chunk that goes on elsewhere, after a death,
+gives what it would have given undisturbed.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.mlp import NeuralField
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
+from nerif.measurement_sequence import MeasurementSequence
+from nerif.metrics import correlation
+from nerif.physics.deflection import Deflection, project
+from nerif.physics.quantities import GasSettings, derive
+from nerif.reconstruction.base import Reconstruction
+from nerif.reconstruction.device import keep_freed_memory
+from nerif.reconstruction.neural import NeRIF
+from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
+
+__all__ = ["ATTEMPTS", "Event", "Plan", "reconstruct_frames"]
+
+ATTEMPTS = 3  # at a frame
+PIXELS = 1024  # of each view, evenly over it, in which a frame is compared with what was measured
+SAMPLES = 80  # a ray, for that
+
+Event = Callable[[dict[str, object]], None]
+"""Told {"frame", "what": "begun" | "done" | "failed", ...} as a frame goes along."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What every worker has to know.
+
+    Parameters
+    ----------
+    measurement, out : stores
+    cold : settings of a frame that starts from nothing
+    warm : settings of a frame that starts from the one before
+    voxels : of the volumes, along the longest edge
+    quantities : written
+    gas : what density and temperature are computed for
+    hold_out : views kept out
+    threads : of a worker on a CPU; 0 for its share of the cores
+    """
+
+    measurement: Path
+    out: Path
+    cold: NeRIF
+    warm: NeRIF
+    voxels: int = 100
+    quantities: tuple[str, ...] = ("index_excess",)
+    gas: GasSettings = field(default_factory=GasSettings)
+    hold_out: tuple[str, ...] = ()
+    threads: int = 0
+
+
+def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda told: None) -> None:
+    """Reconstruct the frames first to last - 1 that the store lacks."""
+    if plan.threads:
+        torch.set_num_threads(plan.threads)
+    keep_freed_memory()
+    sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
+    parent = os.getppid()
+    start: NeuralField | None = None
+    for index in range(first, last):
+        status = store.status[index]
+        if status == MISSING:
+            event({"frame": index, "what": "begun"})
+            try:
+                frame = _attempts(plan, sequence, index, start, parent)
+            except _FrameError as error:
+                store.fail(index, str(error), ATTEMPTS)
+                event({"frame": index, "what": "failed", "reason": str(error)})
+                continue
+            store.write_frame(index, frame)
+            event({"frame": index, "what": "done", "seconds": frame.seconds, "rms_px": float(np.mean(frame.rms_px))})
+            status = DONE
+        if status == DONE:
+            start = store.field(index)
+
+
+class _FrameError(Exception):
+    """A frame could not be reconstructed in as many attempts as there are."""
+
+
+def _attempts(plan: Plan, sequence: MeasurementSequence, index: int, start: NeuralField | None, parent: int) -> Frame:
+    """One frame: as planned, then from nothing, then more cautiously."""
+    careful = replace(plan.cold, learning_rate=plan.cold.learning_rate / 2)
+    tries = [(plan.cold, None) if start is None else (plan.warm, start), (plan.cold, None), (careful, None)]
+    reason = ""
+    for number, (settings, begin) in enumerate(tries, start=1):
+        try:
+            return replace(_frame(plan, settings, sequence.frame(index), begin, parent), attempts=number)
+        except (InputError, ArithmeticError, RuntimeError, MemoryError, OSError) as error:
+            reason = str(error) or type(error).__name__
+    raise _FrameError(reason)
+
+
+def _frame(plan: Plan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, parent: int) -> Frame:
+    begun = time.perf_counter()
+    training = measurement.select([name for name in measurement.names if name not in plan.hold_out])
+
+    def watch(_: object) -> None:
+        if os.getppid() != parent:  # the command was killed, and may run again: leave the frames to the new one
+            os._exit(1)
+
+    result = settings(training, watch, None, start)
+    if result.outcome.reason == "diverged":
+        raise ArithmeticError(result.outcome.message)
+    assert isinstance(result.field, NeuralField)
+    excess = result.volume(Grid.of_resolution(measurement.box, plan.voxels))
+    volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
+    cc, rms = _against_measured(result, measurement)
+    steps = int(result.history[-1]["step"]) if result.history else 0
+    return Frame(result.field, volumes, cc, rms, time.perf_counter() - begun, steps)
+
+
+def _against_measured(result: Reconstruction, measurement: Measurement) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation and rms difference (px) in every view, held-out ones included, over some of its pixels."""
+    model = Deflection(samples=SAMPLES, n_ambient=measurement.n_ambient)
+    usable, cc, rms = measurement.usable, [], []
+    for i, camera in enumerate(measurement.cameras):
+        height, width = camera.image_size
+        mask = usable[i, :height, :width]
+        rays = camera.rays(camera.pixel_grid()[mask]).clip(measurement.box)
+        seen = rays.crosses.nonzero()[:, 0]
+        seen = seen[:: max(1, len(seen) // PIXELS)]
+        measured = measurement.displacement[i][usable[i]][seen].numpy()
+        predicted = project(model, result.field, rays[seen].to(dtype=torch.float32), result.device).numpy()
+        cc.append(correlation(measured, predicted) if len(seen) else np.nan)
+        rms.append(float(np.sqrt(np.mean((measured - predicted) ** 2))) if len(seen) else np.nan)
+    return np.array(cc), np.array(rms)

@@ -1,0 +1,191 @@
+"""The result of a sequence: a Zarr store with a chunk for each frame, which xarray opens at any time.
+
+Volumes and the weights of the network are written first and `status` last, so that what a killed run leaves
+half-written counts as missing and is done again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.geometry import Grid
+from nerif.measurement_sequence import MeasurementSequence
+from nerif.volume import Volume
+from nerif.volume_sequence import VolumeSequence, add_frames
+
+__all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore"]
+
+KIND = "nerif sequence 1"  # attribute `kind` of the store
+MISSING, DONE, FAILED = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What came of one frame.
+
+    Parameters
+    ----------
+    field : NeuralField
+    volumes : what is written of it
+    cc, rms_px : (view,) measured against re-projected displacement
+    seconds : spent on the frame
+    steps : of training
+    attempts : how many it took
+    """
+
+    field: NeuralField
+    volumes: Sequence[Volume]
+    cc: np.ndarray
+    rms_px: np.ndarray
+    seconds: float
+    steps: int
+    attempts: int = 1
+
+
+class SequenceStore(VolumeSequence):
+    """A result on disc: volumes, the weights they come from, and how each frame went.
+
+    Parameters
+    ----------
+    path : of the Zarr store
+
+    Raises
+    ------
+    InputError
+        If there is no such store, or it is none of ours.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__(path)
+        if self.attributes.get("kind") != KIND:
+            raise InputError(f"{path}: expected the result of nerif sequence (attribute kind '{KIND}'), got another")
+        self.shape = NetworkShape(**self.attributes["network"])
+
+    @classmethod
+    def begin(
+        cls,
+        path: Path,
+        sequence: MeasurementSequence,
+        grid: Grid,
+        quantities: Sequence[str],
+        network: NetworkShape,
+        attributes: dict[str, Any],
+    ) -> SequenceStore:
+        """Make a store in which every frame is missing; what is there is replaced.
+
+        Parameters
+        ----------
+        sequence : whose instants and views it has
+        grid, quantities : of the volumes
+        attributes : settings and whatever else is to be kept, JSON
+        """
+        like, frames = sequence.first_good(), len(sequence)
+        about = {"kind": KIND, "network": vars(network), "views": list(like.names), **attributes}
+        temporary = path.with_name(path.name + ".part")
+        group = VolumeSequence.create(temporary, sequence.times, grid, quantities, like.n_ambient, about).group
+        views, parameters = len(like.names), sum(p.numel() for p in Network(network).parameters())
+
+        def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
+            add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
+
+        nan = float("nan")
+        for name, unit, meaning in (("cc", "1", "correlation with"), ("rms_px", "px", "rms difference to")):
+            add_frames(
+                group, name, frames, (views,), ("view",), "float64",
+                units=unit, long_name=f"{meaning} what the view measured",
+            )  # fmt: skip
+        add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
+        add("index_scale", "float64", nan, "index excess of one unit of network output")
+        add("offset", "float64", nan, "network output that counts as ambient")
+        add("seconds", "float64", nan, "spent on the frame, s")  # as units they would be read as a time span
+        add("steps", "int32", 0, "steps of training")
+        add("attempts", "int8", 0, "attempts at the frame")
+        add("reason", "str", "", "why the frame failed")
+        flags = {"flag_values": [MISSING, DONE, FAILED], "flag_meanings": "missing done failed"}
+        add("status", "int8", MISSING, "written last: the frame is complete", **flags)
+        if path.exists():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        os.replace(temporary, path)
+        return cls(path)
+
+    # -- frames --------------------------------------------------------------------------------------------------
+
+    @property
+    def status(self) -> np.ndarray:
+        """(time,) MISSING, DONE or FAILED, as it is on disc now."""
+        return np.asarray(self.array("status")[:])
+
+    @property
+    def reasons(self) -> list[str]:
+        """(time,) why a frame failed, or nothing."""
+        return [str(r) for r in self.array("reason")[:]]
+
+    def write_frame(self, index: int, frame: Frame) -> None:
+        """Write a frame; it counts as done when the last of it is written."""
+        self.write(index, frame.volumes)
+        weights = [p.detach().cpu().float().reshape(-1) for p in frame.field.network.parameters()]
+        self.array("weights")[index] = torch.cat(weights).numpy()
+        for name in ("index_scale", "offset"):
+            self.array(name)[index] = getattr(frame.field, name)
+        for name in ("cc", "rms_px", "seconds", "steps", "attempts"):
+            self.array(name)[index] = getattr(frame, name)
+        self.array("reason")[index] = ""
+        self.array("status")[index] = DONE
+
+    def fail(self, index: int, reason: str, attempts: int) -> None:
+        """Record that a frame failed, and why."""
+        self.array("attempts")[index] = attempts
+        self.array("reason")[index] = " ".join(reason.split())
+        self.array("status")[index] = FAILED
+
+    def forget_failures(self) -> int:
+        """Count failed frames as missing again, and return how many there were."""
+        failed = np.flatnonzero(self.status == FAILED)
+        for index in failed:
+            self.array("status")[int(index)] = MISSING
+        return len(failed)
+
+    def field(self, index: int) -> NeuralField:
+        """Return the field of a frame that is done."""
+        if int(self.array("status")[index]) != DONE:
+            raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
+        network = Network(self.shape)
+        weights, at = torch.from_numpy(np.asarray(self.array("weights")[index])), 0
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.copy_(weights[at : at + parameter.numel()].reshape(parameter.shape))
+                at += parameter.numel()
+        network.eval().requires_grad_(False)
+        scale, offset = (float(self.array(name)[index]) for name in ("index_scale", "offset"))
+        return NeuralField(network, self.grid.box, scale, offset)
+
+    def check_same(self, attributes: dict[str, Any]) -> None:
+        """Refuse to go on with other settings than the store was begun with.
+
+        Raises
+        ------
+        InputError
+            Naming the first that differs.
+        """
+        for name, asked in json.loads(json.dumps(attributes)).items():
+            kept = self.attributes.get(name)
+            if isinstance(asked, dict) and isinstance(kept, dict):
+                changed = [k for k in asked if asked[k] != kept.get(k)]
+                if changed:
+                    name, kept, asked = changed[0], kept.get(changed[0]), asked[changed[0]]
+            if kept != asked:
+                raise InputError(
+                    f"{self.path}: {name}: expected {kept!r}, with which it was begun, got {asked!r}; "
+                    "give another --out, or --force to begin anew"
+                )

@@ -1,0 +1,148 @@
+"""Volumes over time: a Zarr store with a chunk for each frame (time, z, y, x), which xarray opens at any time."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerif.conventions import InputError
+from nerif.geometry import Box, Grid
+from nerif.measurement_sequence import require_zarr
+from nerif.volume import REFERENCES, Volume, describe
+
+if TYPE_CHECKING:
+    import zarr
+
+__all__ = ["VolumeSequence", "add_frames"]
+
+
+class VolumeSequence:
+    """A store of volumes on one grid.
+
+    Parameters
+    ----------
+    path : of the Zarr store
+
+    Raises
+    ------
+    InputError
+        If there is no such store, or it holds no volumes over time.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        require_zarr()
+        import zarr
+
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise InputError(f"{path}: no such store; expected volumes over time (Zarr)")
+        try:
+            self.group: zarr.Group = zarr.open_group(self.path, mode="r+")
+            self.attributes: dict[str, Any] = dict(self.group.attrs)
+            axes = [self.array(a).shape[0] for a in "zyx"]
+            self.times = tuple(float(t) for t in self.array("time")[:])
+            box = Box(tuple(self.attributes["box_lower_mm"]), tuple(self.attributes["box_upper_mm"]))
+            self.n_ambient = float(self.attributes["n_ambient"])
+        except (OSError, ValueError, KeyError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InputError(f"{path}: expected volumes over time, written by nerif ({reason})") from None
+        self.grid = Grid(box, (axes[0], axes[1], axes[2]))
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        times: Sequence[float],
+        grid: Grid,
+        quantities: Sequence[str],
+        n_ambient: float,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> VolumeSequence:
+        """Make a store with nothing in it yet; what is there is replaced.
+
+        Parameters
+        ----------
+        times : of the frames, s
+        grid : of the volumes, mm
+        quantities : such as index_excess, density
+        attributes : whatever else is to be kept, JSON
+        """
+        import numpy as np
+        import xarray as xr
+        import zarr
+
+        if path.exists():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        axes = {a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper()}) for a in "zyx"}
+        fixed = xr.Dataset(
+            coords={"time": ("time", np.array(times, dtype=np.float64), {"units": "s", "axis": "T"}), **axes},
+            attrs={
+                "Conventions": "CF-1.11",
+                "title": "Fields of refractive index over time (background-oriented schlieren)",
+                "references": REFERENCES,
+                "n_ambient": n_ambient,
+                "box_lower_mm": list(grid.box.lower),
+                "box_upper_mm": list(grid.box.upper),
+                **(attributes or {}),
+            },
+        )
+        fixed.to_zarr(path, mode="w", consolidated=False, zarr_format=3)
+        group = zarr.open_group(path, mode="r+")
+        for quantity in quantities:
+            unit, name = describe(quantity)
+            add_frames(group, quantity, len(times), grid.shape, ("z", "y", "x"), "float32", units=unit, long_name=name)
+        return cls(path)
+
+    def array(self, name: str) -> Any:  # zarr's own types do not know what an index gives
+        """Return one of the arrays (zarr.Array) of the store."""
+        return self.group[name]
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What is there over time and space."""
+        volumes = ("time", "z", "y", "x")
+        return tuple(name for name, _ in self.group.arrays() if self.array(name).metadata.dimension_names == volumes)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def write(self, index: int, volumes: Sequence[Volume]) -> None:
+        """Write the volumes of one frame."""
+        for volume in volumes:
+            self.array(volume.quantity)[index] = volume.values.float().numpy()
+
+    def volume(self, index: int, quantity: str) -> Volume:
+        """Return one quantity of one frame, NaN where it is masked or the frame is not there.
+
+        Raises
+        ------
+        InputError
+            If the store lacks the quantity.
+        """
+        import numpy as np
+        import torch
+
+        if quantity not in self.quantities:
+            raise InputError(f"{self.path}: expected one of {', '.join(self.quantities)}, got '{quantity}'")
+        values = torch.from_numpy(np.asarray(self.array(quantity)[index]))
+        return Volume(values, self.grid, quantity, describe(quantity)[0], {"n_ambient": self.n_ambient})
+
+
+def add_frames(
+    group: zarr.Group,
+    name: str,
+    frames: int,
+    sizes: tuple[int, ...],
+    dimensions: tuple[str, ...],
+    kind: str,
+    fill: float | str = float("nan"),
+    **about: Any,
+) -> None:
+    """Add an array with a leading dimension time and a chunk for each frame."""
+    group.create_array(
+        name, shape=(frames, *sizes), chunks=(1, *sizes), dtype=kind, fill_value=fill,
+        dimension_names=["time", *dimensions], attributes=about,
+    )  # fmt: skip
