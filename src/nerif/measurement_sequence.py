@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerif.conventions import InputError
-from nerif.measurement import CONVENTIONS, MAPS, Measurement
+from nerif.measurement import CONVENTIONS, MAPS, VARIABLES, Measurement
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -73,7 +73,7 @@ class MeasurementSequence:
         return cls(path, times)
 
     def frame(self, index: int) -> Measurement:
-        """Return the measurement of one instant.
+        """Return the measurement of one instant, without the views that measured nothing then (if others did).
 
         Raises
         ------
@@ -83,6 +83,9 @@ class MeasurementSequence:
         with _opened(self.path) as dataset:
             one = dataset.isel(time=index).load() if "time" in dataset.dims else dataset.load()
         try:
+            if tuple(one["displacement"].dims) == VARIABLES["displacement"][0]:
+                seeing = one["displacement"].notnull().all("component").any(("row", "column")).values
+                one = one.isel(view=seeing) if seeing.any() else one
             return Measurement.from_dataset(one.drop_vars("time", errors="ignore"))
         except InputError as error:
             raise InputError(f"{self.path}, frame {index}: {error}") from None
@@ -145,17 +148,33 @@ class MeasurementSequence:
         return cls(path, tuple(float(t) for t in times))
 
     def write_frame(self, index: int, measurement: Measurement) -> None:
-        """Write one frame; cameras and box are those the store was made with."""
+        """Write one frame, the displacement last; cameras and box are those the store was made with.
+
+        Views that the measurement lacks have measured nothing then.
+        """
+        import numpy as np
         import zarr
 
         group: Any = zarr.open_group(self.path, mode="r+")
         dataset = measurement.to_dataset()
-        for name in MAPS:
+        names = [str(name) for name in group["view"][:]]
+        for name in measurement.names:
+            if name not in names:
+                raise InputError(f"{self.path}, frame {index}: expected views out of {', '.join(names)}, got '{name}'")
+        places = [names.index(name) for name in measurement.names]
+        for name in reversed(MAPS):
             if (name in dataset) != (name in group):
                 has = "with" if name in group else "without"
                 raise InputError(f"{self.path}, frame {index}: expected a measurement {has} '{name}' as the others")
             if name in dataset:
-                group[name][index] = dataset[name].values
+                values = dataset[name].values
+                whole = np.full(group[name].shape[1:], group[name].fill_value, dtype=values.dtype)
+                whole[places, : values.shape[1], : values.shape[2]] = values
+                group[name][index] = whole
+
+    def is_written(self, index: int) -> bool:
+        """Whether a frame has been written, to its end."""
+        return (self.path / "displacement" / "c" / str(index)).is_dir()
 
 
 def _opened(path: Path) -> xr.Dataset:

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import torch
 import tyro
 
-from nerif.commands.output import check_file, say
+from nerif.commands.output import check_file, counting_bar, say
+from nerif.commands.recording import FrameJob, RestingView, frame_numbers, instants_of, measure_frames
 from nerif.commands.settings import flag_value, merge, parse, read_toml
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
 from nerif.geometry import Box, Camera
+from nerif.imaging.assembly import World, join_views
 from nerif.imaging.cameras_file import CalibratedCamera
-from nerif.imaging.displacement import DisplacementMap, DisplacementSettings, measure
+from nerif.imaging.displacement import AtRest, DisplacementMap, DisplacementSettings, measure
 from nerif.imaging.masks import flow_mask, read_mask
 from nerif.imaging.views import View, find_views, good_pictures
 from nerif.measurement import Measurement
+from nerif.measurement_sequence import MeasurementSequence
 
 __all__ = ["Displacement", "main", "run"]
 
@@ -42,11 +44,15 @@ class Displacement:
     upper: tuple[float, float, float]
     """Upper corner of the box, mm."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Measurement to write, NAME.nc; NAME.png shows the displacements."""
+    """Measurement to write, NAME.nc, and NAME.png to show the displacements; NAME.zarr with --frames."""
     views: tuple[str, ...] = ()
     """Only these views."""
     frame: int = 0
     """Which flow picture to take."""
+    frames: str = ""
+    """Many flow pictures, all or FIRST:LAST (LAST not included): a sequence, --out NAME.zarr."""
+    frame_rate: float = 0.0
+    """Flow pictures a second, where the recording does not tell."""
     average: int = 1
     """Number of flow pictures, from `frame` on, whose displacements are averaged."""
     references: int = 100
@@ -65,21 +71,28 @@ class Displacement:
     """TOML file of settings; flags win over it."""
     method: Annotated[DisplacementSettings, tyro.conf.arg(name="")] = field(default_factory=DisplacementSettings)
 
+    def world(self, box: Box) -> World:
+        """What the measurement holds beside its views."""
+        return World(box, self.n_ambient, self.wavelength_nm, self.ambient_faces)
+
 
 def run(settings: Displacement) -> Measurement:
-    """Write the measurement."""
-    if settings.out.suffix != ".nc":
-        raise InputError(f"out: expected a name ending in .nc, got '{settings.out.name}'")
+    """Write the measurement, or the first frame's of a sequence."""
+    ending = ".zarr" if settings.frames else ".nc"
+    if settings.out.suffix != ending:
+        raise InputError(f"out: expected a name ending in {ending}, got '{settings.out.name}'")
     for name, least in (("frame", 0), ("average", 1), ("references", 0), ("mask", 0)):
         if not getattr(settings, name) >= least:
             raise InputError(f"{name}: expected {least} or more, got {getattr(settings, name)}")
-    picture = settings.out.with_suffix(".png")
-    check_file(settings.out, settings.force, picture)
     box = Box(settings.lower, settings.upper)
     views = find_views(settings.folder, settings.views)
+    if settings.frames:
+        return run_over_time(settings, box, views).first_good()
+    picture = settings.out.with_suffix(".png")
+    check_file(settings.out, settings.force, picture)
     cameras = _calibrated(settings.calibration, views)
     maps, kept = _measure(views, cameras, settings)
-    measurement = _join(kept, maps, box, settings)
+    measurement = join_views([camera for camera, _ in kept], maps, [mask for _, mask in kept], settings.world(box))
     measurement.write(settings.out)
     _tell(measurement, maps)
     from nerif.report.displacement_figure import save_displacements
@@ -87,6 +100,37 @@ def run(settings: Displacement) -> Measurement:
     save_displacements(picture, measurement)
     say(f"{settings.out}: measurement of {len(kept)} views; {picture}: its displacements")
     return measurement
+
+
+def run_over_time(settings: Displacement, box: Box, views: Sequence[View]) -> MeasurementSequence:
+    """Write a measurement of every flow picture asked for."""
+    if settings.average != 1 or settings.frame != 0:
+        raise InputError("frame, average: expected neither with --frames, which takes every flow picture by itself")
+    cameras = _calibrated(settings.calibration, views)
+    numbers = frame_numbers(settings.frames, views)
+    times = instants_of(numbers, views[0], settings.frame_rate)
+    resting = []
+    with counting_bar("looking at references", len(views)) as bar:
+        for view in views:
+            reference = good_pictures(view, "reference", say, settings.references)
+            shape = (reference[0].shape[0], reference[0].shape[1])
+            region, mask = (_drawn(view, source, shape) for source in ("region", "mask"))
+            rest = AtRest.of(reference, settings.method, _full_scale(view))
+            resting.append(RestingView(view, _camera(view, cameras[view.name], shape), rest, region, mask))
+            bar(len(resting))
+    job = FrameJob(resting, settings.world(box), settings.mask)
+    return measure_frames(job, numbers, times, settings.out, asdict(settings.method), settings.force)
+
+
+def _drawn(view: View, source: str, shape: tuple[int, int]) -> np.ndarray | None:
+    """A drawn mask of a view, if there is one."""
+    return read_mask(view.folder / view.sources[source], shape) if source in view.sources else None
+
+
+def _full_scale(view: View) -> float | None:
+    """Grey value at which the sensor is full, if that can be told."""
+    bits = _bits(view)
+    return 2**bits - 1 if bits > 1 else None
 
 
 def _calibrated(path: Path, views: Sequence[View]) -> dict[str, CalibratedCamera]:
@@ -137,18 +181,15 @@ def _measure_view(
         )
     shape = (flow[0].shape[0], flow[0].shape[1])
     camera = _camera(view, calibrated, shape)
-    region = read_mask(view.folder / view.sources["region"], shape) if "region" in view.sources else None
-    bits = _bits(view)
-    full = 2**bits - 1 if bits > 1 else None
-    found = measure(reference, flow, settings.method, full, region)
+    found = measure(reference, flow, settings.method, _full_scale(view), _drawn(view, "region", shape))
     if not found.valid.any():
         raise InputError(
             f"view '{view.name}': no pixel holds (noise above {settings.method.max_sigma:g} px or correlation below "
             f"{settings.method.min_correlation:g} everywhere); do the pictures show the same pattern, in focus?"
         )
-    if "mask" in view.sources:
-        return found, camera, read_mask(view.folder / view.sources["mask"], shape)
-    mask = flow_mask(found.displacement, found.sigma, settings.mask) if settings.mask else None
+    mask = _drawn(view, "mask", shape)
+    if mask is None and settings.mask:
+        mask = flow_mask(found.displacement, found.sigma, settings.mask)
     return found, camera, mask
 
 
@@ -192,39 +233,6 @@ def _camera(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) ->
     raise InputError(
         f"view '{view.name}': its pictures have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
         f"with {calibrated.image_size}; calibrate with the same crop, or with the whole frame and no flip"
-    )
-
-
-def _join(
-    kept: Sequence[tuple[Camera, np.ndarray | None]], maps: Sequence[DisplacementMap], box: Box, settings: Displacement
-) -> Measurement:
-    """One measurement of all views; smaller pictures are padded."""
-    sizes = [m.valid.shape for m in maps]
-    height, width = max(s[0] for s in sizes), max(s[1] for s in sizes)
-
-    def stack(arrays: Sequence[np.ndarray], fill: float | bool) -> torch.Tensor:
-        whole = [
-            np.pad(
-                a,
-                [(0, height - a.shape[0]), (0, width - a.shape[1])] + [(0, 0)] * (a.ndim - 2),
-                constant_values=fill,
-            )
-            for a in arrays
-        ]
-        return torch.from_numpy(np.stack(whole))
-
-    everywhere = [np.ones(m.valid.shape, dtype=bool) for m in maps]  # no mask says nothing about where the flow is
-    masks = [e if mask is None else mask for (_, mask), e in zip(kept, everywhere, strict=True)]
-    return Measurement(
-        cameras=tuple(camera for camera, _ in kept),
-        displacement=stack([m.displacement for m in maps], np.nan),
-        box=box,
-        n_ambient=settings.n_ambient,
-        sigma=stack([m.sigma for m in maps], np.nan),
-        valid=stack([m.valid for m in maps], False),
-        flow_mask=stack(masks, False) if any(mask is not None for _, mask in kept) else None,
-        wavelength_nm=settings.wavelength_nm,
-        ambient_faces=settings.ambient_faces,
     )
 
 

@@ -20,7 +20,15 @@ from jaxtyping import Bool, Float
 from nerif.conventions import InputError
 from nerif.imaging.optical_flow import FLOWS, warp
 
-__all__ = ["DisplacementMap", "DisplacementSettings", "displacement", "measure", "remove_shake"]
+__all__ = [
+    "AtRest",
+    "DisplacementMap",
+    "DisplacementSettings",
+    "displacement",
+    "measure",
+    "measure_against",
+    "remove_shake",
+]
 
 Image = Float[np.ndarray, "row column"]
 REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.8}
@@ -99,6 +107,44 @@ def displacement(reference: Image, flow: Image, settings: DisplacementSettings) 
     return -FLOWS[settings.method](first, second, settings.smoothness).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class AtRest:
+    """What the reference frames of a view say, once for all flow frames.
+
+    Parameters
+    ----------
+    mean : of the frames
+    settings : of the method
+    full : (row, column) where the sensor was full in one of them
+    full_scale : grey value at which it is, if known
+    averaged : number of flow frames whose displacements are averaged
+    noise : (row, column, 2) of repeats: as seen, and by the gradients, px; None with fewer than three frames
+    """
+
+    mean: Image
+    settings: DisplacementSettings
+    full: Bool[np.ndarray, "row column"]
+    full_scale: float | None
+    averaged: int
+    noise: tuple[Float[np.ndarray, "row column 2"], Float[np.ndarray, "row column 2"]] | None
+
+    @classmethod
+    def of(
+        cls,
+        reference: Sequence[np.ndarray],
+        settings: DisplacementSettings,
+        full_scale: float | None = None,
+        averaged: int = 1,
+    ) -> AtRest:
+        """Average the frames and take the noise from their differences."""
+        if not len(reference):
+            raise InputError("pictures: expected at least one reference picture, got none")
+        frames = [np.asarray(f, dtype=np.float32) for f in reference]
+        full = np.any([np.asarray(p) >= (np.inf if full_scale is None else full_scale) for p in reference], axis=0)
+        noise = _repeat_sigma(frames, averaged, settings) if len(frames) >= 3 else None
+        return cls(np.stack(frames).mean(axis=0), settings, full, full_scale, averaged, noise)
+
+
 def measure(
     reference: Sequence[np.ndarray],
     flow: Sequence[np.ndarray],
@@ -116,10 +162,16 @@ def measure(
     full_scale : grey value at which the sensor is full, if known: such pixels are not valid
     region : where the background is seen at all, or None
     """
-    if not len(reference) or not len(flow):
-        raise InputError(f"pictures: expected at least one of each, got {len(reference)} reference, {len(flow)} flow")
-    frames = [np.asarray(f, dtype=np.float32) for f in reference]
-    mean = np.stack(frames).mean(axis=0)
+    if not len(flow):
+        raise InputError("pictures: expected at least one flow picture, got none")
+    return measure_against(AtRest.of(reference, settings, full_scale, len(flow)), flow, region)
+
+
+def measure_against(
+    rest: AtRest, flow: Sequence[np.ndarray], region: Bool[np.ndarray, "row column"] | None = None
+) -> DisplacementMap:
+    """Return displacement, noise and validity of a view whose reference is known already; see measure."""
+    mean, settings = rest.mean, rest.settings
     maps, rests = [], []
     for picture in (np.asarray(p, dtype=np.float32) for p in flow):
         seen = displacement(mean, picture, settings)
@@ -128,16 +180,16 @@ def measure(
     d = np.stack(maps).mean(axis=0)
     agreement = np.mean([_local_correlation(a, b, max(3.0, settings.reach)) for a, b in rests], axis=0)
     sigma, source = _structure_sigma(rests, settings.reach), "structure tensor"
-    if len(frames) >= 3:
-        repeats, without = _repeat_sigma(frames, len(maps), settings)
+    if rest.noise is not None:
+        repeats, without = rest.noise
         sigma, source = np.sqrt(repeats**2 + np.maximum(sigma**2 - without**2, 0)), "repeats"
     sigma = np.sqrt(sigma**2 + _smoothed_away(d, settings.reach) ** 2).astype(np.float32)
     rows, columns = np.mgrid[: d.shape[0], : d.shape[1]]
     at_row, at_column = rows - d[..., 1], columns - d[..., 0]
     valid = (at_row >= 0) & (at_row <= d.shape[0] - 1) & (at_column >= 0) & (at_column <= d.shape[1] - 1)
     valid &= (agreement >= settings.min_correlation) & (sigma.max(-1) <= settings.max_sigma)
-    if full_scale is not None:
-        full = np.any([np.asarray(p) >= full_scale for p in (*flow, *reference)], axis=0)
+    if rest.full_scale is not None:
+        full = np.any([rest.full, *(np.asarray(p) >= rest.full_scale for p in flow)], axis=0)
         valid &= ~_grown(full, 2)
     if region is not None:
         valid &= region

@@ -87,7 +87,14 @@ def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda 
                 event({"frame": index, "what": "failed", "reason": str(error)})
                 continue
             store.write_frame(index, frame)
-            event({"frame": index, "what": "done", "seconds": frame.seconds, "rms_px": float(np.mean(frame.rms_px))})
+            event(
+                {
+                    "frame": index,
+                    "what": "done",
+                    "seconds": frame.seconds,
+                    "rms_px": float(np.mean(list(frame.rms_px.values()))),
+                }
+            )
             status = DONE
         if status == DONE:
             start = store.field(index)
@@ -129,18 +136,20 @@ def _frame(plan: Plan, settings: NeRIF, measurement: Measurement, start: NeuralF
     return Frame(result.field, volumes, cc, rms, time.perf_counter() - begun, steps)
 
 
-def _against_measured(result: Reconstruction, measurement: Measurement) -> tuple[np.ndarray, np.ndarray]:
+def _against_measured(result: Reconstruction, measurement: Measurement) -> tuple[dict[str, float], dict[str, float]]:
     """Correlation and rms difference (px) in every view, held-out ones included, over some of its pixels."""
     model = Deflection(samples=SAMPLES, n_ambient=measurement.n_ambient)
-    usable, cc, rms = measurement.usable, [], []
+    usable, cc, rms = measurement.usable, {}, {}
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
         mask = usable[i, :height, :width]
         rays = camera.rays(camera.pixel_grid()[mask]).clip(measurement.box)
         seen = rays.crosses.nonzero()[:, 0]
+        if not len(seen):
+            continue
         seen = seen[:: max(1, len(seen) // PIXELS)]
         measured = measurement.displacement[i][usable[i]][seen].numpy()
         predicted = project(model, result.field, rays[seen].to(dtype=torch.float32), result.device).numpy()
-        cc.append(correlation(measured, predicted) if len(seen) else np.nan)
-        rms.append(float(np.sqrt(np.mean((measured - predicted) ** 2))) if len(seen) else np.nan)
-    return np.array(cc), np.array(rms)
+        cc[camera.name] = correlation(measured, predicted)
+        rms[camera.name] = float(np.sqrt(np.mean((measured - predicted) ** 2)))
+    return cc, rms

@@ -38,7 +38,7 @@ class Frame:
     ----------
     field : NeuralField
     volumes : what is written of it
-    cc, rms_px : (view,) measured against re-projected displacement
+    cc, rms_px : measured against re-projected displacement, by the name of the view
     seconds : spent on the frame
     steps : of training
     attempts : how many it took
@@ -46,8 +46,8 @@ class Frame:
 
     field: NeuralField
     volumes: Sequence[Volume]
-    cc: np.ndarray
-    rms_px: np.ndarray
+    cc: dict[str, float]
+    rms_px: dict[str, float]
     seconds: float
     steps: int
     attempts: int = 1
@@ -138,7 +138,10 @@ class SequenceStore(VolumeSequence):
         self.array("weights")[index] = torch.cat(weights).numpy()
         for name in ("index_scale", "offset"):
             self.array(name)[index] = getattr(frame.field, name)
-        for name in ("cc", "rms_px", "seconds", "steps", "attempts"):
+        for name in ("cc", "rms_px"):
+            found = getattr(frame, name)
+            self.array(name)[index] = np.array([found.get(view, np.nan) for view in self.attributes["views"]])
+        for name in ("seconds", "steps", "attempts"):
             self.array(name)[index] = getattr(frame, name)
         self.array("reason")[index] = ""
         self.array("status")[index] = DONE
