@@ -218,7 +218,7 @@ def _frame(index: int) -> list[str]:
     job, sequence, numbers = _worker
     try:
         measurement, lost = job.measure(numbers[index])
+        sequence.write_frame(index, measurement)
     except InputError as error:
         return [str(error)]
-    sequence.write_frame(index, measurement)
     return lost
