@@ -26,6 +26,9 @@ CHECKED += (
     "consistency",
     "mistakes",
     "study",
+    "measurement_sequence",
+    "volume_sequence",
+    "sequence",
 )
 # what Numba compiles stays as it is written
 SOLVERS = Path(__file__).parents[1] / "src" / "nerif" / "reconstruction"

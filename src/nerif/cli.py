@@ -22,6 +22,7 @@ VERBS = {
     "project": "predict the displacement that any camera would see of a reconstruction",
     "evaluate": "compare a reconstruction with a truth, or with measured views",
     "sequence": "reconstruct every frame of a recording, on one machine or a cluster",
+    "movie": "draw volumes over time, isosurface or slices, as .mp4 or .gif",
     "report": "write a page that shows a result, and says whether it can be trusted",
     "figures": "write every figure of a result as PDF and PNG at journal widths",
     "export": "write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid",

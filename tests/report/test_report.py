@@ -95,7 +95,7 @@ def test_a_volume_of_128_stays_below_15_megabytes(tmp_path):
     values = {q: derive(excess, q, GasSettings()) for q in ("n", "density", "temperature")}
     more = {f"index_excess_{s}": excess for s in ("mean", "std")}
     more |= {f"temperature_{s}": values["temperature"] for s in ("mean", "std")}
-    html.write(Result(tmp_path, volumes={"index_excess": excess, **values, **more}), tmp_path / "r.html")
+    html.write(html.render(Result(tmp_path, volumes={"index_excess": excess, **values, **more})), tmp_path / "r.html")
     assert (tmp_path / "r.html").stat().st_size < 15e6
 
 
@@ -256,7 +256,7 @@ def test_the_gas_is_doubted_in_a_liquid(tmp_path):
     found = {q: derive(water, q, GasSettings()) for q in ("n", "density", "temperature")}
     statements = trust(Result(tmp_path, volumes={"index_excess": water, **found}))
     assert any("do not apply here" in s.text and s.level == "warning" for s in statements)
-    html.write(Result(tmp_path, volumes={"index_excess": water, **found}), tmp_path / "r.html")
+    html.write(html.render(Result(tmp_path, volumes={"index_excess": water, **found})), tmp_path / "r.html")
     assert "NaN" not in scene_of(tmp_path / "r.html")
 
 

@@ -13,6 +13,8 @@ from nerif.commands.settings import parse
 from nerif.conventions import InputError
 from nerif.report import html
 from nerif.report.result import REPORT, read_result
+from nerif.report.sequence_page import render_sequence
+from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["Report", "main", "run", "write_report"]
 
@@ -22,18 +24,23 @@ class Report:
     """Write a page that shows a result: one HTML file, no network, opens from disk."""
 
     result: Annotated[Path, tyro.conf.Positional]
-    """Result directory of nerif reconstruct, finished or not."""
+    """Result directory of nerif reconstruct, or store of nerif sequence (.zarr), finished or not."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File to write; default: RESULT/report.html."""
+    """File to write; default: RESULT/report.html, or RESULT.html of a store."""
 
 
 def run(settings: Report) -> Path:
     """Write the page, and say what could not be shown."""
-    out = settings.out or settings.result / REPORT
+    is_store = settings.result.suffix == ".zarr"
+    out = settings.out or (settings.result.with_suffix(".html") if is_store else settings.result / REPORT)
     if out.suffix not in (".html", ".htm"):
         raise InputError(f"out: expected a name ending in .html, got '{out.name}'")
     if not out.parent.is_dir():
         raise InputError(f"{settings.result if settings.out is None else out}: no such directory")
+    if is_store:
+        html.write(render_sequence(VolumeSequence(settings.result)), out)
+        _say_size(out)
+        return out
     return write_report(settings.result, out)
 
 
@@ -41,12 +48,16 @@ def write_report(directory: Path, out: Path | None = None) -> Path:
     """Write the page of a result directory and return its path."""
     out = out or directory / REPORT
     result = read_result(directory)
-    html.write(result, out)
+    html.write(html.render(result), out)
     for gap in result.missing:
         say(f"missing: {gap.sentence}")
+    _say_size(out)
+    return out
+
+
+def _say_size(out: Path) -> None:
     size = out.stat().st_size
     say(f"{out}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")
-    return out
 
 
 def main(arguments: list[str]) -> None:

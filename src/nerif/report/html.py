@@ -26,7 +26,7 @@ from nerif.volume import Volume
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["render", "write"]
+__all__ = ["flat", "render", "render_page", "svg", "write"]
 
 ASSETS = Path(__file__).parent / "assets"
 QUANTITIES = {
@@ -42,29 +42,23 @@ CITATION = (
 )
 
 
-def write(result: Result, path: Path) -> None:
-    """Write the page, atomically."""
+def write(page: str, path: Path) -> None:
+    """Write a page, atomically."""
     temporary = path.with_name(path.name + ".part")
-    temporary.write_text(render(result), encoding="utf-8")
+    temporary.write_text(page, encoding="utf-8")
     os.replace(temporary, path)
 
 
 def render(result: Result) -> str:
     """Return the page of a result, whatever of it is there."""
-    import jinja2
-
-    loader = jinja2.FileSystemLoader(ASSETS)
-    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["number"] = number
     statements = trust(result)
     scene, arrays = _scene(result)
     metrics = result.metrics.get("views")
     metrics = metrics if isinstance(metrics, list) else []
     views, limit, apart = ([], 0.0, 0.0) if result.reprojection is None else view_images(result.reprojection, metrics)
     first = next((v.name for v in views if v.held_out), views[0].name if views else "")
-    return environment.get_template("report.html.j2").render(
+    return render_page(
         title=result.directory.resolve().name,
-        version=__version__,
         source=_source(result),
         finished=result.about.get("finished", ""),
         headline=headline(statements),
@@ -75,13 +69,11 @@ def render(result: Result) -> str:
             ("Can it be trusted", trust_figures(result)),
         ),
         scene=scene,
-        scene_json=_json(scene),
         arrays=arrays,
         views=views,
         first_view=first,
         limit=limit,
         apart=apart,
-        diverging=_gradient(DIVERGING),
         scores=metrics,
         left_out=(result.metrics.get("ensemble") or {}).get("left_out") or [],
         curves=_curves(result),
@@ -92,12 +84,28 @@ def render(result: Result) -> str:
         ],
         ensemble=result.metrics.get("ensemble"),
         coverage=result.metrics.get("coverage"),
-        settings=_flat(result.settings),
-        about=_flat(result.about),
+        settings=flat(result.settings),
+        about=flat(result.about),
+    )
+
+
+def render_page(scene: dict[str, Any] | None, **parts: Any) -> str:
+    """Return the page of what report.html.j2 is given; parts that are left out are not shown."""
+    import jinja2
+
+    loader = jinja2.FileSystemLoader(ASSETS)
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["number"] = number
+    return environment.get_template("report.html.j2").render(
+        version=__version__,
+        scene=scene,
+        scene_json=_json(scene),
+        diverging=_gradient(DIVERGING),
         citation=CITATION,
         style=(ASSETS / "report.css").read_text(),
         three=(ASSETS / "three.min.js").read_text(),
         script="\n".join((ASSETS / name).read_text() for name in ("volume3d.js", "slices.js", "report.js")),
+        **parts,
     )
 
 
@@ -187,17 +195,18 @@ def _curves(result: Result) -> list[tuple[str, str]]:
     found = []
     if result.history:
         method = str(result.settings.get("method", "nerif"))
-        found.append(("How the run went", _svg(lambda axes: draw_history(axes, result.history, method))))
+        found.append(("How the run went", svg(lambda axes: draw_history(axes, result.history, method))))
     if result.reprojection is not None and result.reprojection.measurement.sigma is not None:
         residuals = residuals_over_sigma(result.reprojection)
-        found.append(("Residuals against the noise", _svg(lambda axes: draw_residuals(axes, residuals))))
+        found.append(("Residuals against the noise", svg(lambda axes: draw_residuals(axes, residuals))))
     if result.metrics.get("slices"):
         slices = result.metrics["slices"]
-        found.append(("Against the truth, slice by slice", _svg(lambda axes: draw_slice_scores(axes, slices))))
+        found.append(("Against the truth, slice by slice", svg(lambda axes: draw_slice_scores(axes, slices))))
     return found
 
 
-def _svg(draw: Callable[[Axes], object]) -> str:
+def svg(draw: Callable[[Axes], object]) -> str:
+    """Return a plot as SVG in a data address."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -226,11 +235,12 @@ def _json(value: Any) -> str:
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _flat(table: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+def flat(table: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Return nested settings as rows of name and value."""
     rows = []
     for key, value in table.items():
         if isinstance(value, dict):
-            rows += _flat(value, f"{prefix}{key}.")
+            rows += flat(value, f"{prefix}{key}.")
         else:
             rows.append((f"{prefix}{key}", ", ".join(map(str, value)) if isinstance(value, list) else str(value)))
     return rows

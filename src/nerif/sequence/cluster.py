@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import inspect
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -124,12 +126,24 @@ def slurm_cluster(path: Path) -> Any:
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise InputError("cluster: dask-jobqueue is not installed; pip install 'nerif[cluster]'") from None
-    try:
-        cluster = SLURMCluster(**settings)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: not what SLURM jobs are made of ({error}); see docs/sequences.md") from None
+    known = _slurm_names()
+    for name in settings:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0)[0]
+            raise InputError(f"{path}: unknown key '{name}'; the nearest known one is '{near}'; see docs/sequences.md")
+    cluster = SLURMCluster(**settings)
     cluster.scale(jobs=jobs)
     return cluster
+
+
+def _slurm_names() -> list[str]:
+    """What SLURMCluster understands: its own parameters and those of its jobs."""
+    from dask_jobqueue.core import Job, JobQueueCluster
+    from dask_jobqueue.slurm import SLURMJob
+
+    parts = (inspect.signature(part.__init__).parameters.values() for part in (JobQueueCluster, Job, SLURMJob))
+    named = [p.name for part in parts for p in part if p.kind is not p.VAR_KEYWORD]
+    return sorted(set(named) - {"self", "scheduler", "job_cls"})
 
 
 def read_slurm(path: Path) -> dict[str, Any]:

@@ -87,14 +87,7 @@ def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda 
                 event({"frame": index, "what": "failed", "reason": str(error)})
                 continue
             store.write_frame(index, frame)
-            event(
-                {
-                    "frame": index,
-                    "what": "done",
-                    "seconds": frame.seconds,
-                    "rms_px": float(np.mean(list(frame.rms_px.values()))),
-                }
-            )
+            event({"frame": index, "what": "done", "seconds": frame.seconds})
             status = DONE
         if status == DONE:
             start = store.field(index)

@@ -73,8 +73,9 @@ async function main() {
     for (let i = 0; i < count; i++) { if (values[i] < low) low = values[i]; if (values[i] > high) high = values[i]; }
     if (!(low <= high)) { low = 0; high = 1; }
     const lowest = low, highest = high;
+    if (q.range) [low, high] = q.range;  // the same colours at all times
     const robust = limits(values, low, high);
-    if (high - low > 1.25 * (robust[1] - robust[0]) && robust[1] > robust[0]) [low, high] = robust;
+    if (!q.range && high - low > 1.25 * (robust[1] - robust[0]) && robust[1] > robust[0]) [low, high] = robust;
     const spread = chosen.variant === "std" || chosen.variant === "error";
     let colours = q.colours, ambient = quantityOf(r, 0), level = q.level;
     if (chosen.variant === "error") { high = Math.max(-low, high); low = -high; colours = scene.diverging; }
@@ -143,19 +144,47 @@ async function main() {
     if (space) space.level(value);
   }
 
-  function update() {
+  function update(keepLevel) {
     const shown = display();
     slices.show(shown);
     drawBar(shown);
     if (space) space.show(shown);
-    setLevel(false);
+    setLevel(keepLevel === true);
     moved();
   }
 
   for (const name of ["quantity", "variant"])
     for (const input of document.querySelectorAll("input[name=" + name + "]"))
-      input.addEventListener("change", () => { switches[name] = input.value; update(); });
+      input.addEventListener("change", () => { switches[name] = input.value; update(false); });
   update();
+  if (scene.frames) await makeTime();
+
+  // frames are unpacked when they are first asked for
+  async function makeTime() {
+    const slider = document.getElementById("time"), text = document.getElementById("time-text"), play = document.getElementById("play");
+    const known = [];
+    let wanted = 0, timer = null;
+    async function go(k) {
+      wanted = k;
+      slider.value = k;
+      const frame = scene.frames[k];
+      text.textContent = plain(Number((1e3 * frame.time).toPrecision(6))) + " ms, frame " + frame.index;
+      slider.setAttribute("aria-valuetext", text.textContent);
+      if (!known[k]) known[k] = unpack("frame-" + k, frame, count);
+      const values = await known[k];
+      if (wanted !== k) return;  // another has been asked for meanwhile
+      arrays.value = values;
+      for (const key in cache) delete cache[key];
+      update(true);
+    }
+    slider.addEventListener("input", () => go(Number(slider.value)));
+    play.addEventListener("click", () => {
+      if (timer) { clearInterval(timer); timer = null; } else timer = setInterval(() => go((wanted + 1) % scene.frames.length), 120);
+      play.textContent = timer ? "Stop" : "Play";
+      play.setAttribute("aria-pressed", String(Boolean(timer)));
+    });
+    await go(0);
+  }
 
   try {
     if (!document.createElement("canvas").getContext("webgl2")) throw new Error("no WebGL 2");

@@ -1,0 +1,182 @@
+"""Movies of volumes over time, drawn off-screen: an isosurface or slices, with box, time and colour bar."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerif.conventions import InputError
+from nerif.report.figures import COLOUR_MAPS, LABELS, colour_range, shown
+from nerif.report.isosurface import default_level
+from nerif.volume import Volume
+from nerif.volume_sequence import VolumeSequence
+
+__all__ = ["STYLES", "Movie", "frames_there"]
+
+STYLES = ("isosurface", "slices")
+FORMATS = (".mp4", ".gif")
+
+
+@dataclass(frozen=True)
+class Movie:
+    """How a movie looks.
+
+    Parameters
+    ----------
+    style : isosurface or slices (three, through the middle of the box)
+    quantity : shown
+    level : of the isosurface, in the unit shown; None for halfway between the ambient and what is farthest from it
+    size : width and height, px
+    azimuth, elevation : of the eye, degrees
+    frames_per_second : of the movie
+    """
+
+    style: str = "isosurface"
+    quantity: str = "density"
+    level: float | None = None
+    size: tuple[int, int] = (960, 720)
+    azimuth: float = 35.0
+    elevation: float = 20.0
+    frames_per_second: float = 20.0
+
+    def __post_init__(self) -> None:
+        if self.style not in STYLES:
+            raise InputError(f"style: expected one of {', '.join(STYLES)}, got '{self.style}'")
+        if min(self.size) < 16 or any(s % 2 for s in self.size):
+            raise InputError(f"size: expected an even width and height of 16 px or more, got {self.size}")
+        if not self.frames_per_second > 0:
+            raise InputError(f"frames_per_second: expected a positive number, got {self.frames_per_second}")
+
+    def pictures(self, store: VolumeSequence, frames: Sequence[int]) -> Iterator[np.ndarray]:
+        """Draw the frames one after the other: (row, column, 3) of 8 bit. The colours are those of the whole movie."""
+        some = [store.volume(i, self.quantity) for i in frames[:: max(1, len(frames) // 8)]]
+        ends = [colour_range(shown(v)) for v in some]
+        limits = min(low for low, _ in ends), max(high for _, high in ends)
+        level = self.level if self.level is not None else float(np.median([default_level(v) for v in some]))
+        for i in frames:
+            volume = store.volume(i, self.quantity)
+            yield self._picture(volume, f"t = {store.times[i] * 1e3:.3f} ms", limits, level)
+
+    def _picture(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
+        import pyvista as pv
+
+        values = shown(volume)
+        grid = pv.ImageData(
+            dimensions=volume.grid.shape[::-1],
+            spacing=volume.grid.spacing,
+            origin=[float(volume.grid.axis(a)[0]) for a in "xyz"],
+        )
+        label, unit = _plain(self.quantity)
+        name = f"{label} [{unit}]"
+        grid[name] = np.nan_to_num(values, nan=float(limits[0])).ravel()
+        plotter = pv.Plotter(off_screen=True, window_size=list(self.size))
+        try:
+            plotter.set_background("white")
+            colour_map = COLOUR_MAPS.get(self.quantity, "viridis")
+            if self.style == "slices":
+                bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.3g"}
+                x, y, z = volume.grid.box.centre
+                slices = grid.slice_orthogonal(x=x, y=y, z=z)
+                plotter.add_mesh(slices, clim=limits, cmap=colour_map, scalar_bar_args=bar, lighting=False)
+            elif values[np.isfinite(values)].size and np.nanmin(values) < level < np.nanmax(values):
+                plotter.add_mesh(
+                    grid.contour([level], scalars=name), color="#E69F00", smooth_shading=True, ambient=0.25
+                )
+                plotter.add_text(f"{label} = {level:.4g} {'' if unit == '1' else unit}", **_text("lower_left"))
+            lower, upper = volume.grid.box.lower, volume.grid.box.upper
+            box = [end for pair in zip(lower, upper, strict=True) for end in pair]
+            plotter.add_mesh(pv.Box(bounds=box), style="wireframe", color="black", line_width=1)
+            plotter.show_bounds(
+                bounds=box, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", color="black", font_size=10,
+                location="outer", ticks="outside",
+            )  # fmt: skip
+            plotter.add_text(text, **_text("upper_left"))
+            plotter.camera.focal_point = volume.grid.box.centre
+            plotter.camera.position = self._eye(volume)
+            plotter.camera.up = (0.0, 0.0, 1.0)
+            return np.ascontiguousarray(plotter.screenshot(return_img=True)[..., :3])
+        finally:
+            plotter.close()
+
+    def _eye(self, volume: Volume) -> tuple[float, float, float]:
+        """Where the eye is, mm."""
+        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        direction = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        x, y, z = np.array(volume.grid.box.centre) + 2.2 * float(np.linalg.norm(volume.grid.box.edges)) * direction
+        return float(x), float(y), float(z)
+
+    def write(
+        self,
+        path: Path,
+        store: VolumeSequence,
+        frames: Sequence[int],
+        on_frame: Callable[[int], None] = lambda done: None,
+    ) -> None:
+        """Write the movie, atomically.
+
+        Parameters
+        ----------
+        path : .mp4 (H.264) or .gif
+        frames : of the store, those that are there
+        on_frame : told how many are drawn
+
+        Raises
+        ------
+        InputError
+            If the ending is another, no frame is there, or a library is missing.
+        """
+        if path.suffix not in FORMATS:
+            raise InputError(f"out: expected a name ending in {' or '.join(FORMATS)}, got '{path.name}'")
+        if not len(frames):
+            raise InputError(f"{store.path}: no frame of it is there yet")
+        if self.quantity not in store.quantities:
+            raise InputError(f"quantity: expected one of {', '.join(store.quantities)}, got '{self.quantity}'")
+        temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+        try:
+            with _writer(temporary, self.frames_per_second) as writer:
+                for done, picture in enumerate(self.pictures(store, frames), start=1):
+                    writer.append_data(picture)
+                    on_frame(done)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def frames_there(store: VolumeSequence) -> list[int]:
+    """Return the frames that can be shown: all of a store without status, else those done."""
+    if "status" not in store.group:
+        return list(range(len(store)))
+    return [int(i) for i in np.flatnonzero(np.asarray(store.array("status")[:]) == 1)]
+
+
+def _writer(path: Path, frames_per_second: float) -> Any:
+    try:
+        import imageio.v2 as imageio
+        import pyvista  # noqa: F401
+
+        if path.suffix == ".gif":
+            return imageio.get_writer(path, mode="I", duration=1000 / frames_per_second, loop=0)
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"movie: {error.name} is not installed; pip install 'nerif[movie]'") from None
+    # yuv420p is what browsers and slides play
+    return imageio.get_writer(
+        path, fps=frames_per_second, codec="libx264", quality=8, pixelformat="yuv420p", macro_block_size=2
+    )
+
+
+def _plain(quantity: str) -> tuple[str, str]:
+    """Name and unit for a renderer that knows no mathematics."""
+    name, unit = LABELS.get(quantity, (quantity, "1"))
+    return name.replace("n$_{ambient}$", "n_ambient"), unit.replace("$^{-3}$", "^-3")
+
+
+def _text(position: str) -> dict[str, Any]:
+    return {"position": position, "color": "black", "font_size": 11}

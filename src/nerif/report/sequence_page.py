@@ -1,0 +1,186 @@
+"""`report.html` of a sequence: the page of a single result, with a slider for time and how the frames went."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nerif.conventions import InputError
+from nerif.physics.quantities import GasSettings, derive
+from nerif.report import packing
+from nerif.report.figures import COLOUR_MAPS, colour_range
+from nerif.report.html import QUANTITIES, flat, render_page, svg
+from nerif.report.isosurface import default_level
+from nerif.report.movie import frames_there
+from nerif.report.summary import Statement, number
+from nerif.report.view_images import colour_table
+from nerif.volume import Volume
+from nerif.volume_sequence import VolumeSequence
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["render_sequence"]
+
+LARGEST = 48  # voxels along the longest edge: a page holds dozens of volumes
+MOST = 60  # frames on the page
+
+
+def render_sequence(store: VolumeSequence) -> str:
+    """Return the page of a sequence, finished or not.
+
+    Raises
+    ------
+    InputError
+        If no frame of it is there, or it holds no index excess.
+    """
+    there = frames_there(store)
+    if not there:
+        raise InputError(f"{store.path}: no frame of it is done yet; run nerif sequence again")
+    if "index_excess" not in store.quantities:
+        raise InputError(f"{store.path}: expected index_excess among its quantities, got {', '.join(store.quantities)}")
+    chosen = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST)).round().astype(int))]
+    scene, arrays = _scene(store, chosen)
+    statements = _statements(store)
+    measured = store.attributes.get("measurement")
+    return render_page(
+        title=store.path.resolve().name,
+        source=Path(str(measured)).name if measured else "",
+        headline=_headline(store, there),
+        statements=statements,
+        cards=(("The frames", _frames(store, there)), ("The fit", _fit(store, there))),
+        scene=scene,
+        arrays=arrays,
+        curves=_curves(store, there),
+        settings=flat({k: v for k, v in store.attributes.items() if k not in ("settings", "network", "references")})
+        + flat(store.attributes.get("settings", {})),
+        shown_of=(len(chosen), len(there)),
+    )
+
+
+def _scene(store: VolumeSequence, chosen: list[int]) -> tuple[dict[str, Any], dict[str, str]]:
+    """What the page draws from, and the packed volumes by name."""
+    small = [packing.coarsen(store.volume(i, "index_excess"), LARGEST) for i in chosen]
+    packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
+    gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
+    quantities: dict[str, dict[str, Any]] = {}
+    for name, (button, label, unit) in QUANTITIES.items():
+        if name != "n" and gas is None:
+            continue
+        some = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
+        values = [v.values.double().numpy() - (name == "n") for v in some]
+        ends = [colour_range(v) for v in values]
+        quantities[name] = {
+            "button": button,
+            "label": label,
+            "unit": unit,
+            "relation": packing.as_plain(packing.relation(name, some[0].attributes)),
+            "colours": COLOUR_MAPS.get(name, "viridis"),
+            "level": float(np.median([default_level(v) for v in some])),
+            "range": [min(e[0] for e in ends), max(e[1] for e in ends)],
+        }
+    grid: Volume = small[0]
+    scene = {
+        "shape": grid.grid.shape,
+        "full_shape": store.grid.shape,
+        "lower": store.grid.box.lower,
+        "upper": store.grid.box.upper,
+        "arrays": {"value": {"low": packed[0]["low"], "step": packed[0]["step"]}},
+        "frames": [
+            {"index": i, "time": store.times[i], "low": p["low"], "step": p["step"]}
+            for i, p in zip(chosen, packed, strict=True)
+        ],
+        "quantities": quantities,
+        "variants": {"value": "Reconstruction"},
+        "diverging": "",
+        "tables": {
+            name: [c for rgb in colour_table(name) for c in rgb]
+            for name in sorted({q["colours"] for q in quantities.values()})
+        },
+        "cameras": [],
+    }
+    arrays = {"value": packed[0]["text"]}
+    return scene, arrays | {f"frame-{k}": p["text"] for k, p in enumerate(packed)}
+
+
+def _statements(store: VolumeSequence) -> list[Statement]:
+    """What to know before looking."""
+    if "status" not in store.group:
+        return [Statement("note", "These are volumes that were simulated or imported, not reconstructed.")]
+    status = np.asarray(store.array("status")[:])
+    found = []
+    missing, failed = int((status == 0).sum()), np.flatnonzero(status == 2)
+    if missing:
+        found.append(
+            Statement("warning", f"{missing} of {len(status)} frames are missing; the same command does them.")
+        )
+    if len(failed):
+        reasons = [str(r) for r in store.array("reason")[:]]
+        first = f"frame {failed[0]}: {reasons[failed[0]]}"
+        found.append(Statement("warning", f"{len(failed)} frames failed, {first}"))
+    held = set(store.attributes.get("hold_out", ()))
+    if not held:
+        found.append(Statement("note", "No view was held out, so nothing here tests what the cameras did not see."))
+    return found
+
+
+def _headline(store: VolumeSequence, there: list[int]) -> Statement:
+    """The sum of it."""
+    if len(there) < len(store):
+        return Statement("warning", f"{len(store) - len(there)} of {len(store)} frames are not there; see below.")
+    return Statement("good", f"All {len(store)} frames are there.")
+
+
+def _frames(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
+    times = store.times
+    rows = [
+        ("Frames", f"{len(there)} of {len(store)}"),
+        ("From, to", f"{number(times[0] * 1e3, 4)} to {number(times[-1] * 1e3, 4)} ms"),
+    ]
+    if len(times) > 1:
+        rows.append(("Frames a second", number((len(times) - 1) / (times[-1] - times[0]), 4)))
+    rows.append(("Voxels", " × ".join(str(n) for n in store.grid.shape[::-1])))
+    return rows
+
+
+def _fit(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
+    if "cc" not in store.group:
+        return [("Truth", "volumes as they are")]
+    cc, rms = (np.asarray(store.array(name)[:])[there] for name in ("cc", "rms_px"))
+    held = np.array([v in store.attributes.get("hold_out", ()) for v in store.attributes["views"]])
+    rows = []
+    for name, which in (("Training views", ~held), ("Held-out views", held)):
+        if which.any():
+            least, most = float(np.nanmin(cc[:, which])), float(np.nanmax(rms[:, which]))
+            rows.append((name, f"CC at least {number(least, 4)}, rms error at most {number(most, 3)} px"))
+    seconds = np.asarray(store.array("seconds")[:])[there]
+    rows.append(("Time for a frame", f"{number(float(np.median(seconds)), 3)} s (median)"))
+    return rows
+
+
+def _curves(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
+    """How the frames went, over time."""
+    if "cc" not in store.group:
+        return []
+    times = np.array(store.times)[there] * 1e3
+    names, held = store.attributes["views"], store.attributes.get("hold_out", ())
+    rms, seconds = (np.asarray(store.array(name)[:])[there] for name in ("rms_px", "seconds"))
+
+    def draw_rms(axes: Axes) -> None:
+        for i, name in enumerate(names):
+            out = name in held
+            axes.plot(times, rms[:, i], lw=1.2, ls="--" if out else "-", label=f"{name} (held out)" if out else name)
+        axes.set_xlabel("time [ms]")
+        axes.set_ylabel("rms difference to the measured [px]")
+        axes.set_ylim(bottom=0)
+        axes.legend(fontsize=7, ncols=2)
+
+    def draw_seconds(axes: Axes) -> None:
+        axes.plot(times, seconds, ".", color="#0072B2")
+        axes.set_xlabel("time [ms]")
+        axes.set_ylabel("spent on the frame [s]")
+        axes.set_ylim(bottom=0)
+
+    return [("Every view over time", svg(draw_rms)), ("Time spent on each frame", svg(draw_seconds))]

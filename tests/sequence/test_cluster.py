@@ -1,0 +1,242 @@
+"""Sequences on a cluster: workers that die, commands that are killed, schedulers that do not answer, SLURM."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from sequence.films import QUICK, blank
+
+pytest.importorskip("distributed", reason="pip install 'nerif[sequence]'")
+
+from nerif.cli import main
+from nerif.conventions import InputError
+from nerif.measurement_sequence import MeasurementSequence
+from nerif.sequence.cluster import open_cluster, read_slurm, slurm_cluster
+from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
+
+CHUNKS = ["--workers", "2", "--threads", "1", "--chunk", "6"]
+
+
+def command(film: Path, out: Path, *more: str) -> list[str]:
+    return [sys.executable, "-m", "nerif", "sequence", str(film), "-o", str(out), *QUICK, *CHUNKS, *more]
+
+
+def status_of(out: Path) -> np.ndarray:
+    try:
+        return SequenceStore(out).status
+    except InputError:  # not begun yet
+        return np.array([])
+
+
+def wait(out: Path, frames: int, process: subprocess.Popen, seconds: float = 120) -> None:
+    """Wait until so many frames are settled."""
+    end = time.monotonic() + seconds
+    while (status_of(out) != MISSING).sum() < frames:
+        assert process.poll() is None, "the command ended before it was to be killed"
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def workers_of(process: subprocess.Popen) -> list[psutil.Process]:
+    """The processes that reconstruct."""
+    children = psutil.Process(process.pid).children(recursive=True)
+    return [c for c in children if any("spawn_main" in word for word in c.cmdline())]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills processes by POSIX signals")
+def test_killed_workers_a_killed_command_and_a_frame_of_nan_leave_a_complete_store(film, tmp_path):
+    spoilt = Path(shutil.copytree(film, tmp_path / "film.zarr"))
+    blank(spoilt, 9)
+    calm, out = tmp_path / "calm.zarr", tmp_path / "out.zarr"
+    done = subprocess.run(command(spoilt, calm), capture_output=True, text=True, timeout=200, check=True)
+    assert "23 of 24 frames done" in done.stdout
+
+    first = subprocess.Popen(command(spoilt, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait(out, 3, first)
+    workers = workers_of(first)
+    assert len(workers) == 2
+    workers[0].send_signal(signal.SIGKILL)
+    wait(out, 8, first)
+    orphans = workers_of(first)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    _, alive = psutil.wait_procs(orphans, timeout=60)
+    assert not alive, "workers went on without their command"
+    assert (status_of(out) == MISSING).any()
+
+    again = subprocess.run(command(spoilt, out), capture_output=True, text=True, timeout=200, check=True)
+    assert "1 failed:\n  frame 9:" in again.stdout
+    assert "no valid pixel" in again.stdout
+    status = status_of(out)
+    assert np.flatnonzero(status == FAILED).tolist() == [9]
+    assert (np.delete(status, 9) == DONE).all()
+    for i in range(24):
+        a, b = (SequenceStore(path).volume(i, "index_excess").values.numpy() for path in (calm, out))
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-9)
+
+    third = subprocess.run(command(spoilt, out), capture_output=True, text=True, timeout=100, check=True)
+    assert "frames to do" not in third.stdout  # nothing is done twice
+
+
+def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(film, tmp_path):
+    out = tmp_path / "out.zarr"
+    process = subprocess.Popen(command(film, out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait(out, 2, process)
+    process.send_signal(signal.SIGINT)
+    text, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "missing; the same command does them" in text
+    assert "Traceback" not in errors
+    assert (status_of(out) == DONE).sum() >= 2
+
+
+def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monkeypatch):
+    from nerif.sequence import run
+    from nerif.sequence.run import run_sequence
+
+    plan = _plan(film, tmp_path / "out.zarr")
+    deadly = tmp_path / "deadly.py"
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    deadly.write_text(
+        "import os\nfrom nerif.sequence.run import _in_worker as real\n"
+        "from nerif.sequence import frames\n"
+        "before = frames._frame\n"
+        "def _frame(plan, settings, measurement, start, parent):\n"
+        "    if abs(float(measurement.displacement.abs().sum()) - TOTAL) < 1e-6 * TOTAL:\n        os._exit(9)\n"
+        "    return before(plan, settings, measurement, start, parent)\n"
+        "def work(plan, first, last, topic):\n    frames._frame = _frame\n    real(plan, first, last, topic)\n"
+    )
+    total = float(MeasurementSequence.read(film).frame(7).displacement.abs().sum())
+    deadly.write_text(f"TOTAL = {total!r}\n" + deadly.read_text())
+    sys.path.insert(0, str(tmp_path))
+    try:
+        import deadly as module
+    finally:
+        sys.path.remove(str(tmp_path))
+    monkeypatch.setattr(run, "_in_worker", module.work)
+    with open_cluster("local", 2) as (client, _):
+        progress = run_sequence(client, plan, 6)
+    store = SequenceStore(plan.out)
+    assert np.flatnonzero(store.status == FAILED).tolist() == [7]
+    assert (store.status == DONE).sum() == 23
+    assert "its worker died 3 times" in store.reasons[7]
+    assert (progress.done, progress.failed) == (23, 1)
+
+
+def _plan(film: Path, out: Path):
+    from dataclasses import replace
+
+    from nerif.geometry import Grid
+    from nerif.sequence.frames import Plan
+    from sequence.test_frames import COLD
+
+    sequence = MeasurementSequence.read(film)
+    grid = Grid.of_resolution(sequence.first_good().box, 10)
+    SequenceStore.begin(out, sequence, grid, ("index_excess",), COLD.network, {})
+    return Plan(film, out, COLD, replace(COLD, max_steps=10), 10, ("index_excess",), threads=1)
+
+
+def test_a_scheduler_that_is_there_already_is_used(film, tmp_path):
+    from distributed import LocalCluster
+
+    out = tmp_path / "out.zarr"
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        arguments = [*QUICK, "--chunk", "12", "--threads", "1", "--cluster", address]
+        assert main(["sequence", str(film), "-o", str(out), *arguments]) == 0
+    assert (status_of(out) == DONE).all()
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        ("tcp://127.0.0.1:9", "no scheduler answers at tcp://127.0.0.1:9"),
+        ("nowhere.yaml", "expected local, tcp://HOST:PORT or a YAML file"),
+    ],
+)
+def test_a_cluster_that_is_not_there_is_refused(where, words, film, tmp_path, capsys):
+    assert main(["sequence", str(film), "-o", str(tmp_path / "o.zarr"), *QUICK, "--cluster", where]) == 2
+    assert words in capsys.readouterr().err
+
+
+SLURM = """
+jobs: 4
+queue: gpu
+cores: 8
+memory: 32GB
+walltime: "02:00:00"
+job_extra_directives: ["--gres=gpu:1"]
+"""
+
+
+def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path):
+    pytest.importorskip("dask_jobqueue", reason="pip install 'nerif[cluster]'")
+    file = tmp_path / "slurm.yaml"
+    file.write_text(SLURM)
+    assert read_slurm(file)["cores"] == 1  # one chunk at a time in a job
+    file.write_text(SLURM.replace("jobs: 4", "jobs: 0"))
+    with pytest.raises(InputError, match="jobs: expected"):
+        slurm_cluster(file)
+    from dask_jobqueue import SLURMCluster
+
+    settings = read_slurm(file)
+    settings.pop("jobs")
+    with SLURMCluster(**settings) as cluster:
+        script = cluster.job_script()
+    for line in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=8", "#SBATCH -t 02:00:00", "#SBATCH --gres=gpu:1"):
+        assert line in script
+    assert "--nthreads 1" in script
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("cores: [", "not a YAML file"),
+        ("- 1", "expected names and values"),
+        ("cores: 4", "expected 'memory' of a job"),
+        ("cores: 4\nmemory: 8GB\nqueu: x", "unknown key 'queu'; the nearest known one is 'queue'"),
+    ],
+)
+def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
+    file = tmp_path / "slurm.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=words):
+        slurm_cluster(file)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--chunk", "0"], "chunk: expected 1 or more"),
+        (["--quantities", "pressure"], "quantities: expected some of"),
+        (["--time-limit", "5"], "time_limit: expected none in a sequence"),
+        (["--hold-out", "nobody"], "hold_out: expected views out of"),
+        (["--hold-out", "0deg", "85deg", "170deg"], "every view is held out"),
+    ],
+)
+def test_wrong_settings_are_refused_before_anything_is_made(arguments, words, film, tmp_path, capsys):
+    out = tmp_path / "o.zarr"
+    assert main(["sequence", str(film), "-o", str(out), *QUICK, *arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_store_begun_with_other_settings_is_left_alone(film, tmp_path, capsys):
+    out = tmp_path / "o.zarr"
+    arguments = ["sequence", str(film), "-o", str(out), *QUICK, "--cluster", "nowhere.yaml"]
+    assert main(arguments) == 2  # the store is there now
+    capsys.readouterr()
+    assert main([*arguments, "--seed", "4"]) == 2
+    assert "seed: expected 0, with which it was begun, got 4" in capsys.readouterr().err
+    assert main(["sequence", str(film), "-o", str(tmp_path / "o.nc"), *QUICK]) == 2
+    assert "ending in .zarr" in capsys.readouterr().err

@@ -1,0 +1,131 @@
+"""Sequences on disc: measurements and volumes over time."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from nerif.cli import main
+from nerif.conventions import InputError
+from nerif.fields.phantoms import Flame
+from nerif.geometry import Box, Grid
+from nerif.measurement import Measurement
+from nerif.measurement_sequence import MeasurementSequence
+from nerif.volume import Volume
+from nerif.volume_sequence import VolumeSequence
+from sequence.films import blank
+
+
+def same(a: Measurement, b: Measurement) -> bool:
+    return a.names == b.names and torch.equal(a.displacement, b.displacement) and a.box == b.box
+
+
+def test_frames_come_back_as_they_were_written(short, tmp_path):
+    sequence = MeasurementSequence.read(short)
+    assert sequence.times == pytest.approx([0, 1e-4, 2e-4, 3e-4, 4e-4])
+    first, last = sequence.frame(0), sequence.frame(4)
+    assert not torch.equal(first.displacement, last.displacement)
+    copy = MeasurementSequence.create(tmp_path / "copy.zarr", [0.0, 1.0], first)
+    assert not copy.is_written(1)
+    copy.write_frame(1, last)
+    assert copy.is_written(1)
+    assert same(copy.frame(1), last)
+    assert torch.equal(copy.frame(1).sigma, last.sigma)
+
+
+def test_a_view_that_saw_nothing_is_left_out_and_an_empty_frame_refused(short):
+    blank(short, 1, view=0)
+    blank(short, 2)
+    sequence = MeasurementSequence.read(short)
+    names = sequence.frame(0).names
+    assert sequence.frame(1).names == names[1:]
+    with pytest.raises(InputError, match=r"frame 2: .*no valid pixel"):
+        sequence.frame(2)
+    blank(short, 0)
+    assert sequence.first_good().names == names[1:]
+
+
+def test_a_frame_without_a_view_is_written_with_that_view_empty(short):
+    sequence = MeasurementSequence.read(short)
+    frame = sequence.frame(3)
+    sequence.write_frame(3, frame.select(frame.names[:2]))
+    assert sequence.frame(3).names == frame.names[:2]
+    stranger = dataclasses.replace(
+        frame, cameras=tuple(dataclasses.replace(c, name=c.name + "x") for c in frame.cameras)
+    )
+    with pytest.raises(InputError, match="expected views out of"):
+        sequence.write_frame(3, stranger)
+    with pytest.raises(InputError, match="expected a measurement with 'sigma'"):
+        sequence.write_frame(3, dataclasses.replace(frame, sigma=None))
+
+
+def test_what_is_no_sequence_is_refused(short, tmp_path):
+    with pytest.raises(InputError, match="no such store"):
+        MeasurementSequence.read(tmp_path / "none.zarr")
+    (tmp_path / "empty.zarr").mkdir()
+    with pytest.raises(InputError, match="not a readable Zarr store"):
+        MeasurementSequence.read(tmp_path / "empty.zarr")
+    truth = short.with_name("short.truth.zarr")
+    with pytest.raises(InputError, match="Conventions"):
+        MeasurementSequence.read(truth)
+    with pytest.raises(InputError, match="increasing"):
+        MeasurementSequence.create(tmp_path / "x.zarr", [0.0, 0.0], MeasurementSequence.read(short).frame(0))
+    with pytest.raises(InputError, match="exists already"):
+        MeasurementSequence.create(short, [0.0], MeasurementSequence.read(short).frame(0))
+    with pytest.raises(InputError, match="no such store"):
+        VolumeSequence(tmp_path / "none.zarr")
+    with pytest.raises(InputError, match="expected volumes over time"):
+        VolumeSequence(short)
+
+
+def test_the_truth_of_a_simulated_sequence_is_the_phantom_at_its_times(short):
+    truth = VolumeSequence(short.with_name("short.truth.zarr"))
+    box = Box((-25.0,) * 3, (25.0,) * 3)
+    assert truth.grid == Grid(box, (12, 12, 12))
+    for i in (0, 4):
+        expected = Flame(box, time=i * 1e-4).sample(truth.grid)
+        assert torch.allclose(truth.volume(i, "index_excess").values, expected)
+    with xr.open_zarr(truth.path, consolidated=False) as found:
+        assert found["index_excess"].dims == ("time", "z", "y", "x")
+        assert found["time"].attrs["units"] == "s"
+        assert found["z"].attrs["units"] == "mm"
+    with pytest.raises(InputError, match="expected one of index_excess"):
+        truth.volume(0, "density")
+
+
+def test_volumes_stand_in_the_order_z_y_x(tmp_path):
+    grid = Grid(Box((0.0, 0.0, 0.0), (2.0, 3.0, 4.0)), (4, 3, 2))
+    store = VolumeSequence.create(tmp_path / "v.zarr", [0.0, 1.0], grid, ("index_excess",), 1.0003)
+    values = torch.arange(24.0).reshape(4, 3, 2)
+    store.write(1, [Volume(values, grid)])
+    again = VolumeSequence(tmp_path / "v.zarr")
+    assert again.grid == grid
+    assert again.n_ambient == 1.0003
+    assert torch.equal(again.volume(1, "index_excess").values, values)
+    assert bool(torch.isnan(again.volume(0, "index_excess").values).all())
+
+
+@pytest.mark.parametrize("times", ["0", "0:1", "0:1:x", "1:0:3", "0:1:0", "a:b:c"])
+def test_times_that_mean_nothing_are_refused(times, tmp_path, capsys):
+    out = str(tmp_path / "x.zarr")
+    assert main(["simulate", "--times", times, "-o", out]) == 2
+    assert "times: expected FIRST:LAST:COUNT" in capsys.readouterr().err
+    assert not Path(out).exists()
+
+
+def test_simulate_refuses_what_does_not_move_and_wrong_names(tmp_path, capsys):
+    assert main(["simulate", "--phantom", "gaussians", "--times", "0:1:3", "-o", str(tmp_path / "x.zarr")]) == 2
+    assert "a phantom that moves" in capsys.readouterr().err
+    assert main(["simulate", "--times", "0:1:3", "-o", str(tmp_path / "x.nc")]) == 2
+    assert "ending in .zarr" in capsys.readouterr().err
+
+
+def test_nothing_of_a_sequence_is_nan_but_what_was_not_measured(film):
+    sequence = MeasurementSequence.read(film)
+    assert len(sequence) == 24
+    assert np.isfinite(sequence.frame(23).displacement.numpy()).all()
