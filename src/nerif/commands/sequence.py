@@ -28,6 +28,9 @@ from nerif.volume import QUANTITIES
 __all__ = ["Sequence", "main", "run"]
 
 
+OWN = ("chunk", "temporal", "warm_steps", "warm_rate", "joint_steps", "time_octaves", "voxels")  # kept in the store
+
+
 @dataclass(frozen=True)
 class Sequence:
     """Reconstruct every frame of a measurement sequence into a Zarr store, which xarray opens at any time.
@@ -52,6 +55,12 @@ class Sequence:
     """Steps of a frame that starts from the one before."""
     warm_rate: float = 0.5
     """Share of the learning rate such a frame begins with."""
+    temporal: str = "frames"
+    """A network for each frame ("frames"), or one over space and time for each chunk ("joint")."""
+    joint_steps: int = 300
+    """Steps for each frame of a joint network."""
+    time_octaves: int = 3
+    """Of the encoding of time in a joint network."""
     hold_out: tuple[str, ...] = ()
     """Views kept out of the reconstruction, and compared with it."""
     voxels: int = 100
@@ -73,12 +82,22 @@ class Sequence:
 
 def run(settings: Sequence) -> SequenceStore:
     """Make the store or open it, reconstruct what is missing, and say what came out."""
-    for name, least in (("chunk", 1), ("warm_steps", 1), ("voxels", 1), ("threads", 0), ("workers", 0)):
+    for name, least in (
+        ("chunk", 1),
+        ("warm_steps", 1),
+        ("voxels", 1),
+        ("threads", 0),
+        ("workers", 0),
+        ("joint_steps", 1),
+        ("time_octaves", 0),
+    ):
         if getattr(settings, name) < least:
             raise InputError(f"{name}: expected {least} or more, got {getattr(settings, name)}")
     for quantity in settings.quantities:
         if quantity not in QUANTITIES:
             raise InputError(f"quantities: expected some of {', '.join(QUANTITIES)}, got '{quantity}'")
+    if settings.temporal not in ("frames", "joint"):
+        raise InputError(f"temporal: expected frames or joint, got '{settings.temporal}'")
     if settings.out.suffix != ".zarr":
         raise InputError(f"out: expected a name ending in .zarr, got '{settings.out.name}'")
     if settings.reconstructor.time_limit:
@@ -90,9 +109,18 @@ def run(settings: Sequence) -> SequenceStore:
     cold = settings.reconstructor
     warm = replace(cold, max_steps=settings.warm_steps, rate_after_fit=settings.warm_rate)
     plan = Plan(
-        settings.measurement.resolve(), settings.out.resolve(), cold, warm, settings.voxels, settings.quantities,
-        settings.gas, settings.hold_out, settings.threads,
-    )  # fmt: skip
+        measurement=settings.measurement.resolve(),
+        out=settings.out.resolve(),
+        cold=cold,
+        warm=warm,
+        voxels=settings.voxels,
+        quantities=settings.quantities,
+        gas=settings.gas,
+        hold_out=settings.hold_out,
+        threads=settings.threads,
+        joint_steps=settings.joint_steps if settings.temporal == "joint" else 0,
+        time_octaves=settings.time_octaves,
+    )
     missing = int((store.status == MISSING).sum())
     if missing:
         say(f"{settings.out}: {missing} of {len(sequence)} frames to do, in chunks of {settings.chunk}")
@@ -122,7 +150,7 @@ def _store(settings: Sequence, sequence: MeasurementSequence) -> tuple[Sequence,
     kept: dict[str, Any] = {
         "measurement": str(settings.measurement.resolve()),
         "frames": len(sequence),
-        **{name: getattr(settings, name) for name in ("chunk", "warm_steps", "warm_rate", "voxels")},
+        **{name: getattr(settings, name) for name in OWN},
         "hold_out": list(settings.hold_out),
         "quantities": list(settings.quantities),
         "gas": asdict(settings.gas),
@@ -156,9 +184,9 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
             settled = progress.done + progress.failed
             figures = f"{settled}/{progress.total} | {progress.frames_per_minute:.1f} frames/min"
             figures += f" | {progress.failed} failed"
-            if settled:
+            if progress.settled:
                 figures += f" | {progress.seconds_left:.0f} s left"
-            bar.update(task, completed=settled, total=progress.total, figures=figures)
+            bar.update(task, completed=progress.settled, total=progress.total, figures=figures)
             if not console.is_terminal and (settled == progress.total or progress.seconds - last[0] >= 15):
                 last[0] = progress.seconds
                 print(f"frames {figures}", file=sys.stderr, flush=True)

@@ -90,10 +90,10 @@ class Network(nn.Module):
 
     gains: Tensor
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: NetworkShape, encoded: int = 0) -> None:
         super().__init__()
         self.shape = shape
-        e, w = encoded_width(shape.octaves), shape.width
+        e, w = encoded or encoded_width(shape.octaves), shape.width
         inputs = [e] + [w + (e if i == shape.skip else 0) for i in range(1, shape.depth + 1)]
         self.layers = nn.ModuleList(nn.Linear(inputs[i], w) for i in range(shape.depth))
         outputs = 4 if shape.gradient_head else 1
@@ -102,7 +102,7 @@ class Network(nn.Module):
         self.outputs = nn.ModuleList(nn.Linear(shape.head_width or inputs[-1], 1) for _ in range(outputs))
         self.register_buffer("gains", 2.0 ** (-shape.octave_decay * torch.arange(shape.octaves)), persistent=False)
 
-    def forward(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    def forward(self, p: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
         """Return the scaled index excess."""
         activate = ACTIVATIONS[self.shape.activation]
         h, _ = self._trunk(p, [])
@@ -114,7 +114,7 @@ class Network(nn.Module):
         return self._gradient_heads(h)
 
     def value_and_gradient(
-        self, p: Float[Tensor, "n 3"], heads: bool = False
+        self, p: Float[Tensor, "n k"], heads: bool = False
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
         """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
         slopes: list[Tensor] = []
@@ -129,13 +129,19 @@ class Network(nn.Module):
             cotangent = (cotangent * slopes[i - 1]) @ _linear(self.layers[i - 1]).weight
         if to_encoding is not None:
             cotangent = cotangent + to_encoding
-        gains = self.gains.to(encoded)
-        gradient = encode_pullback(encoded, cotangent, self.shape.octaves) if len(gains) else cotangent
-        return value, gradient, self._gradient_heads(h) if heads else None
+        return value, self._pull_back(encoded, cotangent), self._gradient_heads(h) if heads else None
+
+    def _encode(self, p: Tensor) -> Tensor:
+        """What the first layer is given of a point."""
+        return encode(p, self.shape.octaves, self.gains.to(p) if self.shape.octave_decay else None)
+
+    def _pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
+        """From the slope along what the first layer is given to that along x, y, z."""
+        return encode_pullback(encoded, cotangent, self.shape.octaves)
 
     def _trunk(self, p: Tensor, slopes: list[Tensor]) -> tuple[Tensor, Tensor]:
         activate = ACTIVATIONS[self.shape.activation]
-        encoded = encode(p, self.shape.octaves, self.gains.to(p) if self.shape.octave_decay else None)
+        encoded = self._encode(p)
         h = encoded
         for i, layer in enumerate(self.layers, start=1):
             h, slope = activate(layer(h))
@@ -186,13 +192,15 @@ class NeuralField(Field):
         """Map points in mm to the coordinates of the network."""
         return (points - points.new_tensor(self.box.centre)) / self.half_edge
 
+    def _inputs(self, points: Points) -> Float[Tensor, "n k"]:
+        """What the network is asked of points in mm."""
+        return self.normalise(points.reshape(-1, 3))
+
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
-        p = self.normalise(points.reshape(-1, 3))
-        value, gradient, _ = self.network.value_and_gradient(p)
+        value, gradient, _ = self.network.value_and_gradient(self._inputs(points))
         value = self.index_scale * (value - self.offset)
         gradient = gradient * (self.index_scale / self.half_edge)
         return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
 
     def __call__(self, points: Points) -> Values:
-        p = self.normalise(points.reshape(-1, 3))
-        return (self.index_scale * (self.network(p) - self.offset)).reshape(points.shape[:-1])
+        return (self.index_scale * (self.network(self._inputs(points)) - self.offset)).reshape(points.shape[:-1])

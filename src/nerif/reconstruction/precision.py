@@ -28,13 +28,13 @@ class MixedPrecision:
         if compile == "on" or (compile == "auto" and device.type == "cuda"):
             self.both = torch.compile(network.value_and_gradient, dynamic=True)
 
-    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    def value(self, p: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
         """Return the n head."""
         with self._precision():
             return self.network(p)
 
     def value_and_gradient(
-        self, p: Float[Tensor, "n 3"], heads: bool
+        self, p: Float[Tensor, "n k"], heads: bool
     ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
         """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
         with self._precision():

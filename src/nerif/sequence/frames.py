@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from nerif.conventions import InputError
+from nerif.fields.base import Field
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
@@ -26,12 +27,12 @@ from nerif.measurement_sequence import MeasurementSequence
 from nerif.metrics import correlation
 from nerif.physics.deflection import Deflection, project
 from nerif.physics.quantities import GasSettings, derive
-from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
+from nerif.volume import Volume
 
-__all__ = ["ATTEMPTS", "Event", "Plan", "reconstruct_frames"]
+__all__ = ["ATTEMPTS", "Event", "Plan", "finished_frame", "reconstruct_frames"]
 
 ATTEMPTS = 3  # at a frame
 PIXELS = 1024  # of each view, evenly over it, in which a frame is compared with what was measured
@@ -55,6 +56,8 @@ class Plan:
     gas : what density and temperature are computed for
     hold_out : views kept out
     threads : of a worker on a CPU; 0 for its share of the cores
+    joint_steps : of training for each frame of a network over space and time; 0 for a network for each frame
+    time_octaves : of the encoding of time in it
     """
 
     measurement: Path
@@ -66,6 +69,8 @@ class Plan:
     gas: GasSettings = field(default_factory=GasSettings)
     hold_out: tuple[str, ...] = ()
     threads: int = 0
+    joint_steps: int = 0
+    time_octaves: int = 3
 
 
 def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda told: None) -> None:
@@ -122,14 +127,21 @@ def _frame(plan: Plan, settings: NeRIF, measurement: Measurement, start: NeuralF
     if result.outcome.reason == "diverged":
         raise ArithmeticError(result.outcome.message)
     assert isinstance(result.field, NeuralField)
-    excess = result.volume(Grid.of_resolution(measurement.box, plan.voxels))
-    volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
-    cc, rms = _against_measured(result, measurement)
+    frame = finished_frame(plan, result.field, measurement, result.device, 0.0)
     steps = int(result.history[-1]["step"]) if result.history else 0
-    return Frame(result.field, volumes, cc, rms, time.perf_counter() - begun, steps)
+    return replace(frame, seconds=time.perf_counter() - begun, steps=steps)
 
 
-def _against_measured(result: Reconstruction, measurement: Measurement) -> tuple[dict[str, float], dict[str, float]]:
+def finished_frame(plan: Plan, field: NeuralField, measurement: Measurement, device: str, seconds: float) -> Frame:
+    """Return what is written of a field: its volumes, and how it compares with what was measured."""
+    grid = Grid.of_resolution(measurement.box, plan.voxels)
+    excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})
+    volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
+    cc, rms = _against_measured(field, measurement, device)
+    return Frame(field, volumes, cc, rms, seconds, 0)
+
+
+def _against_measured(field: Field, measurement: Measurement, device: str) -> tuple[dict[str, float], dict[str, float]]:
     """Correlation and rms difference (px) in every view, held-out ones included, over some of its pixels."""
     model = Deflection(samples=SAMPLES, n_ambient=measurement.n_ambient)
     usable, cc, rms = measurement.usable, {}, {}
@@ -142,7 +154,7 @@ def _against_measured(result: Reconstruction, measurement: Measurement) -> tuple
             continue
         seen = seen[:: max(1, len(seen) // PIXELS)]
         measured = measurement.displacement[i][usable[i]][seen].numpy()
-        predicted = project(model, result.field, rays[seen].to(dtype=torch.float32), result.device).numpy()
+        predicted = project(model, field, rays[seen].to(dtype=torch.float32), device).numpy()
         cc[camera.name] = correlation(measured, predicted)
         rms[camera.name] = float(np.sqrt(np.mean((measured - predicted) ** 2)))
     return cc, rms

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerif.sequence.frames import ATTEMPTS, Plan, reconstruct_frames
+from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 if TYPE_CHECKING:
@@ -27,12 +28,14 @@ class Progress:
     ----------
     total : frames to be done in this run
     done, failed : of them, so far
+    parts : of chunks that are done as a whole, how many frames' work is behind them
     seconds : since the run began
     """
 
     total: int
     done: int = 0
     failed: int = 0
+    parts: dict[int, float] = field(default_factory=dict)
     begun: float = field(default_factory=time.monotonic)
 
     @property
@@ -41,15 +44,20 @@ class Progress:
         return time.monotonic() - self.begun
 
     @property
+    def settled(self) -> float:
+        """Frames done or failed, with the share of those under way."""
+        return self.done + self.failed + sum(self.parts.values())
+
+    @property
     def frames_per_minute(self) -> float:
         """Frames settled a minute, in the mean."""
-        return 60 * (self.done + self.failed) / max(self.seconds, 1e-9)
+        return 60 * self.settled / max(self.seconds, 1e-9)
 
     @property
     def seconds_left(self) -> float:
         """What is missing at that rate."""
         rate = self.frames_per_minute / 60
-        return (self.total - self.done - self.failed) / rate if rate else float("nan")
+        return (self.total - self.settled) / rate if rate else float("nan")
 
 
 def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[int, int]]:
@@ -85,6 +93,10 @@ def run_sequence(
         if told["what"] == "begun":
             begun[told["frame"]] = begun.get(told["frame"], 0) + 1
             return
+        if told["what"] == "share":
+            progress.parts[told["frame"]] = told["share"]
+        else:  # the chunk's frames are counted one by one now
+            progress.parts.pop(told["frame"] // length * length, None)
         progress.done += told["what"] == "done"
         progress.failed += told["what"] == "failed"
         on_progress(progress)
@@ -127,7 +139,8 @@ def _in_worker(plan: Plan, first: int, last: int, topic: str) -> None:
     worker = get_worker()
     if not plan.threads:
         plan = replace(plan, threads=max(1, CPU_COUNT // worker.state.nthreads))
-    reconstruct_frames(plan, first, last, lambda told: worker.log_event(topic, told))
+    work = reconstruct_jointly if plan.joint_steps else reconstruct_frames
+    work(plan, first, last, lambda told: worker.log_event(topic, told))
 
 
 def outcome_table(store: SequenceStore) -> str:

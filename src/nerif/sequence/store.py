@@ -19,12 +19,13 @@ import torch
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence, add_frames
 
-__all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore"]
+__all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore", "chunk_tau"]
 
 KIND = "nerif sequence 1"  # attribute `kind` of the store
 MISSING, DONE, FAILED = 0, 1, 2
@@ -36,7 +37,7 @@ class Frame:
 
     Parameters
     ----------
-    field : NeuralField
+    field : with its weights
     volumes : what is written of it
     cc, rms_px : measured against re-projected displacement, by the name of the view
     seconds : spent on the frame
@@ -70,7 +71,6 @@ class SequenceStore(VolumeSequence):
         super().__init__(path)
         if self.attributes.get("kind") != KIND:
             raise InputError(f"{path}: expected the result of nerif sequence (attribute kind '{KIND}'), got another")
-        self.shape = NetworkShape(**self.attributes["network"])
 
     @classmethod
     def begin(
@@ -94,7 +94,7 @@ class SequenceStore(VolumeSequence):
         about = {"kind": KIND, "network": vars(network), "views": list(like.names), **attributes}
         temporary = path.with_name(path.name + ".part")
         group = VolumeSequence.create(temporary, sequence.times, grid, quantities, like.n_ambient, about).group
-        views, parameters = len(like.names), sum(p.numel() for p in Network(network).parameters())
+        views, parameters = len(like.names), sum(p.numel() for p in _network(about).parameters())
 
         def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
             add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
@@ -163,7 +163,7 @@ class SequenceStore(VolumeSequence):
         """Return the field of a frame that is done."""
         if int(self.array("status")[index]) != DONE:
             raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
-        network = Network(self.shape)
+        network = _network(self.attributes)
         weights, at = torch.from_numpy(np.asarray(self.array("weights")[index])), 0
         with torch.no_grad():
             for parameter in network.parameters():
@@ -171,7 +171,12 @@ class SequenceStore(VolumeSequence):
                 at += parameter.numel()
         network.eval().requires_grad_(False)
         scale, offset = (float(self.array(name)[index]) for name in ("index_scale", "offset"))
-        return NeuralField(network, self.grid.box, scale, offset)
+        if not isinstance(network, SpaceTimeNetwork):
+            return NeuralField(network, self.grid.box, scale, offset)
+        length = int(self.attributes["chunk"])
+        first = index // length * length
+        tau = chunk_tau(self.times, index, first, min(first + length, len(self)))
+        return SpaceTimeField(network, self.grid.box, tau, scale, offset)
 
     def check_same(self, attributes: dict[str, Any]) -> None:
         """Refuse to go on with other settings than the store was begun with.
@@ -192,3 +197,17 @@ class SequenceStore(VolumeSequence):
                     f"{self.path}: {name}: expected {kept!r}, with which it was begun, got {asked!r}; "
                     "give another --out, or --force to begin anew"
                 )
+
+
+def _network(attributes: dict[str, Any]) -> Network:
+    """An empty network of the kind that a store was made with."""
+    shape = NetworkShape(**attributes["network"])
+    if attributes.get("temporal") == "joint":
+        return SpaceTimeNetwork(shape, int(attributes["time_octaves"]))
+    return Network(shape)
+
+
+def chunk_tau(times: Sequence[float], index: int, first: int, last: int) -> float:
+    """Return the instant of a frame in [-1, 1], the first and the last frame of its chunk at the ends."""
+    span = times[last - 1] - times[first]
+    return 2 * (times[index] - times[first]) / span - 1 if span > 0 else 0.0

@@ -1,0 +1,101 @@
+"""One network over space and time, (x, y, z, t) -> n: what neighbouring frames have in common is learned once.
+
+    N(x, t) = f(encode(x), encode(x - c tau), tau, sin(2^k pi tau), cos(2^k pi tau)),   tau = t mapped to [-1, 1]
+
+The drift c is learned with the weights: what the flow carries along stands still in x - c tau, and needs no high
+frequency in time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerif.conventions import Points
+from nerif.fields.encoding import encode, encode_pullback, encoded_width
+from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.geometry import Box
+
+__all__ = ["AtTimes", "SpaceTimeField", "SpaceTimeNetwork"]
+
+
+class SpaceTimeNetwork(Network):
+    """Maps (x, y, z, tau) in [-1, 1] to the scaled index excess; its gradient is that in space.
+
+    Parameters
+    ----------
+    shape : NetworkShape, of the layers
+    time_octaves : of the encoding of time
+    """
+
+    def __init__(self, shape: NetworkShape, time_octaves: int) -> None:
+        self.time_octaves = time_octaves
+        super().__init__(shape, 2 * encoded_width(shape.octaves) + 1 + 2 * time_octaves)
+        self.drift = nn.Parameter(torch.zeros(3))  # half edges of the box per unit of tau
+
+    def _encode(self, p: Float[Tensor, "n 4"]) -> Tensor:
+        place, tau = p[:, :3], p[:, 3:]
+        octaves = self.shape.octaves
+        gains = self.gains.to(p) if self.shape.octave_decay else None
+        angle = math.pi * tau * 2.0 ** torch.arange(self.time_octaves, device=p.device, dtype=p.dtype)
+        carried = place - tau * self.drift.to(p)
+        return torch.cat(
+            [encode(place, octaves, gains), encode(carried, octaves, gains), tau, angle.sin(), angle.cos()], dim=1
+        )
+
+    def _pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
+        e, octaves = encoded_width(self.shape.octaves), self.shape.octaves
+        still = encode_pullback(encoded[:, :e], cotangent[:, :e], octaves)
+        return still + encode_pullback(encoded[:, e : 2 * e], cotangent[:, e : 2 * e], octaves)
+
+
+class AtTimes:
+    """A space-time network as a network over space alone, each point at a time of its own; an Evaluator of the loss.
+
+    Parameters
+    ----------
+    network : evaluates (x, y, z, tau)
+    tau : (m,) times in [-1, 1]; point i of n is taken at tau[i m / n]
+    """
+
+    def __init__(self, network: object, tau: Float[Tensor, " m"]) -> None:
+        self.network, self.tau = network, tau
+
+    def _with_time(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+        return torch.cat([p, self.tau.repeat_interleave(len(p) // len(self.tau))[:, None]], dim=1)
+
+    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Return the n head."""
+        return self.network.value(self._with_time(p))  # type: ignore[attr-defined]
+
+    def value_and_gradient(
+        self, p: Float[Tensor, "n 3"], heads: bool
+    ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
+        """Return the n head, its exact gradient in space, and what the gradient heads say."""
+        return self.network.value_and_gradient(self._with_time(p), heads)  # type: ignore[attr-defined]
+
+
+class SpaceTimeField(NeuralField):
+    """A space-time network at one instant, in physical units.
+
+    Parameters
+    ----------
+    network : SpaceTimeNetwork
+    box : Box, mm; its longest edge is mapped to [-1, 1]
+    tau : the instant, in [-1, 1]
+    index_scale : index excess of one unit of network output
+    offset : network output that counts as ambient (the gauge)
+    """
+
+    def __init__(
+        self, network: SpaceTimeNetwork, box: Box, tau: float, index_scale: float, offset: float = 0.0
+    ) -> None:
+        super().__init__(network, box, index_scale, offset)
+        self.tau = tau
+
+    def _inputs(self, points: Points) -> Float[Tensor, "n 4"]:
+        p = self.normalise(points.reshape(-1, 3))
+        return torch.cat([p, torch.full_like(p[:, :1], self.tau)], dim=1)
