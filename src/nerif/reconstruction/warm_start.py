@@ -24,7 +24,9 @@ WARM_UP = 20  # steps
 
 def adopt(field: NeuralField, start: Field) -> bool:
     """Take over the weights of a neural field, exactly; False, and nothing done, if it has another shape or box."""
-    if not isinstance(start, NeuralField) or start.network.shape != field.network.shape or start.box != field.box:
+    if not isinstance(start, NeuralField) or type(start.network) is not type(field.network):
+        return False
+    if start.network.shape != field.network.shape or start.box != field.box:
         return False
     field.network.load_state_dict(start.network.state_dict())
     ratio = start.index_scale / field.index_scale
