@@ -4,7 +4,7 @@
     python benchmarks/sequence.py --device cuda --preset best --pixels 200 --write results/sequence-gpu.md
 
 A flame filmed from 9 and from 4 views. Seconds are those of a whole frame: training, sampling the volume, comparing with
-the views, writing. Errors are means over all frames but the first of a run, which starts from nothing in any case.
+the views, writing. Errors are means over all frames but the first, which starts from nothing in any case.
 Needs nerif[sequence]. Truth and reconstruction meet only in the errors.
 """
 
@@ -109,7 +109,7 @@ def main() -> None:
         f"Machine: {machine()}  ",
         f"Date: {datetime.date.today().isoformat()}",
         "",
-        "| views | frames | steps a frame | seconds a frame | L2 | L2 of variation | CC |",
+        "| views | how | steps a frame | seconds a frame | L2 | L2 of variation | CC |",
         "|---|---|---|---|---|---|---|",
     ]
     print("\n".join(lines), flush=True)

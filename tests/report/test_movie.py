@@ -1,0 +1,82 @@
+"""Movies of volumes over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyvista", reason="pip install 'nerif[movie]'")
+pytest.importorskip("imageio_ffmpeg", reason="pip install 'nerif[movie]'")
+
+import imageio.v2 as imageio
+
+from nerif.cli import main
+from nerif.conventions import InputError
+from nerif.fields.phantoms import Flame
+from nerif.geometry import Box, Grid
+from nerif.report.movie import Movie, frames_there
+from nerif.volume import Volume
+from nerif.volume_sequence import VolumeSequence
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> VolumeSequence:
+    """Three instants of a flame in a box of different edges."""
+    box = Box((-25.0, -25.0, -20.0), (25.0, 25.0, 20.0))
+    grid = Grid.of_resolution(box, 20)
+    path: Path = tmp_path_factory.mktemp("movie") / "v.zarr"
+    found = VolumeSequence.create(path, [0.0, 1e-4, 2e-4], grid, ("index_excess",), 1.00027)
+    for i, t in enumerate(found.times):
+        found.write(i, [Volume(Flame(box, time=t).sample(grid), grid)])
+    return found
+
+
+SMALL = ["--quantity", "index_excess", "--size", "240", "180"]
+
+
+@pytest.mark.parametrize(("name", "style"), [("m.mp4", "isosurface"), ("m.gif", "slices")])
+def test_a_movie_shows_every_frame_and_they_differ(store, tmp_path, capsys, name, style):
+    out = tmp_path / name
+    assert main(["movie", str(store.path), "-o", str(out), "--style", style, *SMALL]) == 0
+    assert "3 frames" in capsys.readouterr().out
+    pictures = [np.asarray(p) for p in imageio.get_reader(out)]
+    assert len(pictures) == 3
+    assert all(p.shape[:2] == (180, 240) for p in pictures)
+    assert all(p[..., :3].std() > 10 for p in pictures)
+    middle = (slice(50, 140), slice(70, 170))
+    assert np.abs(pictures[0][middle].astype(float) - pictures[2][middle].astype(float)).mean() > 1
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_only_frames_that_are_there_are_drawn(store, tmp_path):
+    assert frames_there(store) == [0, 1, 2]
+    from nerif.volume_sequence import add_frames
+
+    path = tmp_path / "v.zarr"
+    partial = VolumeSequence.create(path, store.times, store.grid, ("index_excess",), 1.00027)
+    add_frames(partial.group, "status", 3, (), (), "int8", 0)
+    partial.write(1, [store.volume(1, "index_excess")])
+    with pytest.raises(InputError, match="no frame of it is there yet"):
+        Movie(quantity="index_excess").write(tmp_path / "m.mp4", partial, frames_there(partial))
+    partial.array("status")[1] = 1
+    assert frames_there(partial) == [1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-o", "m.avi"], "out: expected a name ending in .mp4 or .gif"),
+        (["-o", "m.mp4", "--quantity", "density"], "quantity: expected one of index_excess, got 'density'"),
+        (["-o", "m.mp4", "--style", "cubist"], "style: expected one of isosurface, slices"),
+        (["-o", "m.mp4", "--size", "241", "180"], "size: expected an even width and height"),
+        (["-o", "m.mp4", "--frames-per-second", "0"], "frames_per_second: expected a positive number"),
+        (["-o", "m.mp4", "--every", "0"], "every: expected 1 or more"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(store, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["movie", str(store.path), "--quantity", "index_excess", *arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,180 @@
+"""One network over space and time: its gradient, its data, and films reconstructed by it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nerif.cli import main
+from nerif.fields.mlp import NetworkShape
+from nerif.fields.space_time import AtTimes, SpaceTimeField, SpaceTimeNetwork
+from nerif.geometry import Box, Grid
+from nerif.measurement_sequence import MeasurementSequence
+from nerif.reconstruction.base import State
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.precision import MixedPrecision
+from nerif.reconstruction.target import Target
+from nerif.sequence import joint
+from nerif.sequence.frames import Plan
+from nerif.sequence.joint import Film, reconstruct_jointly
+from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
+from sequence.films import QUICK, blank
+
+SHAPE = NetworkShape(depth=2, width=16, octaves=2)
+SETTINGS = NeRIF(
+    network=SHAPE, samples=(8, 12), sample_jitter=2, points_per_batch=400, device="cpu", precision="float32"
+)
+
+
+@pytest.fixture
+def network() -> SpaceTimeNetwork:
+    """A network that drifts."""
+    torch.manual_seed(1)
+    found = SpaceTimeNetwork(SHAPE, 2).double()
+    with torch.no_grad():
+        found.drift.copy_(torch.tensor([0.1, -0.2, 0.7]))
+    return found
+
+
+def test_the_written_out_gradient_in_space_is_that_of_autograd(network):
+    p = (2 * torch.rand(20, 4, dtype=torch.float64) - 1).requires_grad_()
+    value, gradient, heads = network.value_and_gradient(p)
+    (expected,) = torch.autograd.grad(network(p).sum(), p)
+    assert heads is None
+    assert torch.allclose(value, network(p))
+    assert torch.allclose(gradient, expected[:, :3])
+    assert float(expected[:, 3].abs().max()) > 0
+
+
+def test_what_drifts_with_the_flow_can_stand_still_for_the_network():
+    torch.manual_seed(0)
+    network = SpaceTimeNetwork(SHAPE, 0).double()
+    drift = torch.tensor([0.0, 0.3, 0.5], dtype=torch.float64)
+    e = network.layers[0].weight.shape[1]
+    with torch.no_grad():
+        network.drift.copy_(drift)
+        network.layers[0].weight[:, : (e - 1) // 2] = 0  # only what is carried along is seen
+        network.layers[0].weight[:, -1] = 0
+    p = torch.rand(10, 3, dtype=torch.float64) - 0.5
+    at = [torch.cat([p + t * drift, torch.full((10, 1), t, dtype=torch.float64)], dim=1) for t in (-0.7, 0.9)]
+    assert torch.allclose(network(at[0]), network(at[1]))
+
+
+def test_each_ray_is_taken_at_its_own_time(network):
+    low = MixedPrecision(network, torch.device("cpu"), "float32", "off")
+    tau = torch.tensor([-0.5, 0.25], dtype=torch.float64)
+    p = torch.rand(6, 3, dtype=torch.float64)
+    value, gradient, _ = AtTimes(low, tau).value_and_gradient(p, False)
+    for i, t in enumerate(tau):
+        field = SpaceTimeField(network, Box.cube(2.0), float(t), 1.0)
+        mine = slice(3 * i, 3 * i + 3)
+        expected, slope = field.value_and_gradient(p[mine])
+        assert torch.allclose(value[mine], expected)
+        assert torch.allclose(gradient[mine], slope)
+        assert torch.allclose(AtTimes(low, tau).value(p)[mine], field(p[mine]))
+
+
+def test_a_film_holds_every_ray_of_every_frame(short):
+    blank(short, 1, view=0)
+    sequence = MeasurementSequence.read(short)
+    frames = [sequence.frame(i) for i in range(3)]
+    tau = torch.tensor([-1.0, 0.0, 1.0])
+    film = Film.of(frames, tau)
+    targets = [Target.of(frame) for frame in frames]
+    assert len(film.measured()) == sum(len(t) for t in targets)
+    assert len(film.rays) == len(targets[0])
+    of_second = film.measured()[(film.measured() // len(film.rays)) == 1]
+    target, at = film.batch(of_second, torch.device("cpu"))
+    assert torch.equal(at, torch.zeros(len(targets[1])))
+    assert torch.equal(target.displacement, targets[1].displacement)
+    assert torch.equal(target.rays.origin, targets[1].rays.origin)
+    assert torch.equal(target.rays.direction, targets[1].rays.direction)
+    # weighed by sigma alone, the same for all, with a mean square of 1
+    everything, _ = film.batch(film.measured(), torch.device("cpu"))
+    scaled = everything.displacement * everything.inverse_scale
+    assert float(scaled.square().mean()) == pytest.approx(1, rel=1e-4)
+    sigma = frames[1].sigma[frames[1].usable][0, 0]
+    other = frames[2].sigma[frames[2].usable][0, 0]
+    third, _ = film.batch(film.measured()[-5:], torch.device("cpu"))
+    assert float(target.inverse_scale[0, 0] / third.inverse_scale[0, 0]) == pytest.approx(
+        float(other / sigma), rel=1e-4
+    )
+
+
+def test_instants_of_a_chunk_run_from_minus_one_to_one():
+    times = [0.0, 1.0, 3.0, 4.0]
+    assert [chunk_tau(times, i, 0, 3) for i in range(3)] == pytest.approx([-1, -1 / 3, 1])
+    assert chunk_tau(times, 3, 3, 4) == 0
+
+
+def begun(film: Path, out: Path, steps: int) -> Plan:
+    plan = Plan(film, out, SETTINGS, SETTINGS, 10, joint_steps=steps, time_octaves=2)
+    sequence = MeasurementSequence.read(film)
+    grid = Grid.of_resolution(sequence.first_good().box, 10)
+    about = {"temporal": "joint", "time_octaves": 2, "chunk": len(sequence), "settings": asdict(SETTINGS)}
+    SequenceStore.begin(out, sequence, grid, plan.quantities, SHAPE, about)
+    return plan
+
+
+def test_a_film_is_reconstructed_by_one_network(short, tmp_path):
+    blank(short, 3)
+    plan = begun(short, tmp_path / "r.zarr", 60)
+    told: list[dict] = []
+    reconstruct_jointly(plan, 0, 5, told.append)
+    store = SequenceStore(plan.out)
+    assert store.status.tolist() == [DONE, DONE, DONE, FAILED, DONE]
+    assert [t["what"] for t in told if t["what"] != "share"] == ["begun", "failed", "done", "done", "done", "done"]
+    assert 0 < max(t["share"] for t in told if t["what"] == "share") <= 5
+    for i in (0, 4):
+        again = store.field(i).sample(store.grid)
+        assert torch.equal(again, store.volume(i, "index_excess").values)
+    assert not torch.equal(store.volume(0, "index_excess").values, store.volume(4, "index_excess").values)
+    assert float(np.nanmin(store.array("cc")[:])) > 0.5
+    assert not (tmp_path / "r.zarr.joint" / "0").exists()
+
+
+def test_a_joint_run_that_broke_off_goes_on_from_its_checkpoint(short, tmp_path, monkeypatch):
+    whole, parts = begun(short, tmp_path / "whole.zarr", 40), begun(short, tmp_path / "parts.zarr", 40)
+    monkeypatch.setattr(joint, "CHECKPOINT_EVERY", 0.0)
+    reconstruct_jointly(whole, 0, 5)
+    real = joint.write_state
+
+    class Killed(BaseException):
+        pass
+
+    def write_and_die(directory: Path, state: State) -> None:
+        real(directory, state)
+        if state.scalars["step"] == 90:
+            raise Killed
+
+    monkeypatch.setattr(joint, "write_state", write_and_die)
+    with pytest.raises(Killed):
+        reconstruct_jointly(parts, 0, 5)
+    assert (SequenceStore(parts.out).status == MISSING).all()
+    steps: list[int] = []
+    monkeypatch.setattr(joint, "write_state", lambda d, s: steps.append(s.scalars["step"]))
+    reconstruct_jointly(parts, 0, 5)
+    assert steps[0] == 91
+    for i in range(5):
+        a, b = (SequenceStore(p.out).volume(i, "index_excess").values for p in (whole, parts))
+        assert torch.allclose(a, b, rtol=1e-4, atol=1e-9)
+
+
+def test_a_loss_that_is_no_number_is_an_error(short, tmp_path):
+    plan = begun(short, tmp_path / "r.zarr", 60)
+    wild = replace(plan, cold=replace(SETTINGS, learning_rate=1e30))
+    with pytest.raises(ArithmeticError, match="not finite"):
+        reconstruct_jointly(wild, 0, 5)
+
+
+def test_the_command_reconstructs_jointly(short, tmp_path, capsys):
+    out = tmp_path / "r.zarr"
+    arguments = ["sequence", str(short), "-o", str(out), *QUICK, "--temporal", "joint", "--joint-steps", "20"]
+    assert main([*arguments, "--chunk", "3", "--workers", "1"]) == 0
+    assert "5 of 5 frames done" in capsys.readouterr().out
+    assert main([*arguments, "--chunk", "3", "--temporal", "never"]) == 2
+    assert "temporal: expected frames or joint" in capsys.readouterr().err
