@@ -3,8 +3,8 @@
     python benchmarks/sequence.py --write results/sequence-cpu.md
     python benchmarks/sequence.py --device cuda --preset best --pixels 200 --write results/sequence-gpu.md
 
-A flame filmed from 9 and from 4 views. Seconds are those of a whole frame: training, sampling the volume, comparing with
-the views, writing. Errors are means over all frames but the first, which starts from nothing in any case.
+A flame filmed from 9 and from 4 views. Seconds are those of a whole frame: training, sampling the volume, comparing
+with the views, writing. Errors are means over all frames but the first, which starts from nothing in any case.
 Needs nerif[sequence]. Truth and reconstruction meet only in the errors.
 """
 
