@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -176,5 +177,14 @@ def test_the_command_reconstructs_jointly(short, tmp_path, capsys):
     arguments = ["sequence", str(short), "-o", str(out), *QUICK, "--temporal", "joint", "--joint-steps", "20"]
     assert main([*arguments, "--chunk", "3", "--workers", "1"]) == 0
     assert "5 of 5 frames done" in capsys.readouterr().out
+    truth = short.with_name("short.truth.zarr")
+    assert main(["evaluate", str(out), "--truth", str(truth)]) == 0
+    assert "mean of 5 frames" in capsys.readouterr().out
+    kept = json.loads((tmp_path / "r.metrics.json").read_text())
+    assert [f["frame"] for f in kept["frames"]] == [0, 1, 2, 3, 4]
+    assert 0 < kept["mean"]["cc"] < 1
+    assert main(["evaluate", str(out), "--truth", str(out)]) == 0  # the same volumes, to the grid
+    assert "CC 1.00000" in capsys.readouterr().out
+    assert main(["evaluate", str(out)]) == 2
     assert main([*arguments, "--chunk", "3", "--temporal", "never"]) == 2
     assert "temporal: expected frames or joint" in capsys.readouterr().err

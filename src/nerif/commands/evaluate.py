@@ -9,16 +9,17 @@ from typing import Annotated, Any
 import tyro
 from torch import Tensor
 
-from nerif.commands.output import say
+from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import parse, read_toml
 from nerif.conventions import InputError
-from nerif.evaluation import evaluate_views, evaluate_volume, reproject, update_json
+from nerif.evaluation import evaluate_views, evaluate_volume, reproject, update_json, write_json
 from nerif.fields.grid import VoxelField
 from nerif.measurement import Measurement
 from nerif.reconstruction.files import read_field
 from nerif.report.result import RUN, VOLUME
 from nerif.reprojection import REPROJECTION
 from nerif.volume import Volume, read_volume, read_volumes
+from nerif.volume_sequence import VolumeSequence
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 
@@ -30,9 +31,9 @@ class Evaluate:
     """Compare a reconstruction with a truth over the volume, or with measured views; adds to its metrics.json."""
 
     result: Annotated[Path, tyro.conf.Positional]
-    """Result directory of nerif reconstruct."""
+    """Result directory of nerif reconstruct, or store of nerif sequence (.zarr)."""
     truth: Path | None = None
-    """Volume file (.nc, .vti) of the true index; compared on its own grid."""
+    """Volume file (.nc, .vti) of the true index, compared on its own grid; of a sequence NAME.truth.zarr."""
     measurement: Path | None = None
     """Measurement to re-project into."""
     hold_out: tuple[str, ...] | None = None
@@ -43,6 +44,8 @@ def run(settings: Evaluate) -> dict[str, Any]:
     """Print the metrics, keep them in metrics.json, and return them."""
     if settings.truth is None and settings.measurement is None:
         raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")
+    if settings.result.suffix == ".zarr":
+        return run_over_time(settings)
     field, box, n_ambient = read_field(settings.result)
     metrics: dict[str, Any] = {}
     if settings.truth is not None:
@@ -81,6 +84,42 @@ def run(settings: Evaluate) -> dict[str, Any]:
             held = "  held out" if v["held_out"] else ""
             say(f"{v['name']:<14} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {v['rms_px']:9.4f}{held}")
     update_json(settings.result / "metrics.json", metrics)
+    return metrics
+
+
+def run_over_time(settings: Evaluate) -> dict[str, Any]:
+    """Compare every frame of a sequence with its truth; the metrics are kept in RESULT.metrics.json."""
+    from nerif.metrics import volume_errors
+    from nerif.sequence.store import DONE, SequenceStore
+
+    if settings.truth is None or settings.measurement is not None:
+        raise InputError(
+            "evaluate: expected --truth NAME.truth.zarr alone for a sequence, whose views are compared already"
+        )
+    store, truth = SequenceStore(settings.result), VolumeSequence(settings.truth)
+    if len(store) != len(truth) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, truth.times, strict=True)):
+        raise InputError(
+            f"{settings.truth}: expected the instants of {settings.result}, {len(store)} frames, got others"
+        )
+    frames: list[dict[str, Any]] = []
+    done = [i for i, status in enumerate(store.status) if status == DONE]
+    with counting_bar("comparing frames", len(done)) as bar:
+        for i in done:
+            found = store.field(i).sample(truth.grid).numpy()
+            errors = volume_errors(truth.volume(i, "index_excess").values.numpy(), found, store.n_ambient)
+            frames.append({"frame": i, "time_s": store.times[i], **errors})
+            bar(len(frames))
+    if not frames:
+        raise InputError(f"{settings.result}: no frame of it is done yet; run nerif sequence again")
+    say("frame   t [ms]        L2  L2 variation       CC")
+    for f in frames:
+        say(f"{f['frame']:5d} {f['time_s'] * 1e3:8.3f} {f['l2']:9.3%} {f['l2_variation']:13.3%} {f['cc']:8.5f}")
+    mean = {name: sum(f[name] for f in frames) / len(frames) for name in ("l2", "l2_variation", "cc")}
+    say(
+        f"mean of {len(frames)} frames: L2 {mean['l2']:.3%}, of variation {mean['l2_variation']:.3%}, CC {mean['cc']:.5f}"
+    )
+    metrics = {"truth": str(settings.truth.resolve()), "frames": frames, "mean": mean}
+    write_json(settings.result.with_suffix(".metrics.json"), metrics)
     return metrics
 
 
