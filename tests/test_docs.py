@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = (
     "index", "tutorial", "images", "sequences", "choosing", "limits", "conventions", "method", "formats", "benchmarks",
-    "api", "architecture", "changelog", "api/geometry", "api/reconstruction", "repository/benchmarks/results/methods-cpu",
-    "repository/examples/own_data",
+    "api", "architecture", "changelog", "api/geometry", "api/reconstruction",
+    "repository/benchmarks/results/methods-cpu", "repository/examples/own_data",
 )  # fmt: skip
 DRAWINGS = ("axes", "displacement", "volume", "lever_arm")
 

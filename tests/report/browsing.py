@@ -1,0 +1,103 @@
+"""A real browser, and what tests ask of a page in it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None or DRIVER is None, reason="no chromium and chromedriver here; .ci/run installs them"
+)
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--enable-unsafe-swiftshader", "--hide-scrollbars",
+)  # fmt: skip
+KEYS = {"right": "\ue014", "up": "\ue013", "page up": "\ue00e", "space": " "}
+
+
+def open_browser(profile: Path, *more: str) -> Any:
+    """A fresh Chromium that keeps what the page says and asks for."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(CHROMIUM)
+    for flag in (*FLAGS, f"--user-data-dir={profile}", *more):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    return webdriver.Chrome(options=options, service=webdriver.ChromeService(executable_path=DRIVER))
+
+
+def show(driver: Any, page: Path, width: int = 1440, height: int = 900) -> None:
+    """Open a page at a window's size and wait until it says that it is ready."""
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    driver.get_log("browser")
+    driver.get_log("performance")
+    driver.get(page.as_uri())
+    wait_for(driver, "return document.documentElement.dataset.ready !== undefined")
+
+
+def wait_for(driver: Any, script: str, seconds: float = 30.0) -> None:
+    """Ask again and again until the page says yes."""
+    end = time.monotonic() + seconds
+    while not driver.execute_script(script):
+        assert time.monotonic() < end, f"waited in vain for: {script}"
+        time.sleep(0.05)
+
+
+def errors(driver: Any) -> list[str]:
+    """What the console calls errors."""
+    return [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
+
+
+def requests(driver: Any) -> list[str]:
+    """Addresses that the page asked for, its own and those inside it left out."""
+    asked = [json.loads(e["message"])["message"] for e in driver.get_log("performance")]
+    urls = [m["params"]["request"]["url"] for m in asked if m["method"] == "Network.requestWillBeSent"]
+    return [u for u in urls if not u.startswith(("data:", "blob:", "file:"))]
+
+
+def picture(driver: Any, selector: str) -> np.ndarray:
+    """Red, green, blue of a canvas, as it is seen."""
+    import base64
+    import io
+
+    import imageio.v3 as iio
+
+    driver.execute_script(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
+    time.sleep(0.4)  # the view sharpens once it rests
+    address = driver.execute_script(f"return document.querySelector('{selector}').toDataURL('image/png')")
+    return np.asarray(iio.imread(io.BytesIO(base64.b64decode(address.split(",")[1]))))[..., :3].astype(int)
+
+
+def press(driver: Any, selector: str, *keys: str) -> None:
+    """Give an element the focus and type."""
+    element = driver.find_element("css selector", selector)
+    driver.execute_script("arguments[0].focus()", element)
+    element.send_keys("".join(KEYS.get(k, k) for k in keys))
+
+
+def choose(driver: Any, name: str, value: str) -> None:
+    """Choose one of a switch."""
+    driver.execute_script(f"document.querySelector('input[name={name}][value={value}]').click()")
+
+
+def text(driver: Any, selector: str) -> str:
+    """Text of an element."""
+    return str(driver.execute_script(f"return document.querySelector('{selector}').textContent"))
+
+
+def drag(driver: Any, selector: str, x: int, y: int) -> None:
+    """Press in the middle of an element, move, let go."""
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    element = driver.find_element("css selector", selector)
+    driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
+    ActionChains(driver).move_to_element(element).click_and_hold().move_by_offset(x, y).release().perform()
