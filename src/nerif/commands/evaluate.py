@@ -115,9 +115,8 @@ def run_over_time(settings: Evaluate) -> dict[str, Any]:
     for f in frames:
         say(f"{f['frame']:5d} {f['time_s'] * 1e3:8.3f} {f['l2']:9.3%} {f['l2_variation']:13.3%} {f['cc']:8.5f}")
     mean = {name: sum(f[name] for f in frames) / len(frames) for name in ("l2", "l2_variation", "cc")}
-    say(
-        f"mean of {len(frames)} frames: L2 {mean['l2']:.3%}, of variation {mean['l2_variation']:.3%}, CC {mean['cc']:.5f}"
-    )
+    scores = f"L2 {mean['l2']:.3%}, of variation {mean['l2_variation']:.3%}, CC {mean['cc']:.5f}"
+    say(f"mean of {len(frames)} frames: {scores}")
     metrics = {"truth": str(settings.truth.resolve()), "frames": frames, "mean": mean}
     write_json(settings.result.with_suffix(".metrics.json"), metrics)
     return metrics
