@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
+import itertools
 import platform
 import shlex
 import sys
@@ -63,7 +64,8 @@ def run(film: Path, out: Path, cold: NeRIF, voxels: int, **changes: float) -> tu
     warm_steps, rate, joint = (changes.get(k, 0) for k in ("warm_steps", "warm_rate", "joint_steps"))
     warm = replace(cold, max_steps=int(warm_steps), rate_after_fit=rate) if warm_steps else cold
     octaves = int(changes.get("time_octaves", 3))
-    plan = Plan(film, out, cold, warm, voxels, joint_steps=int(joint), time_octaves=octaves)
+    drift = int(changes.get("drift_steps", 0))
+    plan = Plan(film, out, cold, warm, voxels, drift_steps=drift, joint_steps=int(joint), time_octaves=octaves)
     about = {"chunk": len(sequence), "hold_out": [], "settings": dataclasses.asdict(cold)}
     about |= {"temporal": "joint", "time_octaves": octaves} if joint else {}
     store = SequenceStore.begin(out, sequence, truth.grid, plan.quantities, cold.network, about)
@@ -99,6 +101,7 @@ def main() -> None:
     parser.add_argument("--cold", type=int, nargs="*", default=[200, 400, 800], help="steps of a frame from nothing")
     parser.add_argument("--warm", type=int, nargs="*", default=[60, 120, 240], help="steps of a frame from the last")
     parser.add_argument("--warm-rate", type=float, nargs="*", default=[0.5])
+    parser.add_argument("--drift", type=int, nargs="*", default=[0, 40], help="steps in which the drift is found")
     parser.add_argument("--joint", type=int, nargs="*", default=[120, 240], help="steps a frame of a joint network")
     parser.add_argument("--time-octaves", type=int, nargs="*", default=[3])
     parser.add_argument("--write", type=Path, help="also write the table to this file")
@@ -117,11 +120,10 @@ def main() -> None:
     best = max([*arguments.cold, 1])
     kinds: list[tuple[str, int, NeRIF, dict[str, float]]] = []
     kinds += [("from nothing", n, replace(base, max_steps=n), {}) for n in arguments.cold]
-    kinds += [
-        (f"from the one before, rate {rate:g}", n, replace(base, max_steps=best), {"warm_steps": n, "warm_rate": rate})
-        for n in arguments.warm
-        for rate in arguments.warm_rate
-    ]
+    for n, rate, drift in itertools.product(arguments.warm, arguments.warm_rate, arguments.drift):
+        name = f"from the one before, rate {rate:g}" + (", carried along" if drift else "")
+        changes = {"warm_steps": n, "warm_rate": rate, "drift_steps": drift}
+        kinds.append((name, n, replace(base, max_steps=best), changes))
     kinds += [
         (f"jointly, {k} octaves of time", n, base, {"joint_steps": n, "time_octaves": k})
         for n in arguments.joint

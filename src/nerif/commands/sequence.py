@@ -28,7 +28,16 @@ from nerif.volume import QUANTITIES
 __all__ = ["Sequence", "main", "run"]
 
 
-OWN = ("chunk", "temporal", "warm_steps", "warm_rate", "joint_steps", "time_octaves", "voxels")  # kept in the store
+OWN = (
+    "chunk",
+    "temporal",
+    "warm_steps",
+    "warm_rate",
+    "drift_steps",
+    "joint_steps",
+    "time_octaves",
+    "voxels",
+)  # kept in the store
 
 
 @dataclass(frozen=True)
@@ -55,6 +64,8 @@ class Sequence:
     """Steps of a frame that starts from the one before."""
     warm_rate: float = 0.5
     """Share of the learning rate such a frame begins with."""
+    drift_steps: int = 40
+    """Steps in which the drift from frame to frame is found, by which the field before is carried along; 0 for none."""
     temporal: str = "frames"
     """A network for each frame ("frames"), or one over space and time for each chunk ("joint")."""
     joint_steps: int = 300
@@ -87,6 +98,7 @@ def run(settings: Sequence) -> SequenceStore:
         ("warm_steps", 1),
         ("voxels", 1),
         ("threads", 0),
+        ("drift_steps", 0),
         ("workers", 0),
         ("joint_steps", 1),
         ("time_octaves", 0),
@@ -118,6 +130,7 @@ def run(settings: Sequence) -> SequenceStore:
         gas=settings.gas,
         hold_out=settings.hold_out,
         threads=settings.threads,
+        drift_steps=settings.drift_steps,
         joint_steps=settings.joint_steps if settings.temporal == "joint" else 0,
         time_octaves=settings.time_octaves,
     )
