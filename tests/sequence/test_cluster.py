@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import importlib
 import shutil
 import signal
 import subprocess
@@ -18,10 +18,11 @@ from sequence.films import QUICK, blank
 
 pytest.importorskip("distributed", reason="pip install 'nerif[sequence]'")
 
+from nerif import __version__
 from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
-from nerif.sequence.cluster import open_cluster, read_slurm, slurm_cluster
+from nerif.sequence.cluster import check_workers, open_cluster, read_slurm, slurm_cluster
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 CHUNKS = ["--workers", "2", "--threads", "1", "--chunk", "6"]
@@ -106,23 +107,19 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
 
     plan = _plan(film, tmp_path / "out.zarr")
     deadly = tmp_path / "deadly.py"
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(tmp_path)  # workers get it
     deadly.write_text(
         "import os\nfrom nerif.sequence.run import _in_worker as real\n"
         "from nerif.sequence import frames\n"
         "before = frames._frame\n"
-        "def _frame(plan, settings, measurement, start, parent):\n"
+        "def _frame(plan, settings, measurement, *rest):\n"
         "    if abs(float(measurement.displacement.abs().sum()) - TOTAL) < 1e-6 * TOTAL:\n        os._exit(9)\n"
-        "    return before(plan, settings, measurement, start, parent)\n"
+        "    return before(plan, settings, measurement, *rest)\n"
         "def work(plan, first, last, topic):\n    frames._frame = _frame\n    real(plan, first, last, topic)\n"
     )
     total = float(MeasurementSequence.read(film).frame(7).displacement.abs().sum())
     deadly.write_text(f"TOTAL = {total!r}\n" + deadly.read_text())
-    sys.path.insert(0, str(tmp_path))
-    try:
-        import deadly as module
-    finally:
-        sys.path.remove(str(tmp_path))
+    module = importlib.import_module("deadly")
     monkeypatch.setattr(run, "_in_worker", module.work)
     with open_cluster("local", 2) as (client, _):
         progress = run_sequence(client, plan, 6)
@@ -155,6 +152,30 @@ def test_a_scheduler_that_is_there_already_is_used(film, tmp_path):
         arguments = [*QUICK, "--chunk", "12", "--threads", "1", "--cluster", address]
         assert main(["sequence", str(film), "-o", str(out), *arguments]) == 0
     assert (status_of(out) == DONE).all()
+
+
+class Workers:
+    """A client whose workers answer so."""
+
+    def __init__(self, answer: str | Exception) -> None:
+        self.answer = answer
+
+    def wait_for_workers(self, count: int) -> None:
+        assert count == 1
+
+    def run(self, function, words):
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        assert function(words) == __version__  # what is asked makes sense here
+        return {"tcp://node7": self.answer}
+
+
+def test_workers_that_could_not_read_the_job_are_refused():
+    check_workers(Workers(__version__))
+    with pytest.raises(InputError, match=f"worker tcp://node7: expected nerif {__version__} as here, got 9.9"):
+        check_workers(Workers("9.9"))
+    with pytest.raises(InputError, match="a worker cannot import nerif"):
+        check_workers(Workers(ModuleNotFoundError("No module named 'nerif'")))
 
 
 @pytest.mark.parametrize(

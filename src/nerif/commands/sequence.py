@@ -19,7 +19,7 @@ from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
-from nerif.sequence.cluster import open_cluster
+from nerif.sequence.cluster import check_workers, open_cluster
 from nerif.sequence.frames import Plan
 from nerif.sequence.run import Progress, outcome_table, run_sequence
 from nerif.sequence.store import MISSING, SequenceStore
@@ -141,6 +141,7 @@ def run(settings: Sequence) -> SequenceStore:
             with open_cluster(settings.cluster, settings.workers) as (client, threads), _bar() as bar:
                 if client.dashboard_link:
                     say(f"dashboard: {client.dashboard_link}")
+                check_workers(client)
                 run_sequence(client, replace(plan, threads=plan.threads or threads), settings.chunk, bar)
         except KeyboardInterrupt:
             say(outcome_table(store))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from nerif import __version__
 from nerif.conventions import InputError
 
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["open_cluster", "slurm_cluster", "worker_count"]
+__all__ = ["check_workers", "open_cluster", "slurm_cluster", "worker_count"]
 
 CONFIG = {
     "distributed.scheduler.allowed-failures": 0,  # deaths are counted by frame, in run.py
@@ -66,7 +68,7 @@ def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
     from distributed import Client
 
     if where.startswith(PREFIX):
-        with dask.config.set({"distributed.comm.timeouts.connect": "10s"}):
+        with dask.config.set({"distributed.comm.timeouts.connect": "5s"}):
             try:
                 client = Client(where)
             except (OSError, TimeoutError, ValueError) as error:
@@ -85,6 +87,28 @@ def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
             yield client, threads
 
 
+def check_workers(client: Client) -> None:
+    """Wait for a worker, and see that all have this version of nerif: work that they cannot read would never end.
+
+    Raises
+    ------
+    InputError
+        If one cannot import nerif, or has another version.
+    """
+    client.wait_for_workers(1)
+    ask = "(__import__('nerif.sequence.run'), __import__('nerif').__version__)[1]"
+    try:
+        versions = client.run(eval, ask)
+    except ImportError as error:
+        raise InputError(
+            f"cluster: a worker cannot import nerif ({error}); install 'nerif[sequence]' where it runs, or name that "
+            "environment in job_script_prologue"
+        ) from None
+    for worker, version in versions.items():
+        if version != __version__:
+            raise InputError(f"cluster: worker {worker}: expected nerif {__version__} as here, got {version}")
+
+
 def _local_cluster(workers: int) -> Any:
     """A process for each worker, each with a GPU of its own where there are GPUs."""
     from distributed import Nanny, Scheduler, SpecCluster
@@ -95,7 +119,13 @@ def _local_cluster(workers: int) -> Any:
         environment = {"CUDA_VISIBLE_DEVICES": str(i % gpus)} if gpus else {}
         specification[i] = {
             "cls": Nanny,
-            "options": {"nthreads": 1, "env": environment, "memory_limit": 0, "dashboard": False},
+            "options": {
+                "nthreads": 1,
+                "env": environment,
+                "memory_limit": 0,
+                "dashboard": False,
+                "silence_logs": logging.ERROR,
+            },
         }
     dashboard = {"dashboard": True, "dashboard_address": "localhost:0"} if _has_bokeh() else {"dashboard": False}
     scheduler = {"cls": Scheduler, "options": {"host": "localhost", "port": 0, **dashboard}}
