@@ -39,8 +39,8 @@ from nerif.volume import Volume
 __all__ = ["ATTEMPTS", "Event", "Plan", "finished_frame", "reconstruct_frames"]
 
 ATTEMPTS = 3  # at a frame
-PIXELS = 1024  # of each view, evenly over it, in which a frame is compared with what was measured
-SAMPLES = 80  # a ray, for that
+PIXELS = 256  # of each view, evenly over it, in which a frame is compared with what was measured
+SAMPLES = 60  # a ray, for that
 
 Event = Callable[[dict[str, object]], None]
 """Told {"frame", "what": "begun" | "done" | "failed", ...} as a frame goes along."""
