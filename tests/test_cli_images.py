@@ -257,3 +257,42 @@ def test_a_mirrored_camera_is_refused(copy, capsys):
     said = capsys.readouterr().err
     assert f"view '{view.name}'" in said
     assert "mirrored" in said
+
+
+def test_many_flow_pictures_become_a_sequence(copy, capsys):
+    pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
+    from nerif.measurement_sequence import MeasurementSequence
+
+    views = [folder for folder in sorted((copy / "pictures").iterdir()) if (folder / "flow").is_dir()]
+    for folder in views:
+        (picture,) = (folder / "flow").iterdir()
+        rest = sorted((folder / "reference").iterdir())[0]
+        picture.rename(picture.with_name(f"flow0{picture.suffix}"))
+        for number in (1, 2):  # nothing flows in these
+            shutil.copy(rest, picture.with_name(f"flow{number}{picture.suffix}"))
+    spoilt = next(iter(sorted((views[0] / "flow").glob("flow1*"))))
+    iio.imwrite(spoilt, np.zeros_like(iio.imread(spoilt)))
+    out = copy / "film.zarr"
+    words = displacement(copy, "--frames", "all", "--frame-rate", "1000")
+    words[words.index("-o") + 1] = str(out)
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert f"frame 1: left out: view '{views[0].name}'" in said
+    assert f"3 frames of {len(views)} views, 1 of them with something left out" in said
+    film, single = MeasurementSequence.read(out), Measurement.read(copy / "m.nc")
+    assert film.times == pytest.approx([0, 1e-3, 2e-3])
+    first = film.frame(0)
+    assert first.names == single.names
+    assert torch.equal(first.usable, single.usable)
+    assert torch.allclose(first.displacement[first.usable], single.displacement[single.usable], atol=1e-6)
+    assert len(film.frame(1).names) == len(views) - 1
+    still = film.frame(2)
+    assert float(still.displacement[still.usable].abs().mean()) < 0.3 * float(
+        first.displacement[first.usable].abs().mean()
+    )
+    assert main(words) == 0
+    assert "3 of 3 frames are there already" in capsys.readouterr().out
+    assert main([*words, "--smoothness", "2"]) == 2
+    assert "made with other settings" in capsys.readouterr().err
+    assert main([*words, "--frames", "0:4"]) == 2
+    assert "expected numbers within the 3 of view" in capsys.readouterr().err

@@ -162,8 +162,8 @@ def measure(
     full_scale : grey value at which the sensor is full, if known: such pixels are not valid
     region : where the background is seen at all, or None
     """
-    if not len(flow):
-        raise InputError("pictures: expected at least one flow picture, got none")
+    if not len(reference) or not len(flow):
+        raise InputError(f"pictures: expected at least one of each, got {len(reference)} reference, {len(flow)} flow")
     return measure_against(AtRest.of(reference, settings, full_scale, len(flow)), flow, region)
 
 
