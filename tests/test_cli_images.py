@@ -292,7 +292,8 @@ def test_many_flow_pictures_become_a_sequence(copy, capsys):
     )
     assert main(words) == 0
     assert "3 of 3 frames are there already" in capsys.readouterr().out
-    assert main([*words, "--smoothness", "2"]) == 2
-    assert "made with other settings" in capsys.readouterr().err
+    for change in (["--smoothness", "2"], ["--mask", "4"], ["--n-ambient", "1.0003"]):
+        assert main([*words, *change]) == 2
+        assert "made with other settings" in capsys.readouterr().err
     assert main([*words, "--frames", "0:4"]) == 2
     assert "expected numbers within the 3 of view" in capsys.readouterr().err

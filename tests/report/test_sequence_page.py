@@ -48,7 +48,7 @@ def store_of(path: Path, frames: int, **attributes: object) -> VolumeSequence:
 def test_the_page_tells_what_is_there_and_what_is_not(tmp_path):
     page = render_sequence(store_of(tmp_path / "r.zarr", 5, settings={"network": vars(NetworkShape())}))
     words = re.sub(r"<[^>]+>", " ", page[: page.index("<script")])
-    for said in ("3 of 5", "1 frames failed", "frame 1: no valid pixel", "1 of 5 frames are missing", "film.zarr"):
+    for said in ("3 of 5", "1 frame failed", "frame 1: no valid pixel", "1 of 5 frames are missing", "film.zarr"):
         assert said in words, said
     assert "CC at least 0.99, rms error at most 0.01 px" in words
     assert "CC at least 0.9, rms error at most 0.04 px" in words

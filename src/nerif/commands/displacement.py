@@ -119,7 +119,8 @@ def run_over_time(settings: Displacement, box: Box, views: Sequence[View]) -> Me
             resting.append(RestingView(view, _camera(view, cameras[view.name], shape), rest, region, mask))
             bar(len(resting))
     job = FrameJob(resting, settings.world(box), settings.mask)
-    return measure_frames(job, numbers, times, settings.out, asdict(settings.method), settings.force)
+    kept = {name: value for name, value in asdict(settings).items() if name not in ("out", "force", "config", "frames")}
+    return measure_frames(job, numbers, times, settings.out, kept, settings.force)
 
 
 def _drawn(view: View, source: str, shape: tuple[int, int]) -> np.ndarray | None:

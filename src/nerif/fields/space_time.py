@@ -9,6 +9,7 @@ frequency in time.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -61,7 +62,7 @@ class AtTimes:
     tau : (m,) times in [-1, 1]; point i of n is taken at tau[i m / n]
     """
 
-    def __init__(self, network: object, tau: Float[Tensor, " m"]) -> None:
+    def __init__(self, network: Any, tau: Float[Tensor, " m"]) -> None:
         self.network, self.tau = network, tau
 
     def _with_time(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
@@ -69,13 +70,13 @@ class AtTimes:
 
     def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the n head."""
-        return self.network.value(self._with_time(p))  # type: ignore[attr-defined]
+        return self.network.value(self._with_time(p))
 
     def value_and_gradient(
         self, p: Float[Tensor, "n 3"], heads: bool
     ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
         """Return the n head, its exact gradient in space, and what the gradient heads say."""
-        return self.network.value_and_gradient(self._with_time(p), heads)  # type: ignore[attr-defined]
+        return self.network.value_and_gradient(self._with_time(p), heads)
 
 
 class SpaceTimeField(NeuralField):

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from nerif.fields.mlp import Network, NeuralField
 from nerif.physics.deflection import integration_weights
+from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.sampling import Guide, sample_rays
 from nerif.reconstruction.target import Target
 
@@ -44,7 +45,7 @@ def drift_between(
     shift = nn.Parameter((first / field.half_edge).float().to(device))
     adam = torch.optim.Adam([shift], lr=RATE, betas=(0.8, 0.95))
     guide = Guide(field)
-    guide.update(_Plain(field.network))
+    guide.update(MixedPrecision(field.network, device, "float32", "off"))
     unit = field.index_scale / field.half_edge / n_ambient
     rays = min(max(1, points // SAMPLES), len(target))
     sum_of_last, last = torch.zeros(3, device=device), max(1, steps // 4)
@@ -96,20 +97,3 @@ def _fed_by_encoding(network: Network) -> list[tuple[nn.Linear, int]]:
     elif shape.skip == shape.depth:
         fed += [(head, shape.width) for head in (network.heads or network.outputs)]
     return [(layer, first) for layer, first in fed if isinstance(layer, nn.Linear)]
-
-
-class _Plain:
-    """A network as an Evaluator, in its own precision."""
-
-    def __init__(self, network: Network) -> None:
-        self.network = network
-
-    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the n head."""
-        return self.network(p)
-
-    def value_and_gradient(
-        self, p: Float[Tensor, "n 3"], heads: bool
-    ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
-        """Return the n head and its exact gradient."""
-        return self.network.value_and_gradient(p, heads)

@@ -119,7 +119,7 @@ def _statements(store: VolumeSequence) -> list[Statement]:
     if len(failed):
         reasons = [str(r) for r in store.array("reason")[:]]
         first = f"frame {failed[0]}: {reasons[failed[0]]}"
-        found.append(Statement("warning", f"{len(failed)} frames failed, {first}"))
+        found.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
     held = set(store.attributes.get("hold_out", ()))
     if not held:
         found.append(Statement("note", "No view was held out, so nothing here tests what the cameras did not see."))

@@ -9,7 +9,8 @@ import math
 import os
 import shutil
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from nerif.reconstruction.optimiser import NetworkOptimiser
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.sampling import Guide, sample_count, sample_rays
 from nerif.reconstruction.target import Target
-from nerif.sequence.frames import Event, Plan, finished_frame
+from nerif.sequence.frames import ATTEMPTS, Event, Plan, finished_frame
 from nerif.sequence.store import DONE, MISSING, SequenceStore, chunk_tau
 
 __all__ = ["Film", "reconstruct_jointly"]
@@ -139,9 +140,24 @@ def reconstruct_jointly(plan: Plan, first: int, last: int, event: Event = lambda
     if not frames:
         return
     tau = torch.tensor([chunk_tau(sequence.times, i, first, last) for i in frames], dtype=torch.float32)
-    training = _Training(plan, Film.of(list(frames.values()), tau, plan.cold.open_faces), next(iter(frames.values())))
     kept = plan.out.with_name(plan.out.name + ".joint") / str(first)
-    training.run(kept, lambda share: event({"frame": first, "what": "share", "share": share * len(missing)}))
+    reason = ""
+    for attempt in range(ATTEMPTS):
+        careful = replace(plan, cold=replace(plan.cold, learning_rate=plan.cold.learning_rate / 2**attempt))
+        try:
+            film = Film.of(list(frames.values()), tau, plan.cold.open_faces)
+            training = _Training(careful, film, next(iter(frames.values())))
+            training.run(kept, lambda share: event({"frame": first, "what": "share", "share": share * len(missing)}))
+            break
+        except (InputError, ArithmeticError, RuntimeError, MemoryError) as error:
+            reason = str(error) or type(error).__name__
+            shutil.rmtree(kept, ignore_errors=True)
+    else:
+        for i in frames:
+            if store.status[i] == MISSING:
+                store.fail(i, reason, ATTEMPTS)
+                event({"frame": i, "what": "failed", "reason": reason})
+        return
     seconds = (time.perf_counter() - begun) / len(frames)
     for i, t in zip(frames, tau.tolist(), strict=True):
         if store.status[i] != DONE:
@@ -171,7 +187,7 @@ class _Training:
         self.measured, self.order = film.measured(), torch.empty(0, dtype=torch.long)
         self.step, self.parent = 0, os.getppid()
 
-    def run(self, kept: Path, tell: object) -> None:
+    def run(self, kept: Path, tell: Callable[[float], None]) -> None:
         """Train to the end, from the last checkpoint if there is one."""
         if (kept / CHECKPOINT).is_file():
             self._restore(read_state(kept))
@@ -188,7 +204,7 @@ class _Training:
             if self.step % TELL_EVERY == 0:
                 if not math.isfinite(float(loss.detach())):
                     raise ArithmeticError(f"joint: the loss is not finite at step {self.step}; try a smaller rate")
-                tell(self.step / self.steps)  # type: ignore[operator]
+                tell(self.step / self.steps)
             if time.monotonic() - written > CHECKPOINT_EVERY:
                 kept.mkdir(parents=True, exist_ok=True)
                 write_state(kept, self._capture())
