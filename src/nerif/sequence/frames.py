@@ -36,9 +36,10 @@ from nerif.reconstruction.target import Target
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
 from nerif.volume import Volume
 
-__all__ = ["ATTEMPTS", "Event", "Plan", "finished_frame", "reconstruct_frames"]
+__all__ = ["ATTEMPTS", "Event", "Plan", "finished_frame", "reconstruct_frames", "warm"]
 
 ATTEMPTS = 3  # at a frame
+WARM_UP = 10  # steps over which the learning rate rises from weights that are good already
 PIXELS = 256  # of each view, evenly over it, in which a frame is compared with what was measured
 SAMPLES = 60  # a ray, for that
 
@@ -77,6 +78,11 @@ class Plan:
     drift_steps: int = 0
     joint_steps: int = 0
     time_octaves: int = 3
+
+
+def warm(cold: NeRIF, steps: int, rate: float) -> NeRIF:
+    """Return the settings of a frame that starts from the one before: fewer steps, at a share of the learning rate."""
+    return replace(cold, max_steps=steps, rate_after_fit=rate, warm_up=min(cold.warm_up, WARM_UP))
 
 
 def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda told: None) -> None:
