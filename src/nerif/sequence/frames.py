@@ -155,7 +155,7 @@ def _frame(
     if result.outcome.reason == "diverged":
         raise ArithmeticError(result.outcome.message)
     assert isinstance(result.field, NeuralField)
-    frame = finished_frame(plan, result.field, measurement, result.device, 0.0)
+    frame = finished_frame(plan, result.field, measurement, result.device)
     steps = int(result.history[-1]["step"]) if result.history else 0
     return replace(frame, seconds=time.perf_counter() - begun, steps=steps, velocity=velocity)
 
@@ -176,13 +176,13 @@ def _carried_to(
     return carried(before.field, drift), drift / passed
 
 
-def finished_frame(plan: Plan, field: NeuralField, measurement: Measurement, device: str, seconds: float) -> Frame:
+def finished_frame(plan: Plan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return what is written of a field: its volumes, and how it compares with what was measured."""
     grid = Grid.of_resolution(measurement.box, plan.voxels)
     excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})
     volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
     cc, rms = _against_measured(field, measurement, device)
-    return Frame(field, volumes, cc, rms, seconds, 0)
+    return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)
 
 
 def _against_measured(field: Field, measurement: Measurement, device: str) -> tuple[dict[str, float], dict[str, float]]:

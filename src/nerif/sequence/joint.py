@@ -161,9 +161,11 @@ def reconstruct_jointly(plan: Plan, first: int, last: int, event: Event = lambda
     seconds = (time.perf_counter() - begun) / len(frames)
     for i, t in zip(frames, tau.tolist(), strict=True):
         if store.status[i] != DONE:
-            found = finished_frame(plan, training.field(t), sequence.frame(i), str(training.device), seconds)
+            begun = time.perf_counter()
+            found = finished_frame(plan, training.field(t), sequence.frame(i), str(training.device))
+            found = replace(found, seconds=seconds + time.perf_counter() - begun, steps=plan.joint_steps)
             store.write_frame(i, found)
-            event({"frame": i, "what": "done", "seconds": seconds})
+            event({"frame": i, "what": "done", "seconds": found.seconds})
     shutil.rmtree(kept, ignore_errors=True)
 
 
