@@ -23,7 +23,7 @@ from nerif import __version__
 from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
-from nerif.sequence.cluster import check_workers, open_cluster, read_slurm, slurm_cluster
+from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 CHUNKS = ["--workers", "2", "--threads", "1", "--chunk", "6"]
@@ -88,6 +88,17 @@ def test_killed_workers_a_killed_command_and_a_frame_of_nan_leave_a_complete_sto
 
     third = subprocess.run(command(spoilt, out), capture_output=True, text=True, timeout=100, check=True)
     assert "frames to do" not in third.stdout  # nothing is done twice
+
+
+@pytest.mark.parametrize(
+    ("visible", "count", "expected"), [(None, 2, ["0", "1"]), ("4, 7", 2, ["4", "7"]), ("", 0, [])]
+)
+def test_workers_share_the_gpus_that_are_left_to_the_command(monkeypatch, visible, count, expected):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: count)
+    assert _gpus() == expected
 
 
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(film, tmp_path):
