@@ -67,11 +67,16 @@ def run(
     """Reconstruct a film; seconds a frame, and mean L2, L2 of the variation and CC of the last frames."""
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
     steps, rate, joint = (changes.get(k, 0) for k in ("warm_steps", "warm_rate", "joint_steps"))
-    octaves, drift = int(changes.get("time_octaves", 3)), int(changes.get("drift_steps", 0))
+    octaves = int(changes.get("time_octaves", 3))
     plan = Plan(
-        film, out, cold, warm(cold, int(steps), rate) if steps else cold, voxels, drift_steps=drift,
-        joint_steps=int(joint), time_octaves=octaves,
-    )  # fmt: skip
+        film,
+        out,
+        cold,
+        warm(cold, int(steps), rate) if steps else cold,
+        voxels,
+        joint_steps=int(joint),
+        time_octaves=octaves,
+    )
     about = {"chunk": len(sequence), "hold_out": [], "settings": dataclasses.asdict(cold)}
     about |= {"temporal": "joint", "time_octaves": octaves} if joint else {}
     store = SequenceStore.begin(out, sequence, truth.grid, plan.quantities, cold.network, about)
@@ -136,10 +141,9 @@ def main() -> None:
     parser.add_argument("--voxels", type=int, default=64)
     parser.add_argument("--preset", default="fast", choices=list(PRESETS))
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--cold", type=int, nargs="*", default=[200, 400, 800], help="steps of a frame from nothing")
-    parser.add_argument("--warm", type=int, nargs="*", default=[60, 120, 240], help="steps of a frame from the last")
-    parser.add_argument("--warm-rate", type=float, nargs="*", default=[0.5])
-    parser.add_argument("--drift", type=int, nargs="*", default=[0, 40], help="steps in which the drift is found")
+    parser.add_argument("--cold", type=int, nargs="*", default=[250, 500, 1000], help="steps of a frame from nothing")
+    parser.add_argument("--warm", type=int, nargs="*", default=[80, 160, 320], help="steps of a frame from the last")
+    parser.add_argument("--warm-rate", type=float, nargs="*", default=[0.7])
     parser.add_argument("--joint", type=int, nargs="*", default=[120, 240], help="steps a frame of a joint network")
     parser.add_argument("--time-octaves", type=int, nargs="*", default=[3])
     parser.add_argument("--write", type=Path, help="also write the table to this file")
@@ -159,10 +163,9 @@ def main() -> None:
     best = max([*arguments.cold, 1])
     kinds: list[tuple[str, int, NeRIF, dict[str, float]]] = []
     kinds += [("from nothing", n, replace(base, max_steps=n), {}) for n in arguments.cold]
-    for n, rate, drift in itertools.product(arguments.warm, arguments.warm_rate, arguments.drift):
-        name = f"from the one before, rate {rate:g}" + (", carried along" if drift else "")
-        changes = {"warm_steps": n, "warm_rate": rate, "drift_steps": drift}
-        kinds.append((name, n, replace(base, max_steps=best), changes))
+    for n, rate in itertools.product(arguments.warm, arguments.warm_rate):
+        changes = {"warm_steps": n, "warm_rate": rate}
+        kinds.append((f"from the one before, rate {rate:g}", n, replace(base, max_steps=best), changes))
     kinds += [
         (f"jointly, {k} octaves of time", n, base, {"joint_steps": n, "time_octaves": k})
         for n in arguments.joint

@@ -33,7 +33,6 @@ OWN = (
     "temporal",
     "warm_steps",
     "warm_rate",
-    "drift_steps",
     "joint_steps",
     "time_octaves",
     "voxels",
@@ -62,10 +61,8 @@ class Sequence:
     """Frames of a chunk of time; the first of each starts from nothing."""
     warm_steps: int = 300
     """Steps of a frame that starts from the one before."""
-    warm_rate: float = 0.5
+    warm_rate: float = 0.7
     """Share of the learning rate such a frame begins with."""
-    drift_steps: int = 40
-    """Steps in which the drift from frame to frame is found, by which the field before is carried along; 0 for none."""
     temporal: str = "frames"
     """A network for each frame ("frames"), or one over space and time for each chunk ("joint")."""
     joint_steps: int = 300
@@ -98,7 +95,6 @@ def run(settings: Sequence) -> SequenceStore:
         ("warm_steps", 1),
         ("voxels", 1),
         ("threads", 0),
-        ("drift_steps", 0),
         ("workers", 0),
         ("joint_steps", 1),
         ("time_octaves", 0),
@@ -129,7 +125,6 @@ def run(settings: Sequence) -> SequenceStore:
         gas=settings.gas,
         hold_out=settings.hold_out,
         threads=settings.threads,
-        drift_steps=settings.drift_steps,
         joint_steps=settings.joint_steps if settings.temporal == "joint" else 0,
         time_octaves=settings.time_octaves,
     )
