@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 pytest.importorskip("pyvista", reason="pip install 'nerif[movie]'")
 pytest.importorskip("imageio_ffmpeg", reason="pip install 'nerif[movie]'")
 
-import imageio.v2 as imageio
+from imageio_ffmpeg import get_ffmpeg_exe
 
 from nerif.cli import main
 from nerif.conventions import InputError
@@ -33,6 +34,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> VolumeSequence:
     return found
 
 
+def decoded(movie: Path, width: int, height: int) -> np.ndarray:
+    """The pictures of a movie as a player would show them."""
+    command = [get_ffmpeg_exe(), "-v", "error", "-i", str(movie), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(command, check=True, capture_output=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+
+
 SMALL = ["--quantity", "index_excess", "--size", "240", "180"]
 
 
@@ -41,10 +49,9 @@ def test_a_movie_shows_every_frame_and_they_differ(store, tmp_path, capsys, name
     out = tmp_path / name
     assert main(["movie", str(store.path), "-o", str(out), "--style", style, *SMALL]) == 0
     assert "3 frames" in capsys.readouterr().out
-    pictures = [np.asarray(p) for p in imageio.get_reader(out)]
+    pictures = decoded(out, 240, 180)
     assert len(pictures) == 3
-    assert all(p.shape[:2] == (180, 240) for p in pictures)
-    assert all(p[..., :3].std() > 10 for p in pictures)
+    assert all(p.std() > 10 for p in pictures)
     middle = (slice(50, 140), slice(70, 170))
     assert np.abs(pictures[0][middle].astype(float) - pictures[2][middle].astype(float)).mean() > 1
     assert not list(tmp_path.glob(".*"))

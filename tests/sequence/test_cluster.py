@@ -8,13 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
-from sequence.films import QUICK, blank
+from sequence.films import QUICK, blank, simulated
 
 pytest.importorskip("distributed", reason="pip install 'nerif[sequence]'")
 
@@ -22,7 +23,7 @@ from nerif import __version__
 from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
-from nerif.sequence.cluster import check_workers, open_cluster, read_slurm, slurm_cluster
+from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 CHUNKS = ["--workers", "2", "--threads", "1", "--chunk", "6"]
@@ -89,6 +90,17 @@ def test_killed_workers_a_killed_command_and_a_frame_of_nan_leave_a_complete_sto
     assert "frames to do" not in third.stdout  # nothing is done twice
 
 
+@pytest.mark.parametrize(
+    ("visible", "count", "expected"), [(None, 2, ["0", "1"]), ("4, 7", 2, ["4", "7"]), ("", 0, [])]
+)
+def test_workers_share_the_gpus_that_are_left_to_the_command(monkeypatch, visible, count, expected):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: count)
+    assert _gpus() == expected
+
+
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(film, tmp_path):
     out = tmp_path / "out.zarr"
     process = subprocess.Popen(command(film, out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -99,6 +111,28 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(film, tmp_path):
     assert "missing; the same command does them" in text
     assert "Traceback" not in errors
     assert (status_of(out) == DONE).sum() >= 2
+
+
+@pytest.mark.slow
+def test_memory_of_the_command_and_of_each_worker_stays_flat_over_500_frames(tmp_path, capsys):
+    film, out = simulated(tmp_path / "long.zarr", 500), tmp_path / "out.zarr"
+    process = subprocess.Popen(command(film, out, "--chunk", "25"), stdout=subprocess.DEVNULL)
+    seen: dict[int, list[tuple[int, int]]] = {}
+    while process.poll() is None:
+        with suppress(psutil.NoSuchProcess):
+            done = int((status_of(out) != MISSING).sum())
+            for each in (psutil.Process(process.pid), *workers_of(process)):
+                seen.setdefault(each.pid, []).append((done, each.memory_info().rss))
+        time.sleep(0.1)
+    assert process.returncode == 0
+    assert (status_of(out) == DONE).all()
+    assert len(seen) == 3
+    for pid, looks in seen.items():
+        early, late = (np.median([rss for done, rss in looks if low <= done < low + 100]) / 2**20 for low in (100, 400))
+        name = "command" if pid == process.pid else "worker"
+        with capsys.disabled():
+            print(f"\n{name}: {early:.1f} MiB at frames 100 to 200, {late:.1f} MiB at frames 400 to 500", end="")
+        assert late < 1.05 * early, name
 
 
 def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monkeypatch):

@@ -20,7 +20,7 @@ from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
 from nerif.sequence.cluster import check_workers, open_cluster
-from nerif.sequence.frames import Plan
+from nerif.sequence.frames import Plan, warm
 from nerif.sequence.run import Progress, outcome_table, run_sequence
 from nerif.sequence.store import MISSING, SequenceStore
 from nerif.volume import QUANTITIES
@@ -33,7 +33,6 @@ OWN = (
     "temporal",
     "warm_steps",
     "warm_rate",
-    "drift_steps",
     "joint_steps",
     "time_octaves",
     "voxels",
@@ -62,10 +61,8 @@ class Sequence:
     """Frames of a chunk of time; the first of each starts from nothing."""
     warm_steps: int = 300
     """Steps of a frame that starts from the one before."""
-    warm_rate: float = 0.5
+    warm_rate: float = 0.7
     """Share of the learning rate such a frame begins with."""
-    drift_steps: int = 40
-    """Steps in which the drift from frame to frame is found, by which the field before is carried along; 0 for none."""
     temporal: str = "frames"
     """A network for each frame ("frames"), or one over space and time for each chunk ("joint")."""
     joint_steps: int = 300
@@ -98,7 +95,6 @@ def run(settings: Sequence) -> SequenceStore:
         ("warm_steps", 1),
         ("voxels", 1),
         ("threads", 0),
-        ("drift_steps", 0),
         ("workers", 0),
         ("joint_steps", 1),
         ("time_octaves", 0),
@@ -119,18 +115,16 @@ def run(settings: Sequence) -> SequenceStore:
     if settings.retry:
         say(f"{store.forget_failures()} failed frames are tried again")
     cold = settings.reconstructor
-    warm = replace(cold, max_steps=settings.warm_steps, rate_after_fit=settings.warm_rate)
     plan = Plan(
         measurement=settings.measurement.resolve(),
         out=settings.out.resolve(),
         cold=cold,
-        warm=warm,
+        warm=warm(cold, settings.warm_steps, settings.warm_rate),
         voxels=settings.voxels,
         quantities=settings.quantities,
         gas=settings.gas,
         hold_out=settings.hold_out,
         threads=settings.threads,
-        drift_steps=settings.drift_steps,
         joint_steps=settings.joint_steps if settings.temporal == "joint" else 0,
         time_octaves=settings.time_octaves,
     )

@@ -37,7 +37,6 @@ CHOICES = {
     "precision": ("auto", "float32", "tf32", "bf16"),
     "compile": ("auto", "on", "off"),
 }
-WARM_UP = 50  # steps over which the learning rate rises
 RETRIES = 5  # times a run that turned non-finite is taken back before it gives up
 GAUGE_POINTS = 256  # a step
 GUIDE_EVERY = 60  # steps between looks at where the field varies
@@ -75,6 +74,8 @@ class NeRIF(Reconstructor):
     """Muon's learning rate, in units of Adam's."""
     momentum: float = 0.9
     """Muon's."""
+    warm_up: int = 50
+    """Steps over which the learning rate rises; with the cosine schedule."""
     schedule: str = "cosine"
     """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
     epochs: float = 40.0
@@ -108,7 +109,15 @@ class NeRIF(Reconstructor):
         for name, allowed in CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
-        for name in ("epochs", "learning_rate", "matrix_rate", "points_per_batch", "fit_steps", "rate_after_fit"):
+        for name in (
+            "epochs",
+            "learning_rate",
+            "matrix_rate",
+            "points_per_batch",
+            "fit_steps",
+            "rate_after_fit",
+            "warm_up",
+        ):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("max_steps", "time_limit", "stop_ratio", "sample_jitter"):
@@ -279,7 +288,7 @@ class _Training:
     def _learning_rate(self) -> float:
         settings, rate = self.settings, self.rate * self.settings.learning_rate
         if settings.schedule == "cosine":
-            rate *= min(1.0, (self.step + 1) / WARM_UP)
+            rate *= min(1.0, (self.step + 1) / settings.warm_up)
             rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(self.progress, 1.0)))
         return rate
 

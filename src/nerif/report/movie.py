@@ -64,6 +64,10 @@ class Movie:
 
     def _picture(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
         import pyvista as pv
+        from vtkmodules.vtkCommonCore import vtkLogger
+
+        # VTK looks for a display first, warns that there is none, and draws without
+        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
 
         values = shown(volume)
         grid = pv.ImageData(
@@ -79,7 +83,8 @@ class Movie:
             plotter.set_background("white")
             colour_map = COLOUR_MAPS.get(self.quantity, "viridis")
             if self.style == "slices":
-                bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.3g"}
+                bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.2g", "n_labels": 4}
+                bar |= {"position_x": 0.86, "position_y": 0.15, "width": 0.06, "height": 0.5}
                 x, y, z = volume.grid.box.centre
                 slices = grid.slice_orthogonal(x=x, y=y, z=z)
                 plotter.add_mesh(slices, clim=limits, cmap=colour_map, scalar_bar_args=bar, lighting=False)
@@ -109,7 +114,7 @@ class Movie:
         direction = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         )
-        x, y, z = np.array(volume.grid.box.centre) + 2.2 * float(np.linalg.norm(volume.grid.box.edges)) * direction
+        x, y, z = np.array(volume.grid.box.centre) + 2.05 * float(np.linalg.norm(volume.grid.box.edges)) * direction
         return float(x), float(y), float(z)
 
     def write(

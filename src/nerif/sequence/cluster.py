@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -113,10 +114,10 @@ def _local_cluster(workers: int) -> Any:
     """A process for each worker, each with a GPU of its own where there are GPUs."""
     from distributed import Nanny, Scheduler, SpecCluster
 
-    gpus = torch.cuda.device_count()
+    gpus = _gpus()
     specification = {}
     for i in range(workers):
-        environment = {"CUDA_VISIBLE_DEVICES": str(i % gpus)} if gpus else {}
+        environment = {"CUDA_VISIBLE_DEVICES": gpus[i % len(gpus)]} if gpus else {}
         specification[i] = {
             "cls": Nanny,
             "options": {
@@ -130,6 +131,13 @@ def _local_cluster(workers: int) -> Any:
     dashboard = {"dashboard": True, "dashboard_address": "localhost:0"} if _has_bokeh() else {"dashboard": False}
     scheduler = {"cls": Scheduler, "options": {"host": "localhost", "port": 0, **dashboard}}
     return SpecCluster(workers=specification, scheduler=scheduler, silence_logs="ERROR")
+
+
+def _gpus() -> list[str]:
+    """The GPUs that this process may use, by the names that CUDA_VISIBLE_DEVICES takes."""
+    count = torch.cuda.device_count()
+    named = [name.strip() for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
+    return (named or [str(i) for i in range(count)])[:count]
 
 
 def _has_bokeh() -> bool:

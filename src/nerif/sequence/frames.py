@@ -1,6 +1,6 @@
 """The frames of one chunk of time, one after the other, each from the one before. Runs in a worker.
 
-    frame 0: from nothing  ->  frame 1: from the weights of 0, carried along by the flow, fewer steps  ->  ...
+    frame 0: from nothing  ->  frame 1: from the weights of 0, in fewer steps  ->  frame 2: from those of 1  ->  ...
 
 A frame that fails is tried again from nothing, then with half the learning rate, then recorded; the next one starts
 from the last that is done. The weights are read back from the store, so a chunk that goes on elsewhere, after a death,
@@ -17,8 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
@@ -29,16 +27,15 @@ from nerif.measurement_sequence import MeasurementSequence
 from nerif.metrics import correlation
 from nerif.physics.deflection import Deflection, project
 from nerif.physics.quantities import GasSettings, derive
-from nerif.reconstruction.device import keep_freed_memory, resolve_device
-from nerif.reconstruction.drift import carried, drift_between
+from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.target import Target
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
 from nerif.volume import Volume
 
-__all__ = ["ATTEMPTS", "Event", "Plan", "finished_frame", "reconstruct_frames"]
+__all__ = ["ATTEMPTS", "Event", "Plan", "finished_frame", "reconstruct_frames", "warm"]
 
 ATTEMPTS = 3  # at a frame
+WARM_UP = 10  # steps over which the learning rate rises from weights that are good already
 PIXELS = 256  # of each view, evenly over it, in which a frame is compared with what was measured
 SAMPLES = 60  # a ray, for that
 
@@ -60,7 +57,6 @@ class Plan:
     gas : what density and temperature are computed for
     hold_out : views kept out
     threads : of a worker on a CPU; 0 for its share of the cores
-    drift_steps : in which the drift from frame to frame is found; 0 for a flow that is taken to stand still
     joint_steps : of training for each frame of a network over space and time; 0 for a network for each frame
     time_octaves : of the encoding of time in it
     """
@@ -74,9 +70,13 @@ class Plan:
     gas: GasSettings = field(default_factory=GasSettings)
     hold_out: tuple[str, ...] = ()
     threads: int = 0
-    drift_steps: int = 0
     joint_steps: int = 0
     time_octaves: int = 3
+
+
+def warm(cold: NeRIF, steps: int, rate: float) -> NeRIF:
+    """Return the settings of a frame that starts from the one before: fewer steps, at a share of the learning rate."""
+    return replace(cold, max_steps=steps, rate_after_fit=rate, warm_up=min(cold.warm_up, WARM_UP))
 
 
 def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda told: None) -> None:
@@ -86,7 +86,7 @@ def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda 
     keep_freed_memory()
     sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
     parent = os.getppid()
-    before: _Before | None = None
+    before: NeuralField | None = None
     for index in range(first, last):
         status = store.status[index]
         if status == MISSING:
@@ -101,40 +101,27 @@ def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda 
             event({"frame": index, "what": "done", "seconds": frame.seconds})
             status = DONE
         if status == DONE:
-            velocity = torch.from_numpy(np.asarray(store.array("velocity")[index]))
-            before = _Before(store.field(index), sequence.times[index], velocity)
-
-
-@dataclass(frozen=True)
-class _Before:
-    """The last frame that is done: its field, instant (s), and how fast it drifted (mm/s)."""
-
-    field: NeuralField
-    time: float
-    velocity: Float[Tensor, " 3"]
+            before = store.field(index)
 
 
 class _FrameError(Exception):
     """A frame could not be reconstructed in as many attempts as there are."""
 
 
-def _attempts(plan: Plan, sequence: MeasurementSequence, index: int, before: _Before | None, parent: int) -> Frame:
+def _attempts(plan: Plan, sequence: MeasurementSequence, index: int, before: NeuralField | None, parent: int) -> Frame:
     """One frame: as planned, then from nothing, then more cautiously."""
     careful = replace(plan.cold, learning_rate=plan.cold.learning_rate / 2)
     tries = [(plan.cold, None) if before is None else (plan.warm, before), (plan.cold, None), (careful, None)]
     reason = ""
-    for number, (settings, begin) in enumerate(tries, start=1):
+    for number, (settings, start) in enumerate(tries, start=1):
         try:
-            frame = _frame(plan, settings, sequence.frame(index), sequence.times[index], begin, parent)
-            return replace(frame, attempts=number)
+            return replace(_frame(plan, settings, sequence.frame(index), start, parent), attempts=number)
         except (InputError, ArithmeticError, RuntimeError, MemoryError, OSError) as error:
             reason = str(error) or type(error).__name__
     raise _FrameError(reason)
 
 
-def _frame(
-    plan: Plan, settings: NeRIF, measurement: Measurement, instant: float, before: _Before | None, parent: int
-) -> Frame:
+def _frame(plan: Plan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, parent: int) -> Frame:
     begun = time.perf_counter()
     training = measurement.select([name for name in measurement.names if name not in plan.hold_out])
 
@@ -142,41 +129,22 @@ def _frame(
         if os.getppid() != parent:  # the command was killed, and may run again: leave the frames to the new one
             os._exit(1)
 
-    start, velocity = (
-        (None, torch.zeros(3)) if before is None else _carried_to(plan, settings, training, instant, before)
-    )
     result = settings(training, watch, None, start)
     if result.outcome.reason == "diverged":
         raise ArithmeticError(result.outcome.message)
     assert isinstance(result.field, NeuralField)
-    frame = finished_frame(plan, result.field, measurement, result.device, 0.0)
+    frame = finished_frame(plan, result.field, measurement, result.device)
     steps = int(result.history[-1]["step"]) if result.history else 0
-    return replace(frame, seconds=time.perf_counter() - begun, steps=steps, velocity=velocity)
+    return replace(frame, seconds=time.perf_counter() - begun, steps=steps)
 
 
-def _carried_to(
-    plan: Plan, settings: NeRIF, training: Measurement, instant: float, before: _Before
-) -> tuple[NeuralField, Float[Tensor, " 3"]]:
-    """The field of the frame before as the flow has carried it to this one, and how fast, mm/s."""
-    if not plan.drift_steps:
-        return before.field, torch.zeros(3)
-    device, passed = resolve_device(settings.device), instant - before.time
-    before.field.network.to(device)
-    target = Target.of(training, settings.open_faces).to(device)
-    drift = drift_between(
-        before.field, target, before.velocity * passed, training.n_ambient, plan.drift_steps,
-        settings.points_per_batch, settings.seed,
-    )  # fmt: skip
-    return carried(before.field, drift), drift / passed
-
-
-def finished_frame(plan: Plan, field: NeuralField, measurement: Measurement, device: str, seconds: float) -> Frame:
+def finished_frame(plan: Plan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return what is written of a field: its volumes, and how it compares with what was measured."""
     grid = Grid.of_resolution(measurement.box, plan.voxels)
     excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})
     volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
     cc, rms = _against_measured(field, measurement, device)
-    return Frame(field, volumes, cc, rms, seconds, 0)
+    return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)
 
 
 def _against_measured(field: Field, measurement: Measurement, device: str) -> tuple[dict[str, float], dict[str, float]]:

@@ -28,7 +28,7 @@ from nerif.reconstruction.device import keep_freed_memory, resolve_device
 from nerif.reconstruction.files import CHECKPOINT, read_state, write_state
 from nerif.reconstruction.gauge import AmbientRegion
 from nerif.reconstruction.losses import loss_terms
-from nerif.reconstruction.neural import GAUGE_POINTS, GUIDE_EVERY, WARM_UP
+from nerif.reconstruction.neural import GAUGE_POINTS, GUIDE_EVERY
 from nerif.reconstruction.optimiser import NetworkOptimiser
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.sampling import Guide, sample_count, sample_rays
@@ -161,9 +161,11 @@ def reconstruct_jointly(plan: Plan, first: int, last: int, event: Event = lambda
     seconds = (time.perf_counter() - begun) / len(frames)
     for i, t in zip(frames, tau.tolist(), strict=True):
         if store.status[i] != DONE:
-            found = finished_frame(plan, training.field(t), sequence.frame(i), str(training.device), seconds)
+            begun = time.perf_counter()
+            found = finished_frame(plan, training.field(t), sequence.frame(i), str(training.device))
+            found = replace(found, seconds=seconds + time.perf_counter() - begun, steps=plan.joint_steps)
             store.write_frame(i, found)
-            event({"frame": i, "what": "done", "seconds": seconds})
+            event({"frame": i, "what": "done", "seconds": found.seconds})
     shutil.rmtree(kept, ignore_errors=True)
 
 
@@ -244,7 +246,7 @@ class _Training:
         self.guide.values = largest
 
     def _rate(self) -> float:
-        rate = self.settings.learning_rate * min(1.0, (self.step + 1) / WARM_UP)
+        rate = self.settings.learning_rate * min(1.0, (self.step + 1) / self.settings.warm_up)
         return rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * self.step / self.steps)))
 
     @torch.no_grad()

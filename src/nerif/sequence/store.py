@@ -6,7 +6,6 @@ half-written counts as missing and is done again.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import shutil
@@ -17,8 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
@@ -46,7 +43,6 @@ class Frame:
     seconds : spent on the frame
     steps : of training
     attempts : how many it took
-    velocity : (3,) of the drift from the frame it started from, mm/s
     """
 
     field: NeuralField
@@ -56,7 +52,6 @@ class Frame:
     seconds: float
     steps: int
     attempts: int = 1
-    velocity: Float[Tensor, " 3"] = dataclasses.field(default_factory=lambda: torch.zeros(3))
 
 
 class SequenceStore(VolumeSequence):
@@ -111,8 +106,6 @@ class SequenceStore(VolumeSequence):
                 units=unit, long_name=f"{meaning} what the view measured",
             )  # fmt: skip
         add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
-        drift = "of the drift from the frame it started from"
-        add_frames(group, "velocity", frames, (3,), ("axis",), "float64", units="mm s-1", long_name=f"{drift}; x, y, z")
         add("index_scale", "float64", nan, "index excess of one unit of network output")
         add("offset", "float64", nan, "network output that counts as ambient")
         add("seconds", "float64", nan, "spent on the frame, s")  # as units they would be read as a time span
@@ -150,7 +143,6 @@ class SequenceStore(VolumeSequence):
             self.array(name)[index] = np.array([found.get(view, np.nan) for view in self.attributes["views"]])
         for name in ("seconds", "steps", "attempts"):
             self.array(name)[index] = getattr(frame, name)
-        self.array("velocity")[index] = frame.velocity.double().numpy()
         self.array("reason")[index] = ""
         self.array("status")[index] = DONE
 
