@@ -119,11 +119,11 @@ def test_a_frame_that_fails_warm_is_tried_from_nothing_then_with_half_the_rate(s
     tries: list[tuple[int, float, bool]] = []
     real = frames._frame
 
-    def fail_twice(plan, settings, measurement, instant, before, parent):
-        tries.append((settings.max_steps, settings.learning_rate, before is not None))
+    def fail_twice(plan, settings, measurement, start, parent):
+        tries.append((settings.max_steps, settings.learning_rate, start is not None))
         if len(tries) in (2, 3):
             raise ArithmeticError("diverged")
-        return real(plan, settings, measurement, instant, before, parent)
+        return real(plan, settings, measurement, start, parent)
 
     monkeypatch.setattr(frames, "_frame", fail_twice)
     reconstruct_frames(plan, 0, 2)
