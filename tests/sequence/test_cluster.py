@@ -231,6 +231,7 @@ cores: 8
 memory: 32GB
 walltime: "02:00:00"
 job_extra_directives: ["--gres=gpu:1"]
+job_script_prologue: ["source ~/nerif/bin/activate"]
 """
 
 
@@ -251,6 +252,9 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path):
     for line in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=8", "#SBATCH -t 02:00:00", "#SBATCH --gres=gpu:1"):
         assert line in script
     assert "--nthreads 1" in script
+    # stack samples fill a worker's memory; switched off before what the file itself wants
+    prologue = ["export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False", "source ~/nerif/bin/activate"]
+    assert [line for line in script.splitlines() if line in prologue] == prologue
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,9 @@ CONFIG = {
     "distributed.scheduler.allowed-failures": 0,  # deaths are counted by frame, in run.py
     "distributed.scheduler.worker-saturation": 1.0,  # a chunk waits for a worker, not at one
     "distributed.comm.timeouts.connect": "60s",
+    "distributed.worker.profile.enabled": False,  # an hour of stack samples is a gigabyte
 }
+NO_PROFILE = "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False"  # a job does not inherit CONFIG
 PREFIX = ("tcp://", "tls://", "ucx://", "ws://", "wss://")
 
 
@@ -201,4 +203,5 @@ def read_slurm(path: Path) -> dict[str, Any]:
         if name not in wanted:
             raise InputError(f"{path}: expected '{name}' of a job, e.g. '{name}: {'8' if name == 'cores' else '32GB'}'")
     # a job is one worker that takes one chunk of time at once, on all cores of the job
-    return {"processes": 1, "job_cpu": wanted["cores"], **wanted, "cores": 1}
+    prologue = [NO_PROFILE, *(wanted.get("job_script_prologue") or [])]
+    return {"processes": 1, "job_cpu": wanted["cores"], **wanted, "cores": 1, "job_script_prologue": prologue}
