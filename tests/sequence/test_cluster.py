@@ -262,6 +262,7 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path):
     [
         ("cores: [", "not a YAML file"),
         ("- 1", "expected names and values"),
+        ("cores: 1\nmemory: 1GB\njob_script_prologue: module load x", "expected a list of shell lines"),
         ("cores: 4", "expected 'memory' of a job"),
         ("cores: 4\nmemory: 8GB\nqueu: x", "unknown key 'queu'; the nearest known one is 'queue'"),
     ],

@@ -203,5 +203,11 @@ def read_slurm(path: Path) -> dict[str, Any]:
         if name not in wanted:
             raise InputError(f"{path}: expected '{name}' of a job, e.g. '{name}: {'8' if name == 'cores' else '32GB'}'")
     # a job is one worker that takes one chunk of time at once, on all cores of the job
-    prologue = [NO_PROFILE, *(wanted.get("job_script_prologue") or [])]
+    prologue = wanted.get("job_script_prologue") or []
+    if not isinstance(prologue, list):
+        raise InputError(
+            f'{path}: job_script_prologue: expected a list of shell lines, ["source ~/nerif/bin/activate"], '
+            f"got {prologue!r}"
+        )
+    prologue = [NO_PROFILE, *prologue]
     return {"processes": 1, "job_cpu": wanted["cores"], **wanted, "cores": 1, "job_script_prologue": prologue}
