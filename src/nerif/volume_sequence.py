@@ -48,6 +48,8 @@ class VolumeSequence:
             self.n_ambient = float(self.attributes["n_ambient"])
         except (OSError, ValueError, KeyError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            if isinstance(error, KeyError):
+                reason = f"it has no {reason}; nerif sequence makes volumes of measurements"
             raise InputError(f"{path}: expected volumes over time, written by nerif ({reason})") from None
         self.grid = Grid(box, (axes[0], axes[1], axes[2]))
 
