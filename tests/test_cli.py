@@ -18,7 +18,9 @@ import torch
 import xarray as xr
 
 from nerif.cli import VERBS, main
+from nerif.evaluation import evaluate_views, reproject
 from nerif.measurement import Measurement
+from nerif.physics.deflection import MODELS
 from nerif.reconstruction.files import read_field
 from nerif.volume import read_volume
 
@@ -110,6 +112,20 @@ def test_evaluate(work, capsys):
     error = (field.sample(truth.grid) - truth.values).double().norm()
     assert metrics["l2_variation"] == pytest.approx(float(error / truth.values.double().norm()), rel=1e-4)
     assert metrics["l2"] == pytest.approx(float(error / (truth.values.double() + n_ambient - 1).norm()), rel=1e-4)
+
+
+def test_views_are_compared_by_the_model_of_the_reconstruction(work, tmp_path):
+    """At the end of reconstruct and by evaluate: one model throughout, and not always the default."""
+    out = tmp_path / "r"
+    assert main(["reconstruct", str(work / "m.nc"), "-o", str(out), "--model", "paraxial", *QUICK]) == 0
+    measurement, field = Measurement.read(work / "m.nc"), read_field(out)[0]
+    by_model = {model: evaluate_views(reproject(field, measurement, model=model)) for model in MODELS}
+    scores = {model: [v["rms_px"] for v in views] for model, views in by_model.items()}
+    assert scores["paraxial"] != pytest.approx(scores["lever_arm"], rel=1e-4)
+    for _ in range(2):
+        kept = json.loads((out / "metrics.json").read_text())["views"]
+        assert [v["rms_px"] for v in kept] == pytest.approx(scores["paraxial"], rel=1e-5)
+        assert main(["evaluate", str(out), "--measurement", str(work / "m.nc")]) == 0
 
 
 def test_project_into_the_same_and_other_cameras(work, tmp_path, capsys):

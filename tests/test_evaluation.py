@@ -14,7 +14,7 @@ from nerif.evaluation import evaluate_views, evaluate_volume, predict_view, repr
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.geometry import Grid
-from nerif.physics.deflection import Deflection, project
+from nerif.physics.deflection import MODELS, Deflection, project
 from nerif.volume import Volume
 
 
@@ -61,6 +61,18 @@ def test_predictions_on_views_without_valid_pixels_are_not_numbers(measurement, 
     views = evaluate_views(reproject(ball, replace(measurement, valid=valid)))
     assert math.isnan(views[0]["rms_px"])
     assert views[1]["cc"] > 0.99
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_views_are_predicted_by_the_model_asked_for(measurement, ball, model):
+    """Also of voxels, whose compiled way knows straight rays only."""
+    grid = Grid.of_resolution(measurement.box, 16)
+    for field in (ball, VoxelField.through(ball.sample(grid), grid)):
+        predicted = reproject(field, measurement, model=model).predicted
+        camera, (height, width) = measurement.cameras[1], measurement.cameras[1].image_size
+        rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).to(dtype=torch.float32)
+        expected = project(Deflection(model, 200, measurement.n_ambient), field, rays).reshape(height, width, 2)
+        assert float((predicted[1, :height, :width] - expected).norm() / expected.norm()) < 3e-3
 
 
 @pytest.mark.parametrize("degree", [1, 3])

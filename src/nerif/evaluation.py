@@ -19,7 +19,7 @@ from nerif.geometry import Camera, Rays
 from nerif.measurement import Measurement
 from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
 from nerif.physics.deflection import Deflection, ForwardModel, project
-from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reconstruction.operator import MODELS, DeflectionOperator
 from nerif.reprojection import Reprojection
 from nerif.volume import Volume
 
@@ -34,7 +34,9 @@ def predict_view(
 ) -> Float[Tensor, "row column 2"]:
     """Return the displacement (px) that a camera would see of a field; 0 where a ray misses the box."""
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
-    if isinstance(field, VoxelField) and isinstance(model, Deflection) and bool(rays.crosses.any()):
+    if not rays.crosses.any():
+        return torch.zeros(*camera.image_size, 2)
+    if isinstance(field, VoxelField) and isinstance(model, Deflection) and model.model in MODELS:
         return _through_voxels(field, rays, model, device).reshape(*camera.image_size, 2)
     return project(model, field, rays, device).reshape(*camera.image_size, 2)
 
@@ -56,13 +58,17 @@ def reproject(
     held_out: Collection[str] = (),
     device: torch.device | str = "cpu",
     on_view: Callable[[int], None] = lambda done: None,
+    model: str = "lever_arm",
 ) -> Reprojection:
-    """Predict what every view of a measurement sees of a field; px. `on_view` hears how many views are done."""
-    model = Deflection(samples=REPROJECTION_SAMPLES, n_ambient=measurement.n_ambient)
+    """Predict what every view of a measurement sees of a field; px.
+
+    `on_view` hears how many views are done; `model` is the forward model that the field was reconstructed with.
+    """
+    forward = Deflection(model, REPROJECTION_SAMPLES, measurement.n_ambient)
     predicted = torch.full_like(measurement.displacement, float("nan"))
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
-        predicted[i, :height, :width] = predict_view(field, camera, model, measurement.box, device)
+        predicted[i, :height, :width] = predict_view(field, camera, forward, measurement.box, device)
         on_view(i + 1)
     return Reprojection(measurement, predicted, tuple(held_out))
 

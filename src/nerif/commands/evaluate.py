@@ -75,7 +75,9 @@ def run(settings: Evaluate) -> dict[str, Any]:
             say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
     if settings.measurement is not None:
         measurement = Measurement.read(settings.measurement)
-        reprojection = reproject(field, measurement, _held_out(settings, measurement))
+        asked = _asked_for(settings.result)
+        held_out, model = _held_out(settings, asked, measurement), str(asked.get("model", "lever_arm"))
+        reprojection = reproject(field, measurement, held_out, model=model)
         reprojection.write(settings.result / REPROJECTION)
         metrics["measurement"] = str(settings.measurement.resolve())
         metrics["views"] = evaluate_views(reprojection)
@@ -122,12 +124,15 @@ def run_over_time(settings: Evaluate) -> dict[str, Any]:
     return metrics
 
 
-def _held_out(settings: Evaluate, measurement: Measurement) -> tuple[str, ...]:
+def _asked_for(result: Path) -> dict[str, Any]:
+    """The settings of the reconstruction, where they are kept with it."""
+    return read_toml(result / RUN) if (result / RUN).is_file() else {}
+
+
+def _held_out(settings: Evaluate, asked: dict[str, Any], measurement: Measurement) -> tuple[str, ...]:
     """Names of the views that the reconstruction has not seen."""
     if settings.hold_out is None:
-        run = settings.result / RUN
-        held = read_toml(run).get("hold_out", []) if run.is_file() else []
-        return tuple(name for name in held if name in measurement.names)
+        return tuple(name for name in asked.get("hold_out", ()) if name in measurement.names)
     unknown = [name for name in settings.hold_out if name not in measurement.names]
     if unknown:
         raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{unknown[0]}'")

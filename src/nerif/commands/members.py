@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def add_ensemble(
         spread.add(all_quantities(settings, result))
         out = ensemble.left_out(number, training)
         if out:
-            left_out += evaluate_views(reproject(result.field, training.select(out), out, result.device))
+            left_out += _compared(result, training.select(out), out)
     if spread.count < 2:
         say(f"ensemble: {spread.count} members are too few for a standard deviation; none is written")
         return
@@ -73,10 +74,15 @@ def _noise(training: Measurement, main: Reconstruction) -> tuple[torch.Tensor, s
     """Standard deviation of the noise of every pixel, px: that of the file, else the rms residual of each view."""
     if training.sigma is not None:
         return training.sigma.nan_to_num(0.0, 0.0, 0.0), "sigma of the measurement"
-    rms = torch.tensor([v["rms_px"] for v in evaluate_views(reproject(main.field, training, (), main.device))])
+    rms = torch.tensor([v["rms_px"] for v in _compared(main, training)])
     say("ensemble: the measurement has no sigma; noise of the size of each view's rms residual is added")
     # NaN for a view of which no ray crosses the box
     return rms.nan_to_num(0.0)[:, None, None, None].expand(training.displacement.shape).clone(), "rms residual"
+
+
+def _compared(result: Reconstruction, data: Measurement, held_out: Collection[str] = ()) -> list[dict[str, Any]]:
+    """How well the views of some data are predicted."""
+    return evaluate_views(reproject(result.field, data, held_out, result.device, model=result.model))
 
 
 def _member(
@@ -95,7 +101,7 @@ def _member(
         try:
             field, box, n_ambient = read_field(folder)
             kept = Outcome("converged", "read from disc")
-            return Reconstruction(field, box, n_ambient, [], kept, {}, device="cpu")
+            return Reconstruction(field, box, n_ambient, [], kept, dataclasses.asdict(reconstructor), device="cpu")  # type: ignore[call-overload]
         except InputError as error:
             say(f"{error}; this member is done again")
     out = "".join(f", without {name}" for name in ensemble.left_out(number, training))

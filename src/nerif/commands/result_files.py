@@ -55,7 +55,7 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
         write_state(out, result.state)
     _write_history(out / HISTORY, result.history)
     with counting_bar("re-projecting", len(measurement.cameras)) as bar:
-        reprojection = reproject(result.field, measurement, settings.hold_out, result.device, bar)
+        reprojection = reproject(result.field, measurement, settings.hold_out, result.device, bar, result.model)
     reprojection.write(out / REPROJECTION)
     views = evaluate_views(reprojection)
     write_json(  # afresh: scores of an earlier field must not stay

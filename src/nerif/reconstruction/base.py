@@ -109,6 +109,11 @@ class Reconstruction:
     device: str = "cpu"
     state: State | None = dataclasses.field(default=None, repr=False)
 
+    @property
+    def model(self) -> str:
+        """Forward model by which the field was found."""
+        return str(self.settings["model"])
+
     def volume(self, grid: Grid) -> Volume:
         """Return the index excess at the voxel centres of a grid."""
         return Volume(self.field.sample(grid, self.device), grid, attributes={"n_ambient": self.n_ambient})

@@ -143,13 +143,15 @@ def finished_frame(plan: Plan, field: NeuralField, measurement: Measurement, dev
     grid = Grid.of_resolution(measurement.box, plan.voxels)
     excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})
     volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
-    cc, rms = _against_measured(field, measurement, device)
+    cc, rms = _against_measured(plan.cold.model, field, measurement, device)
     return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)
 
 
-def _against_measured(field: Field, measurement: Measurement, device: str) -> tuple[dict[str, float], dict[str, float]]:
+def _against_measured(
+    model: str, field: Field, measurement: Measurement, device: str
+) -> tuple[dict[str, float], dict[str, float]]:
     """Correlation and rms difference (px) in every view, held-out ones included, over some of its pixels."""
-    model = Deflection(samples=SAMPLES, n_ambient=measurement.n_ambient)
+    forward = Deflection(model, SAMPLES, measurement.n_ambient)
     usable, cc, rms = measurement.usable, {}, {}
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
@@ -160,7 +162,7 @@ def _against_measured(field: Field, measurement: Measurement, device: str) -> tu
             continue
         seen = seen[:: max(1, len(seen) // PIXELS)]
         measured = measurement.displacement[i][usable[i]][seen].numpy()
-        predicted = project(model, field, rays[seen].to(dtype=torch.float32), device).numpy()
+        predicted = project(forward, field, rays[seen].to(dtype=torch.float32), device).numpy()
         cc[camera.name] = correlation(measured, predicted)
         rms[camera.name] = float(np.sqrt(np.mean((measured - predicted) ** 2)))
     return cc, rms
