@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from nerif.conventions import InputError
+from nerif.imaging.crop import Crop
 from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames, overexposed
-from nerif.imaging.sequences import Crop, ImageSequence
+from nerif.imaging.views import View
 
 N, H, W = 4, 7, 10
 
@@ -574,35 +575,30 @@ def test_crop_that_cannot_be(change):
         Crop(**change)
 
 
-def test_image_sequence(tmp_path, stack12):
-    header = write_photron(tmp_path, packed(stack12))
-    sequence = ImageSequence(
-        open_frames(f"{header}[:1]"), open_frames(f"{header}[1:]"), Crop(1, 2, 4, 5, rotate=90), "a"
-    )
-    assert sequence.shape == (5, 4)
-    assert sequence.bits == 12
-    np.testing.assert_allclose(sequence.times, np.array([1, 2, 3]) / 20000)
-    np.testing.assert_array_equal(sequence.reference_frame(0), np.rot90(stack12[0, 1:5, 2:7]))
-    np.testing.assert_array_equal(sequence.flow_frame(2), np.rot90(stack12[3, 1:5, 2:7]))
-    whole = ImageSequence(sequence.reference, sequence.flow)
-    np.testing.assert_array_equal(whole.flow_frame(0), stack12[1])
-    assert whole.shape == (H, W)
-
-
 def test_reference_and_flow_must_be_alike(tmp_path, stack12, stack8):
     for name, array in (("ref", stack12), ("small", stack12[:, :5]), ("bytes", stack8)):
         np.save(tmp_path / f"{name}.npy", array)
-    reference, small, other = (open_frames(f"{name}.npy", tmp_path) for name in ("ref", "small", "bytes"))
+
+    def check(flow: str, crop: Crop | None = None) -> None:
+        View("a", tmp_path, {"reference": "ref.npy", "flow": flow}, crop).check_alike()
+
+    check("ref.npy")
     with pytest.raises(
-        InputError, match=r"small.npy frame 0: expected 7 x 10 px.* reference ref.npy frame 0, got 5 x 10"
+        InputError, match=r"view 'a': small.npy frame 0: expected 7 x 10 px.* reference ref.npy frame 0, got 5 x 10"
     ):
-        ImageSequence(reference, small)
+        check("small.npy")
     with pytest.raises(
         InputError, match=r"bytes.npy frame 0: expected 16 bit as in its reference ref.npy.*, got 8 bit"
     ):
-        ImageSequence(reference, other)
-    with pytest.raises(InputError, match=r"ref.npy frame 0: expected a crop within its 7 x 10 px"):
-        ImageSequence(reference, reference, Crop(3, 3, 5, 5))
+        check("bytes.npy")
+
+
+def test_depth_that_the_files_tell_counts(tmp_path, stack12):
+    header = write_photron(tmp_path, packed(stack12))
+    np.save(tmp_path / "flow.npy", stack12)
+    sources = {"reference": f"{header}[:1]", "flow": f"{header}[1:]"}
+    View("a", tmp_path, sources).check_alike()
+    View("a", tmp_path, {**sources, "flow": "flow.npy"}).check_alike()  # 16 bit as read, and may well be 12
 
 
 # --- what can be wrong

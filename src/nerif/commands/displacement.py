@@ -112,6 +112,7 @@ def run_over_time(settings: Displacement, box: Box, views: Sequence[View]) -> Me
     resting = []
     with counting_bar("looking at references", len(views)) as bar:
         for view in views:
+            view.check_alike()
             reference = good_pictures(view, "reference", say, settings.references)
             shape = (reference[0].shape[0], reference[0].shape[1])
             region, mask = (_drawn(view, source, shape) for source in ("region", "mask"))
@@ -173,13 +174,9 @@ def _measure(
 def _measure_view(
     view: View, calibrated: CalibratedCamera, settings: Displacement
 ) -> tuple[DisplacementMap, Camera, np.ndarray | None]:
+    view.check_alike()
     reference = good_pictures(view, "reference", say, settings.references)
     flow = _flow(view, settings)
-    if flow[0].shape != reference[0].shape or flow[0].dtype != reference[0].dtype:
-        raise InputError(
-            f"view '{view.name}': expected flow pictures like the reference ones, {reference[0].shape} px of "
-            f"{reference[0].dtype}, got {flow[0].shape} of {flow[0].dtype}"
-        )
     shape = (flow[0].shape[0], flow[0].shape[1])
     camera = _camera(view, calibrated, shape)
     found = measure(reference, flow, settings.method, _full_scale(view), _drawn(view, "region", shape))

@@ -77,9 +77,6 @@ class FrameJob:
             try:
                 frames = v.view.open("flow")
                 picture = v.view.cropped(frames[index], frames.name(index))
-                if picture.shape != v.rest.mean.shape:
-                    expected = f"{v.rest.mean.shape} px as its reference"
-                    raise InputError(f"{frames.name(index)}: expected {expected}, got {picture.shape}")
                 found = measure_against(v.rest, [picture], v.region)
                 if not found.valid.any():
                     raise InputError(f"{frames.name(index)}: no pixel holds")

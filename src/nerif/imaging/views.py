@@ -29,8 +29,8 @@ import numpy as np
 
 from nerif.conventions import InputError
 from nerif.imaging.calibration import ViewPictures
-from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames
-from nerif.imaging.sequences import Crop
+from nerif.imaging.crop import Crop
+from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames, size_in_words
 from nerif.imaging.targets import Detection, Target
 
 __all__ = ["SOURCES", "View", "find_targets", "find_views", "good_pictures"]
@@ -72,6 +72,27 @@ class View:
                 f'{source} = "..." in {self.folder / "views.toml"}'
             )
         return open_frames(self.sources[source], self.folder)
+
+    def check_alike(self) -> None:
+        """Check that the pictures without and with flow are of one size and bit depth.
+
+        Raises
+        ------
+        InputError
+            If they are not.
+        """
+        reference, flow = self.open("reference"), self.open("flow")
+        ours, theirs = reference.layout, flow.layout
+        depths = [reference.known_bits, flow.known_bits]
+        if None in depths:  # as far as the files tell
+            depths = [8 * ours.dtype.itemsize, 8 * theirs.dtype.itemsize]
+        sizes = (size_in_words(ours.shape), size_in_words(theirs.shape))
+        for expected, got in (sizes, (f"{depths[0]} bit", f"{depths[1]} bit")):
+            if expected != got:
+                raise InputError(
+                    f"view '{self.name}': {theirs.example}: expected {expected} as in its reference {ours.example}, "
+                    f"got {got}; record both alike"
+                )
 
     def cropped(self, image: np.ndarray, name: str) -> np.ndarray:
         """Return the view's part of a frame."""

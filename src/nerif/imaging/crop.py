@@ -1,4 +1,4 @@
-"""What one view recorded, and which part of the frames is its own."""
+"""Which part of the frames of a sensor is a view's own."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.imaging.readers import Frames, size_in_words
+from nerif.imaging.readers import size_in_words
 
-__all__ = ["Crop", "ImageSequence"]
+__all__ = ["Crop"]
 
 
 @dataclass(frozen=True)
@@ -64,69 +64,3 @@ class Crop:
         if self.flip in ("vertical", "both"):
             part = part[::-1]
         return np.ascontiguousarray(part)
-
-
-@dataclass(frozen=True)
-class ImageSequence:
-    """What one view recorded: the background at rest and through the flow.
-
-    Parameters
-    ----------
-    reference, flow : frames without and with flow, of one size and bit depth
-    crop : the view's part of each frame, if not all of it
-    name : of the view
-
-    Raises
-    ------
-    InputError
-        If reference and flow differ in size or bit depth, or the crop reaches beyond the frame.
-    """
-
-    reference: Frames
-    flow: Frames
-    crop: Crop | None = None
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        ours, theirs = self.reference.layout, self.flow.layout
-        known = [frames.known_bits or frames.bits for frames in (self.reference, self.flow)]
-        if None in (
-            self.reference.known_bits,
-            self.flow.known_bits,
-        ):  # may well be the same
-            known = [8 * ours.dtype.itemsize, 8 * theirs.dtype.itemsize]
-        sizes = (size_in_words(ours.shape), size_in_words(theirs.shape))
-        for expected, got in (sizes, (f"{known[0]} bit", f"{known[1]} bit")):
-            if expected != got:
-                raise InputError(
-                    f"{theirs.example}: expected {expected} as in its reference {ours.example}, got {got}; "
-                    "record both alike"
-                )
-        if self.crop:
-            self.crop.shape_of(ours.shape, ours.example)
-
-    @property
-    def times(self) -> np.ndarray | None:
-        """When each flow frame was taken, s."""
-        return self.flow.times
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width after the crop, px."""
-        return self.crop.shape_of(self.reference.shape) if self.crop else self.reference.shape
-
-    @property
-    def bits(self) -> int:
-        """Effective bits of both: those that a file tells, if one does."""
-        return self.reference.known_bits or self.flow.known_bits or self.reference.bits
-
-    def reference_frame(self, i: int) -> np.ndarray:
-        """Return reference frame `i`, cropped."""
-        return self._cropped(self.reference, i)
-
-    def flow_frame(self, i: int) -> np.ndarray:
-        """Return flow frame `i`, cropped."""
-        return self._cropped(self.flow, i)
-
-    def _cropped(self, frames: Frames, i: int) -> np.ndarray:
-        return self.crop(frames[i], frames.name(i)) if self.crop else frames[i]
