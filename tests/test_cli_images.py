@@ -297,3 +297,19 @@ def test_many_flow_pictures_become_a_sequence(copy, capsys):
         assert "made with other settings" in capsys.readouterr().err
     assert main([*words, "--frames", "0:4"]) == 2
     assert "expected numbers within the 3 of view" in capsys.readouterr().err
+
+
+def test_flow_pictures_of_another_depth_than_the_reference_are_refused(copy, capsys):
+    view = next(p for p in sorted((copy / "pictures").iterdir()) if (p / "flow").is_dir())
+    (picture,) = (view / "flow").iterdir()
+    whole = iio.imread(picture)
+    assert whole.dtype == np.uint16
+    iio.imwrite(picture, (whole >> 8).astype(np.uint8))
+    words = displacement(copy, "--frames", "all", "--frame-rate", "1000")
+    words[words.index("-o") + 1] = str(copy / "film.zarr")
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert f"view '{view.name}'" in said
+    assert "got 8 bit; record both alike" in said
+    assert main(displacement(copy, "--force")) == 0  # of one instant the other views may do
+    assert f"view '{view.name}' left out" in capsys.readouterr().out
