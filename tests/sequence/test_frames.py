@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
+import zarr
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import NetworkShape
@@ -58,6 +59,10 @@ def test_every_frame_is_written_with_what_it_came_from(short, tmp_path):
         assert float(found["cc"].min()) > 0
         assert np.isfinite(found["rms_px"].values).all()
     assert "5 of 5 frames done" in outcome_table(store)
+    group = zarr.open_group(plan.out, mode="r+")
+    group.attrs["network"] = {**group.attrs["network"], "gone": 0.0}
+    with pytest.raises(InputError, match=r"another version of nerif \(.*gone.*reconstruct it again"):
+        SequenceStore(plan.out).field(0)
 
 
 def test_a_warm_frame_begins_where_the_one_before_ended(short, tmp_path):

@@ -150,6 +150,21 @@ def test_every_figure_is_whole():
                     assert not words or words.endswith("]") or words in known, words
 
 
+def test_lines_of_a_figure_can_be_told_apart():
+    """No two of one panel share colour and dashes, or colour and mark."""
+    with style(10):
+        for plate in plates(results()):
+            figure = Figure(figsize=plate.size, layout="constrained")
+            plate.draw(figure)
+            for axes in figure.axes:
+                drawn = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+                looks = [(x.get_color(), x.get_linestyle(), x.get_marker(), x.get_markerfacecolor()) for x in drawn]
+                assert len(set(looks)) == len(looks), (plate.name, looks)
+                if plate.name == "speed":
+                    curves = looks[: sum(x.get_linestyle() != "None" for x in drawn)]
+                    assert len({look[:2] for look in curves}) == len(curves) > 7
+
+
 def test_a_page_of_what_is_asked_for_by_name_has_the_cases_of_it():
     for name in SECTIONS:
         asked = cases(QUICK, (name,))

@@ -163,7 +163,10 @@ class SequenceStore(VolumeSequence):
         """Return the field of a frame that is done."""
         if int(self.array("status")[index]) != DONE:
             raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
-        network = _network(self.attributes)
+        try:
+            network = _network(self.attributes)
+        except TypeError as error:
+            raise InputError(f"{self.path}: made by another version of nerif ({error}); reconstruct it again") from None
         weights, at = torch.from_numpy(np.asarray(self.array("weights")[index])), 0
         with torch.no_grad():
             for parameter in network.parameters():

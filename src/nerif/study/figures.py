@@ -37,7 +37,7 @@ LABELS = {
 PER_CENT = ("l2", "l2_variation")
 
 MORE = {**COLOURS, "purple": "#AA5A8E", "amber": "#B87A00", "sky": "#2F8FC4"}  # Okabe & Ito, darkened for white
-MARKS = "osD^vPX"
+MARKS, DASHES = "osD^vPX", ("-", "--", ":")
 METHODS = {
     "NeRIF": (COLOURS["blue"], "o"),
     "Tikhonov": (COLOURS["orange"], "s"),
@@ -203,9 +203,11 @@ def _finish(axes: Axes, score: str, log: bool = False, legend: bool = True) -> A
 
 
 def variety(i: int) -> Line:
-    """Return a colour and mark for the i-th of many lines."""
+    """Return colour, mark and dashes for the i-th of many lines: all the colours, then again with other dashes."""
     colours = list(MORE.values())
-    return look("NeRIF") | {"color": colours[i % len(colours)], "marker": MARKS[i % len(MARKS)]}
+    turn, place = divmod(i, len(colours))
+    mark = MARKS[(place + 3 * turn) % len(MARKS)]
+    return look("NeRIF") | {"color": colours[place], "marker": mark, "linestyle": DASHES[turn % len(DASHES)]}
 
 
 def _plain_numbers(axis: Axis, limits: tuple[float, float]) -> None:
