@@ -45,7 +45,7 @@ from nerif.simulation import simulate
 torch.set_num_threads(1)  # tests run side by side
 
 
-GROUPS = {"whole": "report", "site": "docs"}
+GROUPS = {"whole": "report", "site": "docs", "experiment": "pictures"}
 """Fixtures that take long: tests that use one run in one process, so that it is made once."""
 
 

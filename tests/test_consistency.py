@@ -67,7 +67,7 @@ MISTAKES = {
 }  # fmt: skip
 
 
-QUICK = ("swapped", "sign", "mirrored", "exchanged")
+QUICK = ("swapped", "sign", "exchanged")
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in MISTAKES])
@@ -93,13 +93,18 @@ def test_a_view_of_something_else_is_named(clean):
     other = measure("gaussians", 3).displacement[2]
     found = check_consistency(spoilt(clean, in_view(2, lambda d: other)), voxels=20)
     assert [v.name for v in found.views if v.verdict] == ["60deg"]
-    noise = 0.04 * torch.randn(other.shape, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.slow
+def test_a_view_of_noise_alone_is_named(clean):
+    noise = 0.04 * torch.randn(clean.displacement.shape[1:], generator=torch.Generator().manual_seed(0))
     found = check_consistency(spoilt(clean, in_view(2, lambda d: noise)), voxels=20)
     assert any(f.startswith("view 60deg: does not fit the other views") for f in found.findings)
 
 
 @pytest.mark.parametrize(
-    ("phantom", "seed", "noise"), [("gaussians", 0, 0.05), ("flame", 0, 0.05), ("gaussians", 2, 0.15)]
+    ("phantom", "seed", "noise"),
+    [("flame", 0, 0.05), ("gaussians", 2, 0.15), pytest.param("gaussians", 0, 0.05, marks=pytest.mark.slow)],
 )
 def test_no_false_alarm(phantom, seed, noise):
     found = check_consistency(measure(phantom, seed, noise=noise), voxels=20)

@@ -58,10 +58,10 @@ def errors(driver: Any) -> list[str]:
 
 
 def requests(driver: Any) -> list[str]:
-    """Addresses that the page asked for, its own and those inside it left out."""
+    """Addresses that the page asked for, its own, those inside it and the browser's own pages left out."""
     asked = [json.loads(e["message"])["message"] for e in driver.get_log("performance")]
     urls = [m["params"]["request"]["url"] for m in asked if m["method"] == "Network.requestWillBeSent"]
-    return [u for u in urls if not u.startswith(("data:", "blob:", "file:"))]
+    return [u for u in urls if not u.startswith(("data:", "blob:", "file:", "chrome:"))]
 
 
 def picture(driver: Any, selector: str) -> np.ndarray:

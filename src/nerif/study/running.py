@@ -41,6 +41,12 @@ FORWARD_RAYS, FORWARD_SAMPLES = 4000, 400
 SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Of a run, after which its error is looked at (when the run is over)."""
 
+PRELOADED = [__name__, "xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.kernels_numba"]
+"""Modules that a case needs, imported once for all processes: else it takes each as long as a short reconstruction."""
+
+if not torch.backends.cuda.is_built():  # where it is, a process must not inherit what the import found out of the GPU
+    PRELOADED.append("torch._dynamo")  # which every optimiser imports
+
 OnProgress = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
 
@@ -178,7 +184,7 @@ def _process(case: Case, folder: Path) -> Iterator[Connection]:
     methods = multiprocessing.get_all_start_methods()
     context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
     if "forkserver" in methods:
-        context.set_forkserver_preload([__name__])  # imported once, not once a case
+        context.set_forkserver_preload(PRELOADED)
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(case, folder, there), daemon=True)  # type: ignore[attr-defined]
     process.start()
