@@ -28,7 +28,7 @@ from nerif.study.running import read_record, run_cases
 
 __all__ = ["Study", "main", "run"]
 
-PAGE_EVERY = 60.0  # seconds between pages while the study goes on
+PAGE_EVERY = 180.0  # seconds between pages while the study goes on
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class Scale:
 
 
 FULL = Scale("full", 200, 100, 120.0, 40, 64, "cubic", (0, 2, 4, 5, 6, 8), (3, 4, 6, 9, 12, 18))
-QUICK = Scale("quick", 48, 48, 12.0, 40, 40, "linear", (0, 3, 5, 7), (3, 6, 9, 18), steps=350, points=4096)
+QUICK = Scale("quick", 40, 40, 10.0, 40, 40, "linear", (0, 3, 5, 7), (3, 6, 9, 18), steps=350, points=4096)
 
 
 @dataclass(frozen=True)
