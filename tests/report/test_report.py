@@ -156,11 +156,14 @@ def test_a_run_that_was_killed(copy, capsys):
 
 def test_refusals(tmp_path, capsys, whole):
     (tmp_path / "empty").mkdir()
+    there = tmp_path / "there.html"
+    there.write_text("somebody's page")
     for arguments, words in (
         (["report", str(tmp_path / "absent")], "no such directory"),
         (["report", str(tmp_path / "empty")], "expected a result of nerif reconstruct"),
         (["report", str(whole), "-o", str(tmp_path / "r.pdf")], ".html"),
-        (["report", str(whole), "-o", str(tmp_path / "no" / "r.html")], "no such directory"),
+        (["report", str(whole), "-o", str(tmp_path / "no" / "r.html")], "does not exist; make it first"),
+        (["report", str(whole), "-o", str(there)], "exists already and was left as it is"),
         (["figures", str(whole), "--journal", "lancet"], "elsevier"),
         (["figures", str(whole), "--dpi", "3"], "dpi"),
         (["figures", str(tmp_path / "absent")], "no such directory"),
@@ -169,6 +172,9 @@ def test_refusals(tmp_path, capsys, whole):
         assert words in capsys.readouterr().err
     with pytest.raises(InputError, match="no such directory"):
         read_result(tmp_path / "absent")
+    assert there.read_text() == "somebody's page"
+    assert main(["report", str(whole), "-o", str(there), "--force"]) == 0
+    assert there.read_text().startswith("<!")
 
 
 def view(held_out: bool, cc: float, noise: float | None) -> dict:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import say
+from nerif.commands.output import check_file, say
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
 from nerif.report import html
@@ -26,7 +26,9 @@ class Report:
     result: Annotated[Path, tyro.conf.Positional]
     """Result directory of nerif reconstruct, or store of nerif sequence (.zarr), finished or not."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File to write; default: RESULT/report.html, or RESULT.html of a store."""
+    """File to write; default: RESULT/report.html, or RESULT.html of a store, written anew each time."""
+    force: bool = False
+    """Overwrite the file that --out names."""
 
 
 def run(settings: Report) -> Path:
@@ -35,8 +37,10 @@ def run(settings: Report) -> Path:
     out = settings.out or (settings.result.with_suffix(".html") if is_store else settings.result / REPORT)
     if out.suffix not in (".html", ".htm"):
         raise InputError(f"out: expected a name ending in .html, got '{out.name}'")
-    if not out.parent.is_dir():
-        raise InputError(f"{settings.result if settings.out is None else out}: no such directory")
+    if settings.out is not None:
+        check_file(out, settings.force)
+    elif not out.parent.is_dir():
+        raise InputError(f"{settings.result}: no such directory")
     if is_store:
         html.write(render_sequence(VolumeSequence(settings.result)), out)
         _say_size(out)
