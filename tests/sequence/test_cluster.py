@@ -135,6 +135,7 @@ def test_memory_of_the_command_and_of_each_worker_stays_flat_over_500_frames(tmp
         assert late < 1.05 * early, name
 
 
+@pytest.mark.slow
 def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monkeypatch):
     from nerif.sequence import run
     from nerif.sequence.run import run_sequence
