@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 from dataclasses import replace
 
 import pytest
@@ -16,7 +17,7 @@ from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.study.cases import FULL, METHODS, NOISES, PHANTOMS, QUICK, SECTIONS, Case, cases
-from nerif.study.running import read_record, run_case, run_cases
+from nerif.study.running import PRELOADED, read_record, run_case, run_cases
 
 RING = Ring(views=4, image_size=(16, 16), pixel_pitch=0.25)
 SMALL = NeRIF(
@@ -31,6 +32,13 @@ class Killed(Tikhonov):
 
     def __call__(self, *arguments, **more):
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Looking(Tikhonov):
+    """Tells which modules its process had to import itself, had it needed them."""
+
+    def __call__(self, *arguments, **more):
+        raise ValueError(f"not there: {sorted(set(PRELOADED) - set(sys.modules))}")
 
 
 def small(key: str, reconstructor=TIKHONOV, **more) -> Case:
@@ -123,3 +131,9 @@ def test_the_command(tmp_path, capsys):
     assert main(["study", "-o", str(out), "--pixels", "3"]) == 2
     assert main(["study", "-o", str(out), "--device", "cuda:9"]) == 2
     assert main(["study", "-o", str(out), "--preset", "nonsense"]) == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked on POSIX only")
+def test_what_every_case_needs_is_imported_before_its_process_begins(tmp_path):
+    (record,) = run([small("looking", Looking())], tmp_path)
+    assert "not there: []" in record["failed"]

@@ -1,6 +1,7 @@
 """Running the cases of a study: each in a process of its own, its record on disk as soon as it is done.
 
-A process of its own gives each case an honest peak of memory, and a case that fails or is killed leaves the others be.
+A process of its own gives each case an honest peak of memory (of the libraries of all methods, too: they are imported
+once, before the processes part), and a case that fails or is killed leaves the others be.
 """
 
 from __future__ import annotations
@@ -41,11 +42,12 @@ FORWARD_RAYS, FORWARD_SAMPLES = 4000, 400
 SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Of a run, after which its error is looked at (when the run is over)."""
 
-PRELOADED = [__name__, "xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.kernels_numba"]
+PRELOADED = [
+    *(__name__, "xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.kernels_numba"),
+    # every optimiser imports it; with CUDA a process must not inherit what the import found out of the GPU
+    *(() if torch.backends.cuda.is_built() else ("torch._dynamo",)),
+]
 """Modules that a case needs, imported once for all processes: else it takes each as long as a short reconstruction."""
-
-if not torch.backends.cuda.is_built():  # where it is, a process must not inherit what the import found out of the GPU
-    PRELOADED.append("torch._dynamo")  # which every optimiser imports
 
 OnProgress = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
