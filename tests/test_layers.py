@@ -12,7 +12,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("conventions",),
+    ("atomic", "conventions"),
     ("geometry",),
     ("measurement", "measurement_sequence", "volume", "volume_sequence", "vti", "reprojection"),
     ("imaging",),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES, VoxelField
@@ -118,9 +118,8 @@ def update_json(path: Path, entries: dict[str, Any]) -> dict[str, Any]:
 
 def write_json(path: Path, entries: dict[str, Any]) -> None:
     """Write a JSON file, atomically; NaN and infinity as null."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
-    os.replace(temporary, path)
+    with atomic(path) as part:
+        part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
 
 
 def _plain(value: Any) -> Any:

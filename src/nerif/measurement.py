@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.atomic import atomic
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
 from nerif.geometry import Box, Camera, Plane, Rays
 
@@ -218,10 +219,9 @@ class Measurement:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file of docs/formats.md, atomically."""
         dataset = self.to_dataset()
-        temporary = Path(f"{os.fspath(path)}.part")
         packed = {k: {"zlib": True, "complevel": 3} for k in MAPS if k in dataset}
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=packed)
-        os.replace(temporary, path)
+        with atomic(path) as part:
+            dataset.to_netcdf(part, engine="h5netcdf", encoding=packed)
 
     def to_dataset(self) -> xr.Dataset:
         """Return the variables and attributes of the file."""

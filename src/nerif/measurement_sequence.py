@@ -6,13 +6,13 @@ Each frame has chunks of its own, so frames are written and read one by one, by 
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.measurement import CONVENTIONS, MAPS, VARIABLES, Measurement
 
@@ -125,26 +125,26 @@ class MeasurementSequence:
         path = Path(path)
         if any(not b > a for a, b in pairwise(times)) or not len(times):
             raise InputError(f"times: expected increasing instants in s, got {_short(times)}")
-        if path.exists():
-            if not force:
-                raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if path.exists() and not force:
+            raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
         dataset = like.to_dataset()
         # the static variables by xarray, those of each frame as empty arrays of one chunk a frame
         fixed = dataset.drop_vars([name for name in MAPS if name in dataset])
         # names as text of any length: the fixed one has no place in Zarr's third format
         names = {k: (k, fixed[k].values.astype(object)) for k in ("view", "component")}
         time = ("time", np.asarray(times, dtype=np.float64), {"units": "s", "axis": "T"})
-        fixed.assign_coords(names).assign_coords(time=time).to_zarr(path, mode="w", consolidated=False, zarr_format=3)
-        group = zarr.open_group(path, mode="r+")
-        for name in MAPS:
-            if name in dataset:
-                v = dataset[name]
-                fill = np.nan if v.dtype.kind == "f" else 0
-                group.create_array(
-                    name, shape=(len(times), *v.shape), chunks=(1, *v.shape), dtype=v.dtype, fill_value=fill,
-                    dimension_names=["time", *map(str, v.dims)], attributes=dict(v.attrs),
-                )  # fmt: skip
+        fixed = fixed.assign_coords(names).assign_coords(time=time)
+        with atomic(path) as part:
+            fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=3)
+            group = zarr.open_group(part, mode="r+")
+            for name in MAPS:
+                if name in dataset:
+                    v = dataset[name]
+                    fill = np.nan if v.dtype.kind == "f" else 0
+                    group.create_array(
+                        name, shape=(len(times), *v.shape), chunks=(1, *v.shape), dtype=v.dtype, fill_value=fill,
+                        dimension_names=["time", *map(str, v.dims)], attributes=dict(v.attrs),
+                    )  # fmt: skip
         return cls(path, tuple(float(t) for t in times))
 
     def write_frame(self, index: int, measurement: Measurement) -> None:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.measurement import VARIABLES, Measurement
 
@@ -39,8 +40,6 @@ class Reprojection:
         import xarray as xr
 
         predicted = replace(self.measurement, displacement=self.predicted, valid=self.measurement.usable)
-        whole = Path(f"{os.fspath(path)}.whole")
-        predicted.write(whole)
         held = np.array([name in self.held_out for name in self.measurement.names], dtype=np.int8)
         more = xr.Dataset(
             {
@@ -53,8 +52,9 @@ class Reprojection:
             }
         )
         more["measured"].attrs = {"units": "px", "long_name": "measured displacement"}
-        more.to_netcdf(whole, mode="a", engine="h5netcdf", encoding={"measured": {"zlib": True, "complevel": 3}})
-        os.replace(whole, path)
+        with atomic(path) as part:
+            predicted.write(part)
+            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding={"measured": {"zlib": True, "complevel": 3}})
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Reprojection:

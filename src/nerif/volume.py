@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 
@@ -95,9 +96,8 @@ def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     dataset.attrs |= {"references": REFERENCES, **attributes}
     # the box cannot be told from one voxel centre alone
     dataset.attrs["box_lower_mm"], dataset.attrs["box_upper_mm"] = list(grid.box.lower), list(grid.box.upper)
-    temporary = Path(f"{os.fspath(path)}.part")
-    dataset.to_netcdf(temporary, engine="h5netcdf", encoding={k: {"zlib": True, "complevel": 4} for k in data})
-    os.replace(temporary, path)
+    with atomic(path) as part:
+        dataset.to_netcdf(part, engine="h5netcdf", encoding={k: {"zlib": True, "complevel": 4} for k in data})
 
 
 def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.measurement_sequence import require_zarr
@@ -76,8 +76,6 @@ class VolumeSequence:
         import xarray as xr
         import zarr
 
-        if path.exists():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
         axes = {a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper()}) for a in "zyx"}
         fixed = xr.Dataset(
             coords={"time": ("time", np.array(times, dtype=np.float64), {"units": "s", "axis": "T"}), **axes},
@@ -91,11 +89,12 @@ class VolumeSequence:
                 **(attributes or {}),
             },
         )
-        fixed.to_zarr(path, mode="w", consolidated=False, zarr_format=3)
-        group = zarr.open_group(path, mode="r+")
-        for quantity in quantities:
-            unit, name = describe(quantity)
-            add_frames(group, quantity, len(times), grid.shape, ("z", "y", "x"), "float32", units=unit, long_name=name)
+        with atomic(path) as part:
+            fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=3)
+            group = zarr.open_group(part, mode="r+")
+            for name in quantities:
+                unit, meaning = describe(name)
+                add_frames(group, name, len(times), grid.shape, ("z", "y", "x"), "float32", units=unit, long_name=meaning)
         return cls(path)
 
     def array(self, name: str) -> Any:  # zarr's own types do not know what an index gives

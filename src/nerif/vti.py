@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 
@@ -40,14 +41,13 @@ def write_vti(
         entry.InsertNextValue(value if isinstance(value, str) else float(value))
         image.GetFieldData().AddArray(entry)
     writer = vtkXMLImageDataWriter()
-    temporary = Path(f"{os.fspath(path)}.part")
-    writer.SetFileName(str(temporary))
-    writer.SetInputData(image)
-    writer.SetDataModeToAppended()
-    writer.EncodeAppendedDataOff()
-    if not writer.Write():
-        raise InputError(f"{path}: could not be written; is the folder there, and the disk not full?")
-    os.replace(temporary, path)
+    with atomic(path) as part:
+        writer.SetFileName(str(part))
+        writer.SetInputData(image)
+        writer.SetDataModeToAppended()
+        writer.EncodeAppendedDataOff()
+        if not writer.Write():
+            raise InputError(f"{path}: could not be written; is the folder there, and the disk not full?")
 
 
 def read_vti(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import tyro
 
+from nerif.atomic import atomic
 from nerif.commands.members import add_ensemble
 from nerif.commands.methods import METHODS, Reconstruct
 from nerif.commands.output import check_directory, interruptible, progress_bar, say
@@ -132,7 +133,8 @@ def _begin(settings: Reconstruct) -> Callable[[Step | None], None]:
         settings.out.mkdir(parents=True, exist_ok=True)
         if not settings.resume:
             clear(settings.out)
-        (settings.out / RUN).write_text(run_toml(settings))
+        with atomic(settings.out / RUN) as part:
+            part.write_text(run_toml(settings))
         done.append(True)
 
     return prepare

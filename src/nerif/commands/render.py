@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from nerif.atomic import atomic
 from nerif.commands.output import check_directory, say
 from nerif.commands.settings import flag_value, merge, parse, read_toml, to_toml
 from nerif.conventions import InputError
@@ -65,9 +66,10 @@ def run(settings: Render) -> None:
     truth.mkdir(parents=True, exist_ok=True)
     target = settings.pictures.target_for(cameras)
     axes = ", ".join(f'"{a}"' for a in world_axes(cameras))
-    (settings.out / "calibrate.toml").write_text(
-        f'world = "0"\naxes = [{axes}]\nbackground_scale = {background_scale(cameras)}\n\n[target]\n{to_toml(target)}'
-    )
+    with atomic(settings.out / "calibrate.toml") as part:
+        part.write_text(
+            f'world = "0"\naxes = [{axes}]\nbackground_scale = {background_scale(cameras)}\n\n[target]\n{to_toml(target)}'
+        )
     write_cameras(truth / "calibration.toml", [CalibratedCamera.from_camera(c) for c in cameras])
     grid = Grid.of_resolution(box, settings.truth_voxels)
     write_netcdf(

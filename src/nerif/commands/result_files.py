@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif import __version__
+from nerif.atomic import atomic
 from nerif.commands.methods import Reconstruct
 from nerif.commands.output import counting_bar, say, say_masked
 from nerif.commands.settings import to_toml
@@ -71,7 +72,8 @@ def write_result(settings: Reconstruct, measurement: Measurement, result: Recons
         },
     )
     about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
-    (out / RUN).write_text(run_toml(settings, about))
+    with atomic(out / RUN) as part:
+        part.write_text(run_toml(settings, about))
     write_volumes(out, all_quantities(settings, result))
     for group, held in (("training view", False), ("held-out view", True)):
         chosen = [v for v in views if v["held_out"] is held]
@@ -116,7 +118,7 @@ def write_volumes(directory: Path, volumes: list[Volume]) -> None:
 
 def _write_history(path: Path, history: list[dict[str, float]]) -> None:
     columns = list(dict.fromkeys(key for record in history for key in record))
-    with path.open("w", newline="") as file:
+    with atomic(path) as part, part.open("w", newline="") as file:
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(history)

@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError, Matrix3
 from nerif.geometry import Camera, Plane
 
@@ -154,9 +155,8 @@ def write_cameras(
         if camera.background is not None:
             table["background"] = {"normal": camera.background.normal.tolist(), "offset": camera.background.offset}
         tables.append(table)
-    temporary = Path(f"{os.fspath(path)}.part")
-    temporary.write_text(tomli_w.dumps({"format": FORMAT, "camera": tables, **({"about": about} if about else {})}))
-    os.replace(temporary, path)
+    with atomic(path) as part:
+        part.write_text(tomli_w.dumps({"format": FORMAT, "camera": tables, **({"about": about} if about else {})}))
 
 
 def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:

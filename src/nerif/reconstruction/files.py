@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
@@ -88,9 +88,8 @@ def read_state(directory: Path) -> State:
 def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -> None:
     from safetensors.torch import save_file
 
-    temporary = path.with_name(path.name + ".part")
-    save_file(tensors, temporary, metadata={"nerif": json.dumps(about)})
-    os.replace(temporary, path)
+    with atomic(path) as part:
+        save_file(tensors, part, metadata={"nerif": json.dumps(about)})
 
 
 def _load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nerif.atomic import atomic
 from nerif.imaging.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -68,4 +69,5 @@ def save_errors(path: Path, calibration: Calibration) -> None:
         draw_residuals(axes, calibration.residuals[i], calibration.sizes[i], length / max(float(typical), 1e-9))
         axes.set_title(f"{name}: {calibration.rms(name):.3f} px rms", fontsize=8)
     figure.supxlabel(f"column and row [px]; arrows of {length:.0f} px stand for {typical:.3f} px", fontsize=8)
-    figure.savefig(path, dpi=130)
+    with atomic(path) as part:
+        figure.savefig(part, dpi=130)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nerif.atomic import atomic
 from nerif.geometry import Ring
 from nerif.physics.design import Plan, expect
 
@@ -83,7 +84,8 @@ def save_design(path: Path, ring: Ring, plan: Plan) -> None:
     draw_plan(first, ring, plan)
     draw_displacement(second, ring, plan)
     draw_resolution(third, ring, plan)
-    figure.savefig(path, dpi=130)
+    with atomic(path) as part:
+        figure.savefig(part, dpi=130)
 
 
 def _circle(radius: float):  # type: ignore[no-untyped-def]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerif.atomic import atomic
 from nerif.measurement import Measurement
 from nerif.report.figures import draw_displacement
 
@@ -41,7 +42,8 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
             axes.set_ylabel("row [px]" if i % columns == 0 else "", fontsize=7)
     assert shown is not None
     figure.colorbar(shown.images[-1], ax=grid.ravel().tolist(), label="displacement [px]", shrink=0.6, extend="both")
-    figure.savefig(path, dpi=120)
+    with atomic(path) as part:
+        figure.savefig(part, dpi=120)
 
 
 def save_masks(path: Path, measurement: Measurement) -> None:
@@ -71,4 +73,5 @@ def save_masks(path: Path, measurement: Measurement) -> None:
         axes.set_xlabel("column [px]", fontsize=7)
         axes.set_ylabel("row [px]" if i % columns == 0 else "", fontsize=7)
     figure.colorbar(shown, ax=grid.ravel().tolist(), label="|d| [px]", shrink=0.6, extend="max")
-    figure.savefig(path, dpi=120)
+    with atomic(path) as part:
+        figure.savefig(part, dpi=120)

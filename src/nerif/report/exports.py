@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.volume import Volume, write_netcdf
 from nerif.vti import write_vti
@@ -52,10 +53,8 @@ def write_npz(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     arrays: dict[str, Any] = {v.quantity: v.values.cpu().numpy() for v in volumes}
     arrays |= {f"{a}_mm": volumes[0].grid.axis(a).numpy() for a in "xyz"}
     arrays["about"] = np.array(json.dumps(_attributes(volumes)))
-    temporary = Path(f"{os.fspath(path)}.part")
-    with temporary.open("wb") as file:
+    with atomic(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
-    os.replace(temporary, path)
 
 
 def write_mat(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
@@ -69,10 +68,8 @@ def write_mat(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     data |= {f"{a}_mm": volumes[0].grid.axis(a).numpy()[:, None] for a in "xyz"}
     # names of MATLAB: letters, digits, underscores
     data["about"] = {re.sub(r"\W", "_", name): value for name, value in _attributes(volumes).items()}
-    temporary = Path(f"{os.fspath(path)}.part")
-    with temporary.open("wb") as file:
+    with atomic(path) as part, part.open("wb") as file:
         savemat(file, data, do_compression=True, long_field_names=True)
-    os.replace(temporary, path)
 
 
 def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
@@ -82,9 +79,8 @@ def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     points = volumes[0].grid.points(torch.float64).reshape(-1, 3)
     columns = [points, *(v.values.cpu().double().reshape(-1, 1) for v in volumes)]
     header = ",".join(["x_mm", "y_mm", "z_mm", *(f"{v.quantity} [{v.unit}]" for v in volumes)])
-    temporary = Path(f"{os.fspath(path)}.part")
-    np.savetxt(temporary, torch.cat(columns, dim=1).numpy(), delimiter=",", header=header, comments="", fmt="%.9g")
-    os.replace(temporary, path)
+    with atomic(path) as part:
+        np.savetxt(part, torch.cat(columns, dim=1).numpy(), delimiter=",", header=header, comments="", fmt="%.9g")
 
 
 FORMATS = {".vti": _write_vti, ".nc": write_netcdf, ".npz": write_npz, ".mat": write_mat, ".csv": write_csv}

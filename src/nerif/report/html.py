@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerif import __version__
+from nerif.atomic import atomic
 from nerif.report import packing
 from nerif.report.figures import COLOUR_MAPS, DIVERGING, draw_history, draw_residuals, draw_slice_scores
 from nerif.report.isosurface import default_level
@@ -44,9 +44,8 @@ CITATION = (
 
 def write(page: str, path: Path) -> None:
     """Write a page, atomically."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(page, encoding="utf-8")
-    os.replace(temporary, path)
+    with atomic(path) as part:
+        part.write_text(page, encoding="utf-8")
 
 
 def render(result: Result) -> str:

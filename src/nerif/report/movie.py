@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.report.figures import COLOUR_MAPS, LABELS, colour_range, shown
 from nerif.report.isosurface import default_level
@@ -143,15 +143,10 @@ class Movie:
             raise InputError(f"{store.path}: no frame of it is there yet")
         if self.quantity not in store.quantities:
             raise InputError(f"quantity: expected one of {', '.join(store.quantities)}, got '{self.quantity}'")
-        temporary = path.with_name(f".{path.stem}.part{path.suffix}")
-        try:
-            with _writer(temporary, self.frames_per_second) as writer:
-                for done, picture in enumerate(self.pictures(store, frames), start=1):
-                    writer.append_data(picture)
-                    on_frame(done)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with atomic(path) as part, _writer(part, self.frames_per_second) as writer:
+            for done, picture in enumerate(self.pictures(store, frames), start=1):
+                writer.append_data(picture)
+                on_frame(done)
 
 
 def frames_there(store: VolumeSequence) -> list[int]:

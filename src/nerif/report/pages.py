@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from nerif.atomic import atomic
 from nerif.report.figures import (
     DIVERGING,
     add_colour_bar,
@@ -74,7 +75,8 @@ def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi
             FigureCanvasAgg(figure)
             for ending in ("pdf", "png"):
                 paths.append(directory / f"{name}.{ending}")
-                figure.savefig(paths[-1], dpi=dpi, metadata={"Title": f"{name}, {result.directory.name}"})
+                with atomic(paths[-1]) as part:
+                    figure.savefig(part, dpi=dpi, metadata={"Title": f"{name}, {result.directory.name}"})
     return paths
 
 

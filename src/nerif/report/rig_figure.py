@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from nerif.atomic import atomic
 from nerif.geometry import Box, Camera
 
 if TYPE_CHECKING:
@@ -96,7 +97,8 @@ def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> N
         figure = Figure(figsize=(12, 6.2))
         FigureCanvasAgg(figure)
         draw_two_sides(figure, cameras, box)
-        figure.savefig(path, dpi=130)
+        with atomic(path) as part:
+            figure.savefig(part, dpi=130)
 
 
 def picture_corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
@@ -92,31 +92,28 @@ class SequenceStore(VolumeSequence):
         """
         like, frames = sequence.first_good(), len(sequence)
         about = {"kind": KIND, "network": vars(network), "views": list(like.names), **attributes}
-        temporary = path.with_name(path.name + ".part")
-        group = VolumeSequence.create(temporary, sequence.times, grid, quantities, like.n_ambient, about).group
-        views, parameters = len(like.names), sum(p.numel() for p in _network(about).parameters())
+        with atomic(path) as part:
+            group = VolumeSequence.create(part, sequence.times, grid, quantities, like.n_ambient, about).group
+            views, parameters = len(like.names), sum(p.numel() for p in _network(about).parameters())
 
-        def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
-            add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
+            def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
+                add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
 
-        nan = float("nan")
-        for name, unit, meaning in (("cc", "1", "correlation with"), ("rms_px", "px", "rms difference to")):
-            add_frames(
-                group, name, frames, (views,), ("view",), "float64",
-                units=unit, long_name=f"{meaning} what the view measured",
-            )  # fmt: skip
-        add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
-        add("index_scale", "float64", nan, "index excess of one unit of network output")
-        add("offset", "float64", nan, "network output that counts as ambient")
-        add("seconds", "float64", nan, "spent on the frame, s")  # as units they would be read as a time span
-        add("steps", "int32", 0, "steps of training")
-        add("attempts", "int8", 0, "attempts at the frame")
-        add("reason", "str", "", "why the frame failed")
-        flags = {"flag_values": [MISSING, DONE, FAILED], "flag_meanings": "missing done failed"}
-        add("status", "int8", MISSING, "written last: the frame is complete", **flags)
-        if path.exists():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-        os.replace(temporary, path)
+            nan = float("nan")
+            for name, unit, meaning in (("cc", "1", "correlation with"), ("rms_px", "px", "rms difference to")):
+                add_frames(
+                    group, name, frames, (views,), ("view",), "float64",
+                    units=unit, long_name=f"{meaning} what the view measured",
+                )  # fmt: skip
+            add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
+            add("index_scale", "float64", nan, "index excess of one unit of network output")
+            add("offset", "float64", nan, "network output that counts as ambient")
+            add("seconds", "float64", nan, "spent on the frame, s")  # as units they would be read as a time span
+            add("steps", "int32", 0, "steps of training")
+            add("attempts", "int8", 0, "attempts at the frame")
+            add("reason", "str", "", "why the frame failed")
+            flags = {"flag_values": [MISSING, DONE, FAILED], "flag_meanings": "missing done failed"}
+            add("status", "int8", MISSING, "written last: the frame is complete", **flags)
         return cls(path)
 
     # -- frames --------------------------------------------------------------------------------------------------

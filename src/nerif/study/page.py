@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from nerif.atomic import atomic
 from nerif.study.cases import SECTIONS, Case
 from nerif.study.claim import Claim, Verdict
 from nerif.study.claims import claims
@@ -175,6 +175,5 @@ def _svg(plate: Plate) -> bytes:
 
 
 def _write(path: Path, content: bytes) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(content)
-    os.replace(part, path)
+    with atomic(path) as part:
+        part.write_bytes(content)

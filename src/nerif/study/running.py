@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from nerif.atomic import atomic
 from nerif.evaluation import evaluate_volume, write_json
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
@@ -137,9 +138,7 @@ def _clean(case: Case, phantom: Field, folder: Path) -> Measurement:
     if path.is_file():
         return Measurement.read(path)
     measurement = simulate(phantom, case.ring.cameras(), BOX, N_AMBIENT)
-    part = path.with_suffix(".part.nc")
-    measurement.write(part)
-    part.replace(path)
+    measurement.write(path)
     return measurement
 
 
