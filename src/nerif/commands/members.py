@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import time
 from collections.abc import Collection
@@ -22,6 +21,7 @@ from nerif.measurement import Measurement
 from nerif.reconstruction.base import Outcome, Reconstruction, Reconstructor, compose
 from nerif.reconstruction.ensemble import Ensemble, Spread
 from nerif.reconstruction.files import FIELD, read_field, write_field
+from nerif.reconstruction.fingerprint import fingerprint
 from nerif.report.result import METRICS
 
 __all__ = ["add_ensemble"]
@@ -96,7 +96,7 @@ def _member(
     """One member: read if it is there already, made by the same settings from the same data; else reconstructed."""
     folder: Path = settings.out / ENSEMBLE / f"{number:02d}"
     reconstructor, noisy = ensemble.member(number, settings.reconstructor, training, noise)
-    asked_for = _fingerprint(settings, reconstructor, noisy)
+    asked_for = _asked(settings, reconstructor, noisy)
     if (folder / FIELD).is_file() and (folder / ASKED).is_file() and (folder / ASKED).read_text() == asked_for:
         try:
             field, box, n_ambient = read_field(folder)
@@ -116,15 +116,10 @@ def _member(
     return result
 
 
-def _fingerprint(settings: Reconstruct, reconstructor: Reconstructor, data: Measurement) -> str:
+def _asked(settings: Reconstruct, reconstructor: Reconstructor, data: Measurement) -> str:
     """What a member was made by and from, as text: another one of either gives another text."""
-    seen = hashlib.sha256()
-    for values in (data.displacement, data.sigma, data.usable):
-        if values is not None:
-            seen.update(values.contiguous().numpy().tobytes())
     asked = {
-        "views": data.names,
-        "data": seen.hexdigest(),
+        "data": fingerprint(data),
         "start_from": str(settings.start_from),
         **dataclasses.asdict(reconstructor),  # type: ignore[call-overload]
     }
