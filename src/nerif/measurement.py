@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.atomic import atomic
-from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
+from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces
 from nerif.geometry import Box, Camera, Plane, Rays
 
 if TYPE_CHECKING:
@@ -94,8 +94,7 @@ class Measurement:
                     f"image_size of view '{camera.name}': expected at most {shape[1:3]} (height, width) px, "
                     f"got {camera.image_size}"
                 )
-        if not 0.9 < self.n_ambient < 4:
-            raise InputError(f"n_ambient: expected a refractive index such as 1.00027, got {self.n_ambient}")
+        ambient_index(self.n_ambient)
         parse_faces(self.ambient_faces)
         good = self.usable.flatten(1).sum(dim=1)
         for name, count in zip(self.names, good.tolist(), strict=True):
