@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.measurement import CONVENTIONS, Measurement
 from nerif.reconstruction.files import read_field
@@ -20,7 +20,7 @@ __all__ = ["Info", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Info:
+class Info(Settings):
     """Print what a measurement, a volume or a result directory holds."""
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -116,4 +116,4 @@ def _result(path: Path) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Info(tyro.MISSING), arguments, "nerif info", Info.__doc__ or ""))
+    run(read_settings(Info(tyro.MISSING), arguments, "info"))
