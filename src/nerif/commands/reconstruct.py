@@ -54,7 +54,7 @@ def run(settings: Reconstruct) -> Reconstruction:
         settings = replace(settings, gas=replace(settings.gas, wavelength_nm=measurement.wavelength_nm))
     derive_check(settings.gas, measurement)
     if measurement.bad_pixels:
-        say(f"{settings.measurement}: {measurement.bad_pixels} pixels with NaN or infinite displacement left out")
+        say(f"{settings.measurement}: {measurement.bad_pixels} pixels left out whose displacement or sigma is NaN, infinite or impossible")
     resume = read_state(settings.out) if settings.resume else None
     start = _start(settings, measurement) if resume is None else None
     if not settings.resume:
