@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from nerif.conventions import InputError
-from nerif.evaluation import write_json
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Box, Grid, Ring
+from nerif.result import write_json
 from nerif.study.resolution import (
     Resolution,
     draw_distribution,

@@ -17,11 +17,11 @@ import tyro
 
 from nerif import __version__
 from nerif.commands.output import say
-from nerif.commands.result_files import versions
 from nerif.commands.settings import parse
 from nerif.conventions import InputError
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.presets import preset
+from nerif.result import versions
 from nerif.study.cases import FULL, QUICK, Case, Scale, cases, check_sections
 from nerif.study.page import write_page
 from nerif.study.running import read_record, run_cases

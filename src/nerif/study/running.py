@@ -18,8 +18,7 @@ from typing import Any
 
 import torch
 
-from nerif.atomic import atomic
-from nerif.evaluation import evaluate_volume, write_json
+from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
 from nerif.geometry import Box, Grid
@@ -29,6 +28,7 @@ from nerif.physics.deflection import Deflection, project
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
+from nerif.result import write_json
 from nerif.simulation import add_noise, simulate
 from nerif.study.cases import Case
 from nerif.study.resolution import measure_resolution, pixels_per_unit
