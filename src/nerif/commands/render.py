@@ -67,9 +67,8 @@ def run(settings: Render) -> None:
     target = settings.pictures.target_for(cameras)
     axes = ", ".join(f'"{a}"' for a in world_axes(cameras))
     with atomic(settings.out / "calibrate.toml") as part:
-        part.write_text(
-            f'world = "0"\naxes = [{axes}]\nbackground_scale = {background_scale(cameras)}\n\n[target]\n{to_toml(target)}'
-        )
+        scale = background_scale(cameras)
+        part.write_text(f'world = "0"\naxes = [{axes}]\nbackground_scale = {scale}\n\n[target]\n{to_toml(target)}')
     write_cameras(truth / "calibration.toml", [CalibratedCamera.from_camera(c) for c in cameras])
     grid = Grid.of_resolution(box, settings.truth_voxels)
     write_netcdf(
