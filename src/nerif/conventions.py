@@ -14,6 +14,7 @@ __all__ = [
     "COMPONENTS",
     "DEFAULT_AMBIENT_FACES",
     "FACES",
+    "LARGEST_LENGTH",
     "InputError",
     "Mask",
     "Matrix3",
@@ -34,6 +35,9 @@ FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
 """Where the index is taken as ambient when nothing else is said: the side faces (the gauge)."""
+
+LARGEST_LENGTH = 1e7
+"""Beyond ten kilometres (mm) a length is taken for a mistake of its unit."""
 
 Points = Float[Tensor, "*batch 3"]  # mm, world frame
 Vectors = Float[Tensor, "*batch 3"]  # direction (1) or gradient (1/mm)

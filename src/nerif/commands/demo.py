@@ -11,7 +11,7 @@ import tyro
 from nerif.commands import evaluate, reconstruct, simulate
 from nerif.commands.methods import ReconstructNeRIF
 from nerif.commands.output import MONITOR, check_directory, say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
@@ -22,7 +22,7 @@ __all__ = ["Demo", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(Settings):
     """Simulate nine small views of a flame and a tenth to hold out, reconstruct, evaluate, and write a report."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
@@ -78,4 +78,4 @@ def run(settings: Demo) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Demo(), arguments, "nerif demo", Demo.__doc__ or ""))
+    run(read_settings(Demo(), arguments, "demo"))

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from nerif.commands.output import counting_bar, say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.evaluation import FLOW, evaluate
 
@@ -17,7 +17,7 @@ __all__ = ["Evaluate", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Settings):
     """Compare a reconstruction with a truth over the volume, or with measured views; adds to its metrics.json."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -78,4 +78,4 @@ def run_over_time(settings: Evaluate) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Evaluate(result=tyro.MISSING), arguments, "nerif evaluate", Evaluate.__doc__ or ""))
+    run(read_settings(Evaluate(result=tyro.MISSING), arguments, "evaluate"))

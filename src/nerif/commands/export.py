@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.exports import FORMATS, export
 from nerif.geometry import Box, Grid
@@ -21,7 +21,7 @@ __all__ = ["Export", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Settings):
     """Write a reconstruction as .vti (opens in ParaView), .nc, .npz, .mat or .csv, on any grid."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -72,4 +72,4 @@ def run(settings: Export) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Export(tyro.MISSING, tyro.MISSING), arguments, "nerif export", Export.__doc__ or ""))
+    run(read_settings(Export(tyro.MISSING, tyro.MISSING), arguments, "export"))

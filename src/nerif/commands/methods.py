@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from nerif.commands.settings import Settings
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.neural import NeRIF
@@ -22,7 +23,7 @@ Flat = tyro.conf.arg(name="")
 
 
 @dataclass(frozen=True)
-class Reconstruct:
+class Reconstruct(Settings):
     """Reconstruct the refractive-index field of a measurement and write a result directory."""
 
     measurement: Annotated[Path, tyro.conf.Positional]
@@ -37,8 +38,6 @@ class Reconstruct:
     """Go on with an interrupted run in --out; limits such as --epochs or --iterations may be raised."""
     tensorboard: bool = False
     """Write TensorBoard scalars to OUT/tensorboard."""
-    config: Path | None = None
-    """TOML file of settings (such as the run.toml of a result); flags win over it."""
     run: Annotated[Run, Flat] = field(default_factory=Run)
     reconstructor: Annotated[Reconstructor, tyro.conf.Suppress] = field(default_factory=NeRIF)
 

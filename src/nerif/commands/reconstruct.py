@@ -11,7 +11,7 @@ import tyro
 
 from nerif.commands.methods import RECORDS, Reconstruct
 from nerif.commands.output import MONITOR
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import flag_value, read_settings, value_given
 from nerif.conventions import InputError
 from nerif.reconstruction.base import OnStep, Reconstruction, Step
 from nerif.reconstruction.presets import preset
@@ -53,22 +53,18 @@ def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    config = flag_value(arguments, "--config")
-    out = flag_value(arguments, "-o", "--out")
-    if "--resume" in arguments and config is None and out is not None:
-        if not (Path(out) / RUN).is_file():
+    file, out = None, flag_value(arguments, "-o", "--out")
+    if "--resume" in arguments and flag_value(arguments, "--config") is None and out is not None:
+        file = Path(out) / RUN
+        if not file.is_file():
             raise InputError(f"{out}: expected an interrupted run to resume, got no {RUN} in it")
-        config = str(Path(out) / RUN)
-    values = read_toml(Path(config)) if config else {}
-    method = flag_value(arguments, "--method") or values.get("method", "nerif")
+    method = value_given("method", arguments, "nerif", file)
     if method not in RECORDS:
         raise InputError(f"method: expected one of {', '.join(RECORDS)}, got '{method}'")
     chosen: dict[str, Any] = {"method": method}
     if method == "nerif":
-        name = flag_value(arguments, "--preset") or values.get("preset", "auto")
+        name = value_given("preset", arguments, "auto", file)
         # settings of a file are complete: there the preset has had its say already
         chosen |= {"preset": name, "reconstructor": preset(name)}
     default = RECORDS[method](measurement=tyro.MISSING, out=tyro.MISSING, **chosen)
-    if config:
-        default = merge(default, values, config)
-    run(parse(default, arguments, "nerif reconstruct", RECORDS[method].__doc__ or ""))
+    run(read_settings(default, arguments, "reconstruct", file))

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import MONITOR, check_file
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.result import REPORT
 from nerif.workflow import write_report, write_sequence_report
@@ -18,7 +18,7 @@ __all__ = ["Report", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Settings):
     """Write a page that shows a result: one HTML file, no network, opens from disk."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -45,4 +45,4 @@ def run(settings: Report) -> Path:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Report(tyro.MISSING), arguments, "nerif report", Report.__doc__ or ""))
+    run(read_settings(Report(tyro.MISSING), arguments, "report"))

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.simulation import Simulation
@@ -19,7 +19,7 @@ __all__ = ["Simulate", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Simulate:
+class Simulate(Settings):
     """Trace curved rays through a phantom and write a measurement, with its truth as a volume beside it."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -28,8 +28,6 @@ class Simulate:
     """Many instants of the flame, FIRST:LAST:COUNT in s (0:2.3e-3:24): a sequence."""
     force: bool = False
     """Overwrite existing files."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     simulation: Annotated[Simulation, tyro.conf.arg(name="")] = field(default_factory=Simulation)
     ring: Annotated[Ring, tyro.conf.arg(name="")] = field(default_factory=Ring)
 
@@ -92,8 +90,4 @@ def run_over_time(settings: Simulate) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Simulate(out=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif simulate", Simulate.__doc__ or ""))
+    run(read_settings(Simulate(out=tyro.MISSING), arguments, "simulate"))
