@@ -18,7 +18,7 @@ LAYERS = (
     ("imaging",),
     ("fields",),
     ("physics",),
-    ("metrics", "simulation", "rendering"),
+    ("metrics", "resolution", "simulation", "rendering"),
     ("experiment",),
     ("reconstruction",),
     ("result", "monitor"),
@@ -26,7 +26,6 @@ LAYERS = (
     ("members",),
     ("report", "sequence"),
     ("workflow",),
-    ("study",),
     ("commands",),
     ("cli", "__main__"),
 )

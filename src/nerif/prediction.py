@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -25,7 +24,7 @@ from nerif.reprojection import Accuracy, Reprojection
 VOXEL_STEP = 0.25  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame
 EXACT_WORK = {"cpu": 2.5e11, "cuda": 2.5e13}  # multiplications: ten seconds on two cores
-VOXELS, BEYOND = 128, 3  # along the longest edge of the box, and beyond each face
+VOXELS, BEYOND = 100, 3  # along the longest edge of the box, and beyond each face
 SPARSE_STEP = 2.0  # voxels between samples of SampledViews: as near to the network as half a voxel
 COMPARED = 1024  # pixels
 
@@ -104,8 +103,8 @@ def reproject(
     """Predict what every view of a measurement sees of a field; px.
 
     A network is integrated along every ray where that takes some seconds only. Of larger pictures it is sampled on
-    voxels, and the views are interpolated between rays through those (`SampledViews`); how far that is from the integral
-    through the network is measured on some pixels, and told as `accuracy`.
+    voxels, and the views are interpolated between rays through those (`SampledViews`); how far that is from the
+    integral through the network is measured on some pixels, and told as `accuracy`.
 
     Parameters
     ----------
@@ -119,8 +118,11 @@ def reproject(
     predicted = torch.full_like(measurement.displacement, float("nan"))
     for i, camera in enumerate(cameras):
         height, width = camera.image_size
-        view = sampled(camera) if sampled else predict_view(field, camera, forward, box, device)
-        predicted[i, :height, :width] = view
+        if sampled:
+            seen = measurement.sees_box[i, :height, :width, None]
+            predicted[i, :height, :width] = sampled(camera).where(seen, torch.zeros(()))
+        else:
+            predicted[i, :height, :width] = predict_view(field, camera, forward, box, device)
         on_view(i + 1, len(cameras))
     accuracy = sampled.accuracy(cameras, predicted) if sampled else Accuracy()
     return Reprojection(measurement, predicted, tuple(held_out), accuracy)
@@ -138,8 +140,8 @@ def _work(field: Field, cameras: Sequence[Camera]) -> float:
 class SampledViews:
     """Views of a network by way of its values on voxels.
 
-    The network is sampled on a grid that goes on beyond the box, so that the cubic spline through the values is right up
-    to its faces. Rays of a lattice of pixels, about two a voxel, are integrated through the spline by the compiled
+    The network is sampled on a grid that goes on beyond the box, so that the cubic spline through the values is right
+    up to its faces. Rays of a lattice of pixels, about two a voxel, are integrated through the spline by the compiled
     operator, and the pixels between them are interpolated by bicubic splines. What bending adds (`curved`) is
     integrated through the network itself on a coarser lattice.
 
@@ -169,23 +171,25 @@ class SampledViews:
         return cls(field, VoxelField.through(field.sample(grid, device), grid), box, model, device)
 
     def __call__(self, camera: Camera) -> Float[Tensor, "row column 2"]:
-        """Return the displacement (px) that a camera would see; 0 where a ray misses the box."""
-        height, width = camera.image_size
-        step = max(1, min(height, width) // (2 * VOXELS))
-        straight = "lever_arm" if self.model.model == "curved" else self.model.model
-        operator_of = partial(
-            DeflectionOperator, grid=self.voxels.grid, n_ambient=self.model.n_ambient, model=straight, basis="cubic",
-            step=SPARSE_STEP,
-        )  # fmt: skip
-        view = _interpolated(camera, self.box, step, lambda rays: operator_of(rays).through(self.voxels.coefficients))
+        """Return the displacement (px) that a camera would see; of no meaning where a ray misses the box."""
+        step = max(1, min(camera.image_size) // (2 * VOXELS))
+        view = _interpolated(camera, self.box, step, self._straight)
         if self.model.model == "curved":
-            first = replace(self.model, model="lever_arm")
-            view = view + _interpolated(
-                camera, self.box, 8 * step,
-                lambda rays: project(self.model, self.field, rays, self.device) - project(first, self.field, rays, self.device),
-            )  # fmt: skip
-        seen = camera.sees(self.box)
-        return torch.where(seen[..., None], view, torch.zeros_like(view))
+            view = view + _interpolated(camera, self.box, 8 * step, self._bending)
+        return view
+
+    def _straight(self, rays: Rays) -> Float[Tensor, "n 2"]:
+        n_ambient, model = self.model.n_ambient, self.model.model
+        operator = DeflectionOperator(
+            rays, self.voxels.grid, n_ambient, model if model in MODELS else MODELS[0], "cubic", step=SPARSE_STEP
+        )
+        return operator.through(self.voxels.coefficients)
+
+    def _bending(self, rays: Rays) -> Float[Tensor, "n 2"]:
+        """What bent rays see more than straight ones."""
+        models = (self.model, replace(self.model, model=MODELS[0]))
+        bent, straight = (project(model, self.field, rays, self.device) for model in models)
+        return bent - straight
 
     def accuracy(self, cameras: Sequence[Camera], predicted: Float[Tensor, "view row column 2"]) -> Accuracy:
         """Compare what was predicted with the path integral through the network, on pixels picked at random."""

@@ -70,7 +70,7 @@ class Reprojection:
         more["measured"].attrs = {"units": "px", "long_name": "measured displacement"}
         with atomic(path) as part:
             predicted.write(part)
-            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding={"measured": {"zlib": True, "complevel": 3}})
+            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding={"measured": PACKED})
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Reprojection:

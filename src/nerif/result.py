@@ -283,7 +283,9 @@ class ResultDirectory:
             REPROJECTION, self.reprojection, None, "the views cannot be shown; nerif evaluate --measurement FILE"
         )
         if not finished:
-            go_on = f"Go on with nerif reconstruct --resume -o {self.path}" if self.has(CHECKPOINT) else "Start it again"
+            go_on = "Start it again"
+            if self.has(CHECKPOINT):
+                go_on = f"Go on with nerif reconstruct --resume -o {self.path}"
             rest = f" Not there yet: {', '.join(not_yet)}." if not_yet else ""
             missing.insert(0, Missing(FIELD, f"The run has not ended: there is no {FIELD}. {go_on}.{rest}"))
         return Result(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from nerif.physics.quantities import GasSettings, derive, masked_lines
 from nerif.prediction import reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
+from nerif.reconstruction.files import checkpoints
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.parallel import Ranks
@@ -115,7 +115,8 @@ def reconstruct_into(
     check_gas(run.gas, measurement)
     if measurement.bad_pixels:
         where = "the measurement" if path is None else path
-        monitor.say(f"{where}: {measurement.bad_pixels} pixels with NaN or infinite displacement left out")
+        what = "pixels left out whose displacement or sigma is NaN, infinite or impossible"
+        monitor.say(f"{where}: {measurement.bad_pixels} {what}")
     state = out.state() if resume else None
     start = _start(run, measurement) if run.ensemble or not resume else None
     if not resume:
@@ -129,7 +130,7 @@ def reconstruct_into(
     settings = _settings(run, path, reconstructor, voxels, keep or {})
     begin = _begin(out, settings, resume)
     with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
-        callbacks = [begin, told, _checkpoints(out, run.checkpoint_every), *([on_step] if on_step else [])]
+        callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
         result = reconstructor(training, compose(*callbacks), state, start if state is None else None)
     monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
     begin(None)
@@ -288,14 +289,3 @@ def _begin(out: ResultDirectory, settings: Mapping[str, Any], resume: bool) -> C
             done.append(True)
 
     return prepare
-
-
-def _checkpoints(out: ResultDirectory, every: float) -> Callable[[Step], None]:
-    last = [time.monotonic()]
-
-    def write(step: Step) -> None:
-        if time.monotonic() - last[0] >= every:
-            out.write_state(step.capture())
-            last[0] = time.monotonic()
-
-    return write

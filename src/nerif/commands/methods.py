@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from nerif.commands.settings import Settings
+from nerif.commands.settings import Flat, Settings
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.neural import NeRIF
@@ -17,9 +17,6 @@ from nerif.reconstruction.total_variation import TotalVariation
 from nerif.workflow import Run
 
 __all__ = ["RECORDS", "Reconstruct", "ReconstructNeRIF"]
-
-Flat = tyro.conf.arg(name="")
-"""The settings of the method stand beside the others, without a prefix."""
 
 
 @dataclass(frozen=True)

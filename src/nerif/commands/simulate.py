@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.simulation import Simulation
@@ -28,8 +28,8 @@ class Simulate(Settings):
     """Many instants of the flame, FIRST:LAST:COUNT in s (0:2.3e-3:24): a sequence."""
     force: bool = False
     """Overwrite existing files."""
-    simulation: Annotated[Simulation, tyro.conf.arg(name="")] = field(default_factory=Simulation)
-    ring: Annotated[Ring, tyro.conf.arg(name="")] = field(default_factory=Ring)
+    simulation: Annotated[Simulation, Flat] = field(default_factory=Simulation)
+    ring: Annotated[Ring, Flat] = field(default_factory=Ring)
 
 
 def truth_path(out: Path) -> Path:

@@ -45,7 +45,7 @@ def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"
 
 
 def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
-    """Return masked voxels (NaN) with the value of the nearest that is not: they must not have a surface of their own."""
+    """Return masked voxels (NaN) with the value of the nearest that is not: they must have no surface of their own."""
     from scipy.ndimage import distance_transform_edt
 
     masked = ~np.isfinite(values)

@@ -26,8 +26,8 @@ from nerif.report.figures import (
     shown,
 )
 from nerif.report.isosurface import default_level, draw_isosurface
-from nerif.reprojection import Reprojection
 from nerif.report.view_images import lattice_step
+from nerif.reprojection import Reprojection
 from nerif.result import Result
 from nerif.volume import Volume
 

@@ -85,7 +85,8 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
         for c, component in enumerate("uv"):
             images = (measured[..., c], seen[..., c], seen[..., c] - measured[..., c])
             limits = (limit, limit, apart)
-            rows[component] = tuple(_picture(_shrink(x, shrink), reach) for x, reach in zip(images, limits, strict=True))
+            small = [_shrink(image, shrink) for image in images]
+            rows[component] = tuple(_picture(x, reach) for x, reach in zip(small, limits, strict=True))
         found.append(
             ViewImages(
                 camera.name,

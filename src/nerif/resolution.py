@@ -31,7 +31,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -40,21 +39,8 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.phantoms import Octahedron
-from nerif.geometry import Camera
-from nerif.report.figures import COLOURS, colour_range
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-__all__ = [
-    "Resolution",
-    "draw_distribution",
-    "draw_edge_spread",
-    "draw_mtf",
-    "measure_resolution",
-    "nyquist_per_unit",
-    "pixels_per_unit",
-]
+__all__ = ["SIZE", "THRESHOLD", "Resolution", "measure_resolution"]
 
 SIZE = 1.5  # units from the centre of the octahedron to its corners
 MARGIN = 0.05  # units
@@ -120,48 +106,6 @@ class Resolution:
     def normals(self) -> Float[Tensor, "k 3"]:
         """Outward normals of the patches."""
         return (self.positions - self.patches.mean(dim=(0, 1))).sign() / math.sqrt(3)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain numbers and lists, with what follows from them, for a JSON file."""
-        return {
-            "lp_per_mm": self.lp_per_mm,
-            "lp_per_unit": self.lp_per_unit,
-            "coarsest_lp_per_unit": self.coarsest,
-            "finest_lp_per_unit": float(self.frequency[-1]) * self.unit,
-            "unit_mm": self.unit,
-            "half_length_mm": self.half_length,
-            "distance_mm": self.distance.tolist(),
-            "edge_spread": self.edge_spread.tolist(),
-            "line_spread_per_mm": self.line_spread.tolist(),
-            "frequency_lp_per_mm": self.frequency.tolist(),
-            "mtf": self.mtf.tolist(),
-            "patches_mm": self.patches.tolist(),
-            "local_lp_per_mm": self.local_lp_per_mm.tolist(),
-        }
-
-    @classmethod
-    def from_dict(cls, plain: dict[str, Any]) -> Resolution:
-        """Return what `as_dict` made plain; None, as JSON files have it, is NaN."""
-
-        def numbers(name: str) -> Tensor:
-            values = plain[name]
-            if values and not isinstance(values[0], list):
-                values = [math.nan if v is None else v for v in values]
-            return torch.tensor(values, dtype=torch.float64)
-
-        overall = plain["lp_per_mm"]
-        return cls(
-            lp_per_mm=math.nan if overall is None else overall,
-            unit=plain["unit_mm"],
-            half_length=plain["half_length_mm"],
-            distance=numbers("distance_mm"),
-            edge_spread=numbers("edge_spread"),
-            line_spread=numbers("line_spread_per_mm"),
-            frequency=numbers("frequency_lp_per_mm"),
-            mtf=numbers("mtf"),
-            patches=numbers("patches_mm"),
-            local_lp_per_mm=numbers("local_lp_per_mm"),
-        )
 
 
 @torch.no_grad()
@@ -234,101 +178,6 @@ def measure_resolution(
     )
 
 
-def pixels_per_unit(camera: Camera, phantom: Octahedron) -> float:
-    """Return how many pixels a camera gives to one unit of the phantom at the centre of the box.
-
-    Measured across the optical axis; the geometric mean of what columns and rows have.
-    """
-    centre = camera.rotation.new_tensor(phantom.box.centre)
-    across = camera.rotation[:2] * (phantom.unit / 2)  # the image's right and down, world frame, mm
-    spans = (camera.project(centre + across) - camera.project(centre - across)).norm(dim=-1)
-    return float(spans.prod().sqrt())
-
-
-def nyquist_per_unit(camera: Camera, phantom: Octahedron) -> float:
-    """Return the Nyquist limit of a camera's pixels at the centre of the box, 0.5 line pairs per pixel, in lp/unit.
-
-    It holds along columns and rows. Neither bound is hard: lines that run aslant are sampled up to sqrt(2) more
-    finely by square pixels, and up to sqrt(3) by cubic voxels.
-    """
-    return 0.5 * pixels_per_unit(camera, phantom)
-
-
-def draw_mtf(axes: Axes, resolution: Resolution, label: str = "", colour: str = COLOURS["blue"]) -> Axes:
-    """Draw the MTF over line pairs per unit, and where it falls below 10 %; again for another reconstruction."""
-    first = not axes.has_data()
-    frequency = (resolution.frequency * resolution.unit).numpy()
-    found = resolution.lp_per_unit
-    right = 2 * found if found > 0 else frequency[-1]  # NaN and 0 have no place on the axis
-    if not first:
-        right = max(right, axes.get_xlim()[1])
-    told = f"{found:.2f} lp/unit" if found > 0 else "no edge" if found == 0 else f"> {frequency[-1]:.4g} lp/unit"
-    axes.plot(frequency, resolution.mtf.numpy(), color=colour, label=f"{label}: {told}" if label else told)
-    if first:
-        axes.axhline(THRESHOLD, color=COLOURS["grey"], linewidth=0.8, linestyle="--", label=f"{THRESHOLD:.0%}")
-    if found > 0:
-        axes.plot(found, THRESHOLD, marker="o", markersize=4, color=colour)
-    axes.set_xlim(0, right)
-    axes.set_ylim(0, 1.1)
-    axes.set_xlabel("spatial frequency [lp/unit]")
-    axes.set_ylabel("MTF [1]")
-    axes.legend(frameon=False)
-    return axes
-
-
-def draw_edge_spread(axes: Axes, resolution: Resolution, label: str = "", colour: str = COLOURS["blue"]) -> Axes:
-    """Draw the gradient across a face, averaged over all faces, over the true step."""
-    distance = resolution.distance.numpy()
-    axes.plot([distance[0], 0, 0, distance[-1]], [-1, -1, 0, 0], color=COLOURS["grey"], linewidth=0.8, linestyle="--")
-    axes.plot(distance, resolution.edge_spread.numpy(), color=colour, label=label or None)
-    axes.set_xlabel("distance from the face [mm]")
-    axes.set_ylabel("gradient / true step [1]")
-    if label:
-        axes.legend(frameon=False)
-    return axes
-
-
-def draw_distribution(axes: Axes, resolution: Resolution, limits: tuple[float, float] | None = None) -> Axes:
-    """Draw the resolution on the eight faces, unfolded side by side: x+ y+ first, those of z+ above.
-
-    The colour bar is in lp/unit; a patch that is finer than the samples can tell is grey. The triangles drawn around
-    the patches are the whole faces.
-    """
-    from matplotlib import colormaps
-    from matplotlib.collections import PolyCollection
-
-    signs = torch.tensor(list(product((1.0, -1.0), repeat=3)), dtype=torch.float64)
-    centre = resolution.patches.mean(dim=(0, 1))
-    faces = signs[:, None] * torch.eye(3, dtype=torch.float64) * (SIZE * resolution.unit)
-    outlines = _unfold(faces, signs, resolution.unit).numpy()
-    patches = _unfold(resolution.patches - centre, resolution.normals.sign(), resolution.unit).numpy()
-
-    axes.add_collection(PolyCollection(list(outlines), facecolors="none", edgecolors=COLOURS["grey"], linewidths=0.8))
-    values = resolution.local_lp_per_unit.numpy()
-    low, high = limits or colour_range(values)
-    drawn = PolyCollection(list(patches), array=values, edgecolors="face")
-    drawn.set_cmap(colormaps["viridis"].with_extremes(bad="0.7"))
-    drawn.set_clim(low, high)
-    axes.add_collection(drawn)
-    for face, sign in zip(outlines, signs.int().tolist(), strict=True):
-        name = " ".join(f"{axis}{'+' if s > 0 else '-'}" for axis, s in zip("xyz", sign, strict=True))
-        middle, tip = face[:, 0].mean(), face[2, 1]
-        axes.annotate(
-            name, (middle, tip), (0, 2 if tip > 0 else -2), textcoords="offset points", fontsize="small", ha="center",
-            va="bottom" if tip > 0 else "top",
-        )  # fmt: skip
-    axes.set_aspect("equal")
-    axes.margins(0.03, 0.16)
-    axes.autoscale_view()
-    axes.set_xlabel("around the z axis [mm]")
-    axes.set_ylabel("up the faces [mm]")
-    beyond = (bool((values < low).any()), bool((values > high).any()))
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
-    bar = axes.figure.colorbar(drawn, ax=axes, shrink=0.9, pad=0.02, extend=extend)
-    bar.set_label("resolution, MTF at 10 % [lp/unit]")
-    return axes
-
-
 def _inner_faces(phantom: Octahedron, half_length: float) -> Float[Tensor, "8 3 3"]:
     """Corners (mm) of what remains of each face where profiles of that half length (units) have room."""
     least = half_length / math.sqrt(3) + MARGIN
@@ -373,16 +222,3 @@ def _cutoff(frequency: Float[Tensor, " f"], mtf: Float[Tensor, "*batch f"]) -> F
     found = frequency[i - 1] + (before - THRESHOLD) / (before - after) * (frequency[1] - frequency[0])
     found = torch.where(first < len(frequency), found, math.nan)
     return torch.where(mtf[..., :1].isnan(), 0.0, found).squeeze(-1)
-
-
-def _unfold(triangles: Float[Tensor, "k 3 3"], signs: Float[Tensor, "k 3"], unit: float) -> Float[Tensor, "k 3 2"]:
-    """Lay triangles on the faces of given signs, corners from the centre, side by side into a plane; mm.
-
-    The corner of the z axis is the tip of a face; those of the x and y axes lie on the line of the others' bases.
-    """
-    weights = triangles.abs() / (SIZE * unit)
-    x, y, z = weights.unbind(-1)
-    quadrant = ((signs[:, 1] < 0) * 2 + (signs[:, 0] * signs[:, 1] < 0))[:, None]
-    edge = SIZE * math.sqrt(2) * unit
-    across = quadrant + torch.where(quadrant % 2 == 0, y, x) + z / 2
-    return torch.stack([across * edge, signs[:, None, 2] * z * edge * (math.sqrt(3) / 2)], dim=-1)

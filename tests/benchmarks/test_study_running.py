@@ -5,19 +5,29 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from dataclasses import field as dataclass_field
+from datetime import date
+from pathlib import Path
 
 import pytest
+import torch
 
-from nerif.cli import main
+import study
+from nerif import __version__
 from nerif.conventions import InputError
+from nerif.fields.base import Field
 from nerif.fields.mlp import NetworkShape
-from nerif.geometry import Ring
+from nerif.geometry import Box, Ring
+from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.study.cases import FULL, METHODS, NOISES, PHANTOMS, QUICK, SECTIONS, Case, cases
-from nerif.study.running import PRELOADED, read_record, run_case, run_cases
+from study.cases import FULL, METHODS, NOISES, PHANTOMS, QUICK, SECTIONS, Case, cases
+from study.command import main, parser
+from study.records import of_other_versions, read_record, write_record
+from study.running import PRELOADED, run_case, run_cases
 
 RING = Ring(views=4, image_size=(16, 16), pixel_pitch=0.25)
 SMALL = NeRIF(
@@ -71,11 +81,13 @@ def test_the_study_holds_all_that_the_paper_shows():
         cases(QUICK, ("tabels",))
 
 
+@pytest.mark.slow
 def test_a_record_tells_how_it_went_and_is_not_made_again(tmp_path):
     case = small("nerif", SMALL, method="NeRIF", snapshots=True)
     (record,) = run([case], tmp_path)
     assert record["method"] == "NeRIF"
     assert record["steps"] == 200
+    assert record["made"]["nerif"] == __version__
     assert record["outcome"] == "steps"
     assert record["peak_memory_bytes"] > 1e7
     assert len(record["metrics"]["slices"]) == 10
@@ -95,6 +107,56 @@ def test_a_record_tells_how_it_went_and_is_not_made_again(tmp_path):
     assert read_record(tmp_path, case) is None
 
 
+@pytest.mark.parametrize("field", [f.name for f in fields(Ring)])
+def test_another_rig_is_another_measurement(field):
+    """Whatever differs of the ring, the simulated measurement on disk is not taken for it."""
+    case = small("a")
+    changed = {
+        "views": 5, "arc": (5.0, 170.0), "extra_angles": (33.0,), "elevation": 3.0, "focal_length": 40.0,
+        "pixel_pitch": 0.3, "image_size": (16, 20), "distance": 600.0, "background_distance": 400.0,
+    }  # fmt: skip
+    other = replace(case, ring=replace(RING, **{field: changed[field]}))
+    assert other.data_key != case.data_key
+    assert other.request() != case.request()
+
+
+def test_what_the_measurement_depends_on_is_asked_for(monkeypatch):
+    case = small("a")
+    key, request = case.data_key, case.request()
+    assert replace(case, noise=0.0).data_key == key  # noise is added to what is on disk
+    for name, other in (("BOX", Box.cube(40.0)), ("N_AMBIENT", 1.0003), ("NOISE_SEED", 2)):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"study.cases.{name}", other)
+            assert case.request() != request, name
+            assert (case.data_key != key) == (name != "NOISE_SEED"), name
+    monkeypatch.setattr("study.cases.__version__", "9.9")
+    assert case.data_key != key
+
+
+def test_a_record_tells_its_origin_and_another_version_does_not_use_it(tmp_path, monkeypatch):
+    case = small("a")
+    (tmp_path / "cases").mkdir()
+    record = write_record(tmp_path, case, {"metrics": {}, "device": "cpu"})
+    assert record["made"]["nerif"] == __version__
+    assert record["made"]["torch"] == torch.__version__
+    assert record["made"]["machine"]
+    assert date.fromisoformat(record["made"]["date"])
+    assert read_record(tmp_path, case) == record
+    assert not of_other_versions(tmp_path, [case])
+    monkeypatch.setattr("study.records.__version__", "9.9")
+    assert read_record(tmp_path, case) is None
+    assert of_other_versions(tmp_path, [case]) == {"a": __version__}
+
+
+def test_a_record_without_an_origin_is_of_an_unknown_version(tmp_path):
+    case = small("a")
+    (tmp_path / "cases").mkdir()
+    (tmp_path / "cases" / "a.json").write_text(json.dumps({"request": case.request(), "metrics": {}}))
+    assert read_record(tmp_path, case) is None
+    assert of_other_versions(tmp_path, [case]) == {"a": "unknown"}
+
+
+@pytest.mark.slow
 def test_what_fails_is_recorded_and_the_rest_goes_on(tmp_path):
     todo = [small("wrong", phantom="nonsense"), small("killed", Killed(voxels=8)), small("good")]
     wrong, killed, good = run(todo, tmp_path)
@@ -106,6 +168,7 @@ def test_what_fails_is_recorded_and_the_rest_goes_on(tmp_path):
     assert "failed" not in again[0]
 
 
+@pytest.mark.slow
 def test_the_octahedron_tells_its_resolution_and_the_forward_models_their_distance(tmp_path):
     (tmp_path / "data").mkdir()
     record = run_case(small("o", phantom="octahedron", noise=0.0), tmp_path)
@@ -116,23 +179,70 @@ def test_the_octahedron_tells_its_resolution_and_the_forward_models_their_distan
     assert forward["curved"]["relative"] < forward["lever_arm"]["relative"] < forward["paraxial"]["relative"] < 0.05
 
 
+class Elsewhere(Field):
+    """The octahedron on a device that is not here: it takes note where it is asked."""
+
+    def __init__(self) -> None:
+        self.asked: set[str] = set()
+
+    def value_and_gradient(self, points):
+        self.asked.add(points.device.type)
+        return torch.zeros(points.shape[:-1]), torch.zeros(points.shape)
+
+
+@dataclass(frozen=True)
+class OnMeta(Tikhonov):
+    """A method whose field is on the device "meta"."""
+
+    field: Elsewhere = dataclass_field(default_factory=Elsewhere)
+
+    def __call__(self, measurement, *arguments, **more):
+        return Reconstruction(
+            self.field, measurement.box, measurement.n_ambient, [{}], Outcome("steps", ""), {}, device="meta"
+        )
+
+
+def test_everything_asks_the_field_where_it_is(tmp_path):
+    (tmp_path / "data").mkdir()
+    method = OnMeta(voxels=8)
+    run_case(small("o", method, phantom="octahedron", noise=0.0), tmp_path)
+    assert method.field.asked == {"meta"}
+
+
+def test_help_tells_the_values_that_are_used():
+    text = " ".join(parser().format_help().split())
+    assert f"views of {QUICK.pixels} x {QUICK.pixels} px" in text
+    assert f"{QUICK.steps} steps, at most {QUICK.seconds:g} s" in text
+    assert f"default: {FULL.seconds:g}, with --quick {QUICK.seconds:g}" in text
+    assert f"default: {FULL.pixels} as in the paper, with --quick {QUICK.pixels}" in text
+
+
+def test_the_folder_runs_as_a_program():
+    command = [sys.executable, str(Path(study.__file__).parent), "--only", "tabels", "-o", os.devnull]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("study: only: expected sections out of tables")
+
+
 def test_the_command(tmp_path, capsys):
     out = tmp_path / "study"
-    words = ["study", "-o", str(out), "--quick", "--pixels", "12", "--time-limit", "0.2", "--device", "cpu"]
+    words = ["-o", str(out), "--quick", "--pixels", "12", "--time-limit", "0.2", "--device", "cpu"]
     assert main([*words, "--only", "sampling"]) == 0
     assert "3 of 3 reconstructions" in capsys.readouterr().out
     page = (out / "study.md").read_text()
+    assert f"| {__version__} | " in page
     assert "Random against regular sampling" in page
     assert (out / "study.html").read_text().startswith("<!DOCTYPE html>")
     assert main([*words, "--only", "sampling", "--page-only"]) == 0
 
     assert main([*words, "--only", "tabels"]) == 2
     assert "only: expected sections" in capsys.readouterr().err
-    assert main(["study", "-o", str(out), "--pixels", "3"]) == 2
-    assert main(["study", "-o", str(out), "--device", "cuda:9"]) == 2
-    assert main(["study", "-o", str(out), "--preset", "nonsense"]) == 2
+    assert main(["-o", str(out), "--pixels", "3"]) == 2
+    assert main(["-o", str(out), "--device", "cuda:9"]) == 2
+    assert main(["-o", str(out), "--preset", "nonsense"]) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked on POSIX only")
 def test_what_every_case_needs_is_imported_before_its_process_begins(tmp_path):
     (record,) = run([small("looking", Looking())], tmp_path)

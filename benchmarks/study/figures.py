@@ -1,4 +1,4 @@
-"""Figures of a study, each drawn into Axes that the caller gives and gets back; plates.py has what they are made of."""
+"""Figures of a study, each drawn into Axes that the caller gives and gets back; from what: page_figures.py."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from nerif.report.figures import COLOURS
-from nerif.study.results import finite
+from study.results import finite
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,7 +6,6 @@ once, before the processes part), and a case that fails or is killed leaves the 
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator
@@ -14,37 +13,38 @@ from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
-from nerif.geometry import Box, Grid
+from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.metrics import volume_errors
 from nerif.physics.deflection import Deflection, project
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
-from nerif.result import write_json
+from nerif.resolution import measure_resolution
 from nerif.simulation import add_noise, simulate
-from nerif.study.cases import Case
-from nerif.study.resolution import measure_resolution, pixels_per_unit
 from nerif.volume import Volume
+from study.cases import BOX, N_AMBIENT, NOISE_SEED, Case
+from study.octahedron import pixels_per_unit, to_plain
+from study.records import read_record, write_record
+from study.results import Record
 
-__all__ = ["OnProgress", "read_record", "run_case", "run_cases"]
+__all__ = ["OnProgress", "run_case", "run_cases"]
 
-N_AMBIENT = 1.00027
-BOX = Box.cube(50.0)
-NOISE_SEED = 1
 FORWARD_RAYS, FORWARD_SAMPLES = 4000, 400
 SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Of a run, after which its error is looked at (when the run is over)."""
 
 PRELOADED = [
-    *(__name__, "xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.kernels_numba"),
+    # of the study's own modules forkserver knows no path before Python 3.12.8; they are small
+    *("nerif.evaluation", "nerif.resolution", "nerif.simulation", "nerif.reconstruction.neural"),
+    *("nerif.reconstruction.landweber", "nerif.reconstruction.tikhonov", "nerif.reconstruction.total_variation"),
+    *("xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.kernels_numba"),
     # every optimiser imports it; with CUDA a process must not inherit what the import found out of the GPU
     *(() if torch.backends.cuda.is_built() else ("torch._dynamo",)),
 ]
@@ -56,7 +56,7 @@ OnProgress = Callable[[str, float], None]
 
 def run_cases(
     cases: list[Case], folder: Path, on_progress: Callable[[int, str, float], None]
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[Record]:
     """Run the cases that have no record yet, and yield the record of every case, in order.
 
     Parameters
@@ -71,23 +71,12 @@ def run_cases(
         if record is None or "failed" in record:
             with _process(case, folder) as told:
                 record = _listen(told, lambda what, share, done=i: on_progress(done, what, share))  # type: ignore[misc]
-            record = {**record, "request": _plain(case.request())}
-            write_json(folder / "cases" / f"{case.key}.json", record)
+            record = write_record(folder, case, record)
         on_progress(i + 1, case.key, 0.0)
         yield record
 
 
-def read_record(folder: Path, case: Case) -> dict[str, Any] | None:
-    """Return the record of a case, or None where it is not there or was asked otherwise."""
-    path = folder / "cases" / f"{case.key}.json"
-    try:
-        record: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    return record if record.get("request") == _plain(case.request()) else None
-
-
-def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, share: None) -> dict[str, Any]:
+def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, share: None) -> Record:
     """Simulate (or read what was simulated before), reconstruct, and only then compare with the truth."""
     on_progress("simulating", 0.0)
     phantom = make_phantom(case.phantom, BOX)
@@ -106,7 +95,7 @@ def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, sh
     grid = Grid.of_resolution(BOX, case.truth_voxels)
     truth = Volume(phantom.sample(grid), grid)
     last = result.history[-1]
-    record: dict[str, Any] = {
+    record: Record = {
         "phantom": case.phantom,
         "noise": case.noise,
         "method": case.method,
@@ -127,7 +116,7 @@ def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, sh
     if case.labels.get("model") == "lever_arm":
         record["forward"] = _forward_models(phantom, measurement)
     if isinstance(phantom, Octahedron):
-        record["resolution"] = measure_resolution(result.field, phantom).as_dict()
+        record["resolution"] = to_plain(measure_resolution(result.field, phantom, device=result.device))
         record["pixels_per_unit"] = pixels_per_unit(measurement.cameras[0], phantom)
     return record
 
@@ -198,7 +187,7 @@ def _process(case: Case, folder: Path) -> Iterator[Connection]:
         process.join()
 
 
-def _listen(told: Connection, on_progress: OnProgress) -> dict[str, Any]:
+def _listen(told: Connection, on_progress: OnProgress) -> Record:
     """Pass on what the process tells until it gives its record, or is gone."""
     while True:
         try:
@@ -230,8 +219,3 @@ def _work(case: Case, folder: Path, tell: Connection) -> None:
         place = traceback.extract_tb(error.__traceback__)[-1]
         record = {"failed": f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"}
     tell.send(("done", record))
-
-
-def _plain(request: dict[str, Any]) -> Any:
-    """As it reads back from JSON."""
-    return json.loads(json.dumps(request))

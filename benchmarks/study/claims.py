@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from statistics import median
 
-from nerif.study.cases import NOISES, PHANTOMS
-from nerif.study.claim import Claim, Question, Verdict
-from nerif.study.claims_of_method import CLAIMS_OF_METHOD
-from nerif.study.paper import CORRELATION, L2, paper_value
-from nerif.study.results import Missing, Record, Results, finite, score
-from nerif.study.words import cc, listed, share
+from study.cases import NOISES, PHANTOMS
+from study.claim import Claim, Question, Verdict
+from study.claims_of_method import CLAIMS_OF_METHOD
+from study.paper import CORRELATION, L2, paper_value
+from study.results import NoResult, Record, Results, finite, score
+from study.words import cc, listed, share
 
 __all__ = ["DIGITS", "Claim", "Verdict", "claims", "worse_than_paper"]
 
@@ -36,7 +36,7 @@ def worse_than_paper(name: str, value: float, paper: float) -> bool:
 def _judge(question: Question, results: Results) -> Claim:
     try:
         here, holds = question.answer(results)
-    except Missing as reason:
+    except NoResult as reason:
         return Claim(question.text, question.paper, f"{reason}", "not tested")
     verdict: Verdict = "not tested" if holds is None else "reproduced" if holds else "not reproduced"
     return Claim(question.text, question.paper, here, verdict)
@@ -94,7 +94,7 @@ def _of_slices(records: list[Record], name: str) -> list[float]:
     slices = (s for record in records for s in record["metrics"].get("slices") or [])
     values = [value for value in (finite(s.get(name)) for s in slices) if value is not None]
     if not values:
-        raise Missing(f"no slice has a {name.upper()}")
+        raise NoResult(f"no slice has a {name.upper()}")
     return values
 
 

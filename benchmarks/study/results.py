@@ -9,17 +9,17 @@ from statistics import median
 from typing import Any
 
 from nerif.reconstruction.neural import NeRIF
-from nerif.study.cases import NOISES, PHANTOMS, SECTIONS, Case
+from study.cases import NOISES, PHANTOMS, SECTIONS, Case
 
-__all__ = ["Missing", "Results", "finite", "first_at", "score", "typical"]
+__all__ = ["NoResult", "Record", "Results", "finite", "first_at", "metric", "score", "typical"]
 
 Record = dict[str, Any]
 Cell = tuple[str, float, str]
 """Phantom, noise and method."""
 
 
-class Missing(Exception):
-    """What was asked for was not reconstructed; the message says why."""
+class NoResult(Exception):
+    """A claim or a table asks for a result that the study does not have; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -69,17 +69,17 @@ class Results:
     def cells(
         self, methods: Iterable[str], noises: Iterable[float] = NOISES, phantoms: Iterable[str] = PHANTOMS
     ) -> dict[Cell, Record]:
-        """Return the records of the tables by (phantom, noise, method); Missing where one is not there."""
+        """Return the records of the tables by (phantom, noise, method); NoResult where one is not there."""
         wanted = [(p, noise, method) for method in methods for p in phantoms for noise in noises]
         cases = {_cell(case): (case, record) for case, record in self.pairs if "tables" in case.labels}
         return dict(zip(wanted, self._require([cases.get(cell) for cell in wanted], "tables"), strict=True))
 
     def one(self, phantom: str, noise: float, method: str) -> Record:
-        """Return one record of the tables; Missing where it is not there."""
+        """Return one record of the tables; NoResult where it is not there."""
         return next(iter(self.cells((method,), (noise,), (phantom,)).values()))
 
     def labelled(self, section: str) -> dict[str, Record]:
-        """Return the records of a section by label; Missing where one is not there."""
+        """Return the records of a section by label; NoResult where one is not there."""
         pairs = self._of(section)
         records = self._require(pairs or [None], section)
         return dict(zip((case.labels[section] for case, _ in pairs), records, strict=True))
@@ -96,12 +96,12 @@ class Results:
             return records
         for case, record in found:
             if record is not None and "failed" in record:
-                raise Missing(f"{case.key} failed: {record['failed']}")
+                raise NoResult(f"{case.key} failed: {record['failed']}")
         if len(found) < len(pairs):
-            raise Missing(f"the section “{SECTIONS[section]}” was not asked for")
+            raise NoResult(f"the section “{SECTIONS[section]}” was not asked for")
         if len(pairs) == 1:
-            raise Missing(f"{found[0][0].key} is not done yet")
-        raise Missing(f"{len(records)} of {len(pairs)} reconstructions done")
+            raise NoResult(f"{found[0][0].key} is not done yet")
+        raise NoResult(f"{len(records)} of {len(pairs)} reconstructions done")
 
 
 def _cell(case: Case) -> Cell:
@@ -119,11 +119,16 @@ def finite(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
+def metric(record: Record | None, name: str) -> float | None:
+    """Return a metric of a record; None where there is no record, or no number in it."""
+    return None if record is None else finite(record["metrics"].get(name))
+
+
 def score(record: Record, name: str) -> float:
-    """Return a metric of a record; Missing where it is not a number, as of a run that diverged."""
+    """Return a metric of a record; NoResult where it is not a number, as of a run that diverged."""
     value = finite(record["metrics"].get(name))
     if value is None:
-        raise Missing(f"{name} of {record['key']} is not a number (the run ended with: {record['outcome']})")
+        raise NoResult(f"{name} of {record['key']} is not a number (the run ended with: {record['outcome']})")
     return value
 
 

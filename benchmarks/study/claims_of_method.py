@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from nerif.study.cases import NOISES, PHANTOMS
-from nerif.study.claim import Question
-from nerif.study.paper import L2, MEMORY_GB, MINUTES, NETWORK_LOSS, RESOLUTION, paper_value
-from nerif.study.results import Missing, Record, Results, finite, first_at, score, typical
-from nerif.study.words import duration, factor, listed, memory, share
+from study.cases import NOISES, PHANTOMS
+from study.claim import Question
+from study.paper import L2, MEMORY_GB, MINUTES, NETWORK_LOSS, RESOLUTION, paper_value
+from study.results import NoResult, Record, Results, finite, first_at, score, typical
+from study.words import duration, factor, listed, memory, share
 
 __all__ = ["CLAIMS_OF_METHOD", "EPOCHS", "MARGIN", "resolution_of", "to_paper_error"]
 
@@ -80,7 +80,7 @@ def _memory(methods: tuple[str, ...], holds: Callable[[float], bool]) -> Callabl
             records = list(results.cells([method], [0.0]).values())
             peak = max(finite(record.get("peak_memory_bytes")) or 0.0 for record in records)
             if not peak:
-                raise Missing(f"the memory of {method} was not measured")
+                raise NoResult(f"the memory of {method} was not measured")
             devices = listed(sorted({record["device"] for record in records}))
             parts.append(f"{method} {memory(peak)} ({devices})")
             verdicts.append(holds(peak / 1e9))
@@ -121,7 +121,7 @@ def _encoding(results: Results) -> tuple[str, bool]:
     found = _octaves(results)
     none = found.pop(0, None)
     if none is None:
-        raise Missing("no run without encoding")
+        raise NoResult("no run without encoding")
     best = min(found, key=lambda n: score(found[n], "l2_variation"))
     return _compare("error of the variation at the end", found[best], none, (f"N = {best}", "no encoding"))
 
@@ -149,7 +149,7 @@ def _starting(found: dict[str, Record], start: str) -> Record:
     for label, record in found.items():
         if label.startswith(start):
             return record
-    raise Missing(f"no run is called {start}")
+    raise NoResult(f"no run is called {start}")
 
 
 # -- resolution ------------------------------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ def resolution_of(record: Record) -> tuple[float | None, str]:
     """Return line pairs per unit, and in words; None where it is finer than the profiles can tell."""
     plain = record.get("resolution")
     if plain is None:
-        raise Missing(f"the resolution of {record['key']} was not measured")
+        raise NoResult(f"the resolution of {record['key']} was not measured")
     value = finite(plain.get("lp_per_unit"))
     if value is None:
         return None, f"finer than {plain['finest_lp_per_unit']:.4g} lp/unit"

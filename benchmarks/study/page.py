@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from nerif.atomic import atomic
-from nerif.study.cases import SECTIONS, Case
-from nerif.study.claim import Claim, Verdict
-from nerif.study.claims import claims
-from nerif.study.page_html import render
-from nerif.study.plates import Plate, plates
-from nerif.study.results import Record, Results, finite
-from nerif.study.sections import section_text
-from nerif.study.words import NOTHING, bare, duration, listed, markdown_table
+from study.cases import SECTIONS, Case
+from study.claim import Claim, Verdict
+from study.claims import claims
+from study.page_figures import FigureSpec, page_figures
+from study.page_html import render
+from study.results import Record, Results, finite
+from study.sections import section_text
+from study.words import NOTHING, bare, duration, listed, markdown_table
 
 __all__ = ["VERDICTS", "markdown", "write_page"]
 
@@ -33,13 +33,12 @@ PAPER_PIXELS = 200  # of an edge of each view
 
 FACTS = {
     "command": "Command",
-    "machine": "Machine",
     "device": "Device",
     "preset": "Preset of NeRIF",
-    "date": "Date",
-    "nerif": "nerif",
-    "torch": "PyTorch",
 }
+ORIGIN = {"nerif": "nerif", "torch": "PyTorch", "machine": "Machine", "date": "Date"}
+"""What a record keeps of how it was made, and its heading."""
+
 NOTES = (
     "**Phantoms 2 to 7 are not the paper's.** Its spray-flame data are not public. Here they are a simulated turbulent "
     "Bunsen flame at six instants 0.1 ms apart; Phantom 1 is Gaussian balls placed at random, as in the paper. Rows "
@@ -57,23 +56,23 @@ def markdown(pairs: Pairs, about: Mapping[str, Any]) -> str:
     Parameters
     ----------
     pairs : every case with its record, or None where there is none yet
-    about : scale, command, machine, device, preset, date, nerif and torch (versions), pixels, truth_voxels,
-        seconds (of training), voxels, tv_voxels, sections (asked for), total_seconds; what is missing is left out
+    about : scale, command, device, preset, pixels, truth_voxels, seconds (of training), voxels, tv_voxels, sections
+        (asked for), not_used (the versions of nerif, by key, whose records are not); what is missing is left out
     """
     results = Results(tuple(pairs), tuple(about.get("sections") or SECTIONS))
-    return _markdown(results, about, plates(results))
+    return _markdown(results, about, page_figures(results))
 
 
 def write_page(folder: Path, pairs: Pairs, about: Mapping[str, Any]) -> Path:
     """Write folder/study.md, folder/figures/*.svg and folder/study.html, each atomically, and return the last."""
     results = Results(tuple(pairs), tuple(about.get("sections") or SECTIONS))
-    shown = plates(results)
+    shown = page_figures(results)
     text = _markdown(results, about, shown)
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = {}
-    for plate in shown:
-        name = f"figures/{plate.name}.svg"
-        picture = _svg(plate)
+    for spec in shown:
+        name = f"figures/{spec.name}.svg"
+        picture = _svg(spec)
         _write(folder / name, picture)
         pictures[name] = "data:image/svg+xml;base64," + base64.b64encode(picture).decode()
     _write(folder / "study.md", text.encode())
@@ -82,13 +81,13 @@ def write_page(folder: Path, pairs: Pairs, about: Mapping[str, Any]) -> Path:
     return page
 
 
-def _markdown(results: Results, about: Mapping[str, Any], shown: list[Plate]) -> str:
+def _markdown(results: Results, about: Mapping[str, Any], shown: list[FigureSpec]) -> str:
     blocks = [*_head(results, about), *_claims(claims(results))]
     for name in results.sections:
         blocks += [f"## {SECTIONS[name]}", *section_text(name, results)]
-        for plate in shown:
-            if plate.section == name:
-                blocks += [f"![{plate.caption}](figures/{plate.name}.svg)", f"*{plate.caption}*"]
+        for spec in shown:
+            if spec.section == name:
+                blocks += [f"![{spec.caption}](figures/{spec.name}.svg)", f"*{spec.caption}*"]
     left_out = [name for name in SECTIONS if name not in results.sections]
     if left_out:
         blocks += [
@@ -98,7 +97,22 @@ def _markdown(results: Results, about: Mapping[str, Any], shown: list[Plate]) ->
     if results.failed:
         rows = [[f"{case.key}", bare(reason)] for case, reason in results.failed]
         blocks += ["## Failed reconstructions", markdown_table(["Reconstruction", "Reason"], rows, left=2)]
-    return "\n\n".join(blocks) + "\n"
+    return "\n\n".join([*blocks, *_origins(results)]) + "\n"
+
+
+def _origins(results: Results) -> list[str]:
+    """By which version, where and when each reconstruction was made; those alike in all of it share a row."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for case, record in results.pairs:
+        if record is not None:
+            made = record.get("made", {})
+            rows.setdefault(tuple(bare(made.get(name, NOTHING)) for name in ORIGIN), []).append(case.key)
+    if not rows:
+        return []
+    cells = [
+        [*made, f"all {len(keys)}" if len(rows) == 1 else listed(keys, len(keys))] for made, keys in rows.items()
+    ]
+    return ["## Made by", markdown_table([*ORIGIN.values(), "Reconstructions"], cells, left=5)]
 
 
 def _head(results: Results, about: Mapping[str, Any]) -> list[str]:
@@ -113,12 +127,12 @@ def _head(results: Results, about: Mapping[str, Any]) -> list[str]:
     rows += [[title, bare(about[name])] for name, title in FACTS.items() if about.get(name)]
     seconds = sum(finite(record.get("seconds")) or 0.0 for _, record in results.pairs if record)
     rows += [["Reconstructing took", duration(seconds)]] if seconds else []
-    rows += [["Time in all", duration(float(about["total_seconds"]))]] if about.get("total_seconds") else []
     blocks = [
         "# The numerical study of the NeRIF paper, repeated",
         f"What the numerical section and Apps. A and D of {PAPER} report, reconstructed with nerif from simulated "
         "measurements; the paper's figures stand beside ours.",
         state,
+        *_not_used(about.get("not_used") or {}),
         markdown_table(["", ""], rows, left=2),
     ]
     if 0 < float(about.get("pixels") or PAPER_PIXELS) < PAPER_PIXELS:
@@ -127,6 +141,15 @@ def _head(results: Results, about: Mapping[str, Any]) -> list[str]:
         )
         blocks.append(f"{text}are no test of the paper's, which has {PAPER_PIXELS} px.")
     return [*blocks, "\n".join(f"- {note}" for note in NOTES)]
+
+
+def _not_used(versions: Mapping[str, str]) -> list[str]:
+    """That there are records of other versions of nerif, which ones, and that they are made again."""
+    if not versions:
+        return []
+    names = listed(sorted({bare(version) for version in versions.values()}))
+    text = f"Made by another version of nerif ({names}) and so not used, but made again when the study goes on: "
+    return [text + f"{listed(versions, len(versions))}."]
 
 
 def _settings(about: Mapping[str, Any]) -> str:
@@ -157,7 +180,7 @@ def _claims(found: list[Claim]) -> list[str]:
     ]
 
 
-def _svg(plate: Plate) -> bytes:
+def _svg(spec: FigureSpec) -> bytes:
     """A figure as SVG; letters as outlines, so that it looks the same everywhere."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -165,12 +188,12 @@ def _svg(plate: Plate) -> bytes:
 
     from nerif.report.pages import style
 
-    with style(size=10), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": plate.name}):
-        figure = Figure(figsize=plate.size, layout="constrained")
+    with style(size=10), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": spec.name}):
+        figure = Figure(figsize=spec.size, layout="constrained")
         FigureCanvasSVG(figure)
-        plate.draw(figure)
+        spec.draw(figure)
         picture = io.BytesIO()
-        figure.savefig(picture, format="svg", metadata={"Date": None, "Creator": None, "Title": plate.caption})
+        figure.savefig(picture, format="svg", metadata={"Date": None, "Creator": None, "Title": spec.caption})
     return picture.getvalue()
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from nerif.study.results import Results
+from study.results import Results
 
 __all__ = ["Claim", "Question", "Verdict"]
 

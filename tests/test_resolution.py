@@ -1,8 +1,7 @@
-"""The resolution of blurred octahedra, of which it is known."""
+"""The resolution of blurred octahedra, of which it is known, and its figures."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 
@@ -16,17 +15,9 @@ from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
-from nerif.geometry import Box, Grid, Ring
-from nerif.result import write_json
-from nerif.study.resolution import (
-    Resolution,
-    draw_distribution,
-    draw_edge_spread,
-    draw_mtf,
-    measure_resolution,
-    nyquist_per_unit,
-    pixels_per_unit,
-)
+from nerif.geometry import Box, Grid
+from nerif.report.resolution_figure import draw_distribution, draw_edge_spread, draw_mtf
+from nerif.resolution import Resolution, measure_resolution
 
 PHANTOM = Octahedron(Box((-9.0, -12.0, -14.0), (11.0, 13.0, 16.0)))  # off the origin; one unit is 5 mm
 
@@ -183,26 +174,6 @@ def test_patches_lie_on_the_faces(uneven):
         assert float(local.abs().max()) < 2 * PHANTOM.unit
 
 
-def test_there_and_back_by_a_json_file(uneven, tmp_path):
-    sharp = measure(PHANTOM, patches=1)
-    for i, resolution in enumerate((uneven, sharp, measure(Nothing(), patches=1))):
-        path = tmp_path / f"{i}.json"
-        write_json(path, resolution.as_dict())
-        back = Resolution.from_dict(json.loads(path.read_text()))
-        for name, value in vars(resolution).items():
-            torch.testing.assert_close(getattr(back, name), value, rtol=0, atol=0, equal_nan=True)
-    assert uneven.as_dict()["lp_per_unit"] == uneven.lp_per_unit
-    assert uneven.as_dict()["finest_lp_per_unit"] == pytest.approx(128)
-
-
-def test_pixels_of_a_unit():
-    ring = Ring(views=2, focal_length=50, pixel_pitch=0.02, image_size=(30, 40), distance=700, elevation=10)
-    centred = Octahedron(Box((-25.0, -30.0, -35.0), (25.0, 30.0, 35.0)))
-    for camera in ring.cameras():  # 50 / 700 of 12.5 mm, in pixels of 0.02 mm
-        assert pixels_per_unit(camera, centred) == pytest.approx(50 / 700 * 12.5 / 0.02)
-        assert nyquist_per_unit(camera, centred) == pytest.approx(22.32, abs=0.01)
-
-
 def test_wrong_settings():
     with pytest.raises(InputError, match=r"half_length: expected 0 to 0\.78 units, got 0\.8"):
         measure(PHANTOM, half_length=0.8)
@@ -214,7 +185,7 @@ def test_wrong_settings():
 
 @pytest.mark.parametrize("field", [None, PHANTOM, Nothing()], ids=["uneven", "sharp", "nothing"])
 def test_figures(field, uneven):
-    resolution = Resolution.from_dict((measure(field) if field else uneven).as_dict())
+    resolution = measure(field) if field else uneven
     figure = Figure(figsize=(9, 3), layout="constrained")
     edge, mtf, distribution = figure.subplots(1, 3)
     assert draw_edge_spread(edge, resolution, "NeRIF") is edge

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from nerif.study.cases import Case
-from nerif.study.claim import Claim
-from nerif.study.claims import WHY, claims, worse_than_paper
-from nerif.study.paper import CORRELATION, L2, paper_value
-from study.records import Change, resolution, results
+from benchmarks.study_records import Change, resolution, results
+from study.cases import Case
+from study.claim import Claim
+from study.claims import WHY, claims, worse_than_paper
+from study.paper import CORRELATION, L2, paper_value
 
 
 def claim(start: str, change: Change = lambda case: {}) -> Claim:

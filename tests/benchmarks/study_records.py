@@ -7,18 +7,18 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from nerif.study.cases import QUICK, Case, cases
-from nerif.study.page import markdown
-from nerif.study.results import Results
+from study.cases import QUICK, Case, cases
+from study.page import markdown
+from study.results import Results
 
 ERRORS = {"NeRIF": 0.003, "TV": 0.008, "Landweber": 0.02, "Tikhonov": 0.025}
 """L2 without noise, by method."""
 
 ABOUT = {
-    "scale": "quick", "command": "nerif study --quick -o out/study", "machine": "2 cores, 8 GB", "date": "2025-01-02",
-    "nerif": "0.1.0", "torch": "2.6.0", "pixels": 48, "seconds": 6.0, "voxels": 40, "tv_voxels": 40,
-    "truth_voxels": 48, "total_seconds": 900.0,
+    "scale": "quick", "command": "python benchmarks/study --quick", "pixels": 48, "seconds": 6.0, "voxels": 40,
+    "tv_voxels": 40, "truth_voxels": 48,
 }  # fmt: skip
+MADE = {"nerif": "0.1.0", "torch": "2.6.0", "machine": "2 cores", "date": "2025-01-02"}
 
 
 @cache
@@ -37,7 +37,7 @@ def record(case: Case, **changes: Any) -> dict[str, Any]:
         "phantom": case.phantom, "noise": case.noise, "method": case.method,
         "views": case.ring.views, "metrics": metrics | {"slices": slices},
         "seconds": 6.0 if case.method == "NeRIF" else 2.0, "peak_memory_bytes": 900_000_000, "device": "cpu",
-        "outcome": "time_limit", "steps": 500, "epochs": 60.0, "loss": 0.02,
+        "outcome": "time_limit", "steps": 500, "epochs": 60.0, "loss": 0.02, "made": MADE,
     }  # fmt: skip
     if case.snapshots:
         shares = (0.03, 0.1, 0.3, 0.6, 1.0)
@@ -52,7 +52,7 @@ def record(case: Case, **changes: Any) -> dict[str, Any]:
 
 
 def resolution(lp_per_unit: float | None) -> dict[str, Any]:
-    """As Resolution.as_dict has it, of eight patches."""
+    """As study.octahedron.to_plain has it, of eight patches."""
     t = [-5 + 10 * (i + 0.5) / 32 for i in range(32)]
     sides = [(x, y, z) for x in (1, -1) for y in (1, -1) for z in (1, -1)]
     patches = [[[10 * x, 4 * y, 4 * z], [4 * x, 10 * y, 4 * z], [4 * x, 4 * y, 10 * z]] for x, y, z in sides]

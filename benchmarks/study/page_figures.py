@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from nerif.report.figures import COLOURS
-from nerif.study.cases import METHODS, NOISES, PHANTOMS, SECTIONS
-from nerif.study.figures import (
+from nerif.report.resolution_figure import draw_distribution, draw_edge_spread, draw_mtf
+from study.cases import METHODS, NOISES, PHANTOMS, SECTIONS
+from study.figures import (
     Line,
     draw_by_phantom,
     draw_costs,
@@ -19,18 +20,19 @@ from nerif.study.figures import (
     look,
     variety,
 )
-from nerif.study.paper import COLUMNS, CORRELATION, L2, MEMORY_GB, MINUTES, paper_value
-from nerif.study.results import Record, Results, finite, typical
-from nerif.study.words import duration, memory
+from study.octahedron import from_plain
+from study.paper import COLUMNS, CORRELATION, L2, MEMORY_GB, MINUTES, paper_value
+from study.results import Results, metric, typical
+from study.words import duration, memory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Plate", "plates"]
+__all__ = ["FigureSpec", "page_figures"]
 
 
 @dataclass(frozen=True)
-class Plate:
+class FigureSpec:
     """A figure of the page.
 
     Parameters
@@ -49,14 +51,14 @@ class Plate:
     draw: Callable[[Figure], None]
 
 
-def plates(results: Results) -> list[Plate]:
+def page_figures(results: Results) -> list[FigureSpec]:
     """Return the figures that there are data for, in the order of the sections asked for."""
-    return [plate for section in results.sections for plate in DRAWN[section](results, section)]
+    return [spec for section in results.sections for spec in DRAWN[section](results, section)]
 
 
-def _tables(results: Results, section: str) -> Iterator[Plate]:
+def _tables(results: Results, section: str) -> Iterator[FigureSpec]:
     def values(name: str) -> dict[str, list[float | None]]:
-        rows = {m: [_metric(results.cell(p, 0.0, m), name) for p in PHANTOMS] for m in METHODS}
+        rows = {m: [metric(results.cell(p, 0.0, m), name) for p in PHANTOMS] for m in METHODS}
         return {m: row for m, row in rows.items() if any(v is not None for v in row)}
 
     def draw(figure: Figure) -> None:
@@ -66,13 +68,13 @@ def _tables(results: Results, section: str) -> Iterator[Plate]:
         _one_legend(figure, 5)
 
     if values("l2"):
-        yield Plate("tables", section, "L2 and CC without noise, here and in the paper.", (11, 4.4), draw)
+        yield FigureSpec("tables", section, "L2 and CC without noise, here and in the paper.", (11, 4.4), draw)
 
 
 PAPER = ("NeRIF 0", "Tikhonov", "Landweber")
 
 
-def _slices(results: Results, section: str) -> Iterator[Plate]:
+def _slices(results: Results, section: str) -> Iterator[FigureSpec]:
     shown = [("NeRIF", noise) for noise in NOISES] + [(method, 0.0) for method in METHODS[1:]]
 
     def series(phantom: str) -> dict[str, tuple[Line, list[dict[str, float]]]]:
@@ -103,10 +105,10 @@ def _slices(results: Results, section: str) -> Iterator[Plate]:
     if any(series(phantom) for phantom in PHANTOMS):
         for score, name in (("cc", "Correlation"), ("ssim", "Structural similarity")):
             caption = f"{name} of ten slices across z with the truth; 1 is perfect."
-            yield Plate(f"slices_{score}", section, caption, (11, 5.4), draw(score))
+            yield FigureSpec(f"slices_{score}", section, caption, (11, 5.4), draw(score))
 
 
-def _curves(results: Results, section: str) -> Iterator[Plate]:
+def _curves(results: Results, section: str) -> Iterator[FigureSpec]:
     curves: dict[str, tuple[Line, list[dict[str, float]]]] = {}
     levels: dict[str, tuple[Line, float]] = {}
     for noise, mark in zip(NOISES, "ovX", strict=True):
@@ -125,7 +127,7 @@ def _curves(results: Results, section: str) -> Iterator[Plate]:
 
     if curves:
         caption = "L2 error of Phantom 2 over epochs and over time; in grey the paper's final errors."
-        yield Plate("curves", section, caption, (11, 4.6), draw)
+        yield FigureSpec("curves", section, caption, (11, 4.6), draw)
 
 
 def _points(results: Results, score: str) -> dict[str, tuple[Line, float, float]]:
@@ -133,13 +135,13 @@ def _points(results: Results, score: str) -> dict[str, tuple[Line, float, float]
     found = {}
     for method in METHODS[1:]:
         record = results.cell("2", 0.0, method)
-        error = _metric(record, score)
+        error = metric(record, score)
         if record is not None and error is not None:
             found[f"{method}, noise 0"] = (look(method), record["seconds"], error)
     return found
 
 
-def _cost(results: Results, section: str) -> Iterator[Plate]:
+def _cost(results: Results, section: str) -> Iterator[FigureSpec]:
     records = {m: [r for r in (results.cell(p, 0.0, m) for p in PHANTOMS) if r is not None] for m in METHODS}
     seconds = {m: typical(found, "seconds") for m, found in records.items()}
     sizes = {m: typical(found, "peak_memory_bytes") for m, found in records.items()}
@@ -164,25 +166,23 @@ def _cost(results: Results, section: str) -> Iterator[Plate]:
 
     if any(seconds.values()):
         caption = "Time and peak memory of one reconstruction, medians over the phantoms without noise."
-        yield Plate("cost", section, caption, (11, 3.4), draw)
+        yield FigureSpec("cost", section, caption, (11, 3.4), draw)
 
 
-def _settings(results: Results, section: str) -> Iterator[Plate]:
-    values = {label: _metric(record, "l2_variation") for label, _, record in results.rows(section)}
+def _settings(results: Results, section: str) -> Iterator[FigureSpec]:
+    values = {label: metric(record, "l2_variation") for label, _, record in results.rows(section)}
 
     def draw(figure: Figure) -> None:
         draw_dots(figure.subplots(), values)
 
     if any(value is not None for value in values.values()):
         caption = f"{SECTIONS[section]}: error of the variation of n; the lowest in blue."
-        yield Plate(section, section, caption, (7.5, 1.1 + 0.34 * len(values)), draw)
+        yield FigureSpec(section, section, caption, (7.5, 1.1 + 0.34 * len(values)), draw)
 
 
-def _resolution(results: Results, section: str) -> Iterator[Plate]:
-    from nerif.study.resolution import Resolution, draw_distribution, draw_edge_spread, draw_mtf
-
+def _resolution(results: Results, section: str) -> Iterator[FigureSpec]:
     found = {
-        label: Resolution.from_dict(record["resolution"])
+        label: from_plain(record["resolution"])
         for label, _, record in results.rows(section)
         if record is not None and record.get("resolution")
     }
@@ -201,23 +201,23 @@ def _resolution(results: Results, section: str) -> Iterator[Plate]:
         caption = (
             "Edge spread function of the octahedron's faces, and modulation transfer function with the 10% cutoff."
         )
-        yield Plate("resolution", section, caption, (11, 4), draw)
+        yield FigureSpec("resolution", section, caption, (11, 4), draw)
     if "NeRIF" in found:
         caption = "Resolution of NeRIF over the octahedron's eight faces, laid side by side."
-        yield Plate("resolution_distribution", section, caption, (9, 4.6), distribution)
+        yield FigureSpec("resolution_distribution", section, caption, (9, 4.6), distribution)
 
 
-def _views(results: Results, section: str) -> Iterator[Plate]:
-    errors = {case.ring.views: _metric(record, "l2_variation") for _, case, record in results.rows(section)}
+def _views(results: Results, section: str) -> Iterator[FigureSpec]:
+    errors = {case.ring.views: metric(record, "l2_variation") for _, case, record in results.rows(section)}
 
     def draw(figure: Figure) -> None:
         draw_views(figure.subplots(), errors)
 
     if any(value is not None for value in errors.values()):
-        yield Plate("views", section, "Error over the number of views, Phantom 2 at noise 0.1.", (7.5, 4.2), draw)
+        yield FigureSpec("views", section, "Error over the number of views, Phantom 2 at noise 0.1.", (7.5, 4.2), draw)
 
 
-def _speed(results: Results, section: str) -> Iterator[Plate]:
+def _speed(results: Results, section: str) -> Iterator[FigureSpec]:
     found = [(label, record["curve"]) for label, _, record in results.rows(section) if record and record.get("curve")]
     curves: Mapping[str, tuple[Line, list[dict[str, float]]]] = {
         label: (variety(i), curve) for i, (label, curve) in enumerate(found)
@@ -233,7 +233,7 @@ def _speed(results: Results, section: str) -> Iterator[Plate]:
 
     if curves:
         caption = "Error against seconds of NeRIF's variants and of the classical methods, Phantom 2 without noise."
-        yield Plate("speed", section, caption, (10, 5), draw)
+        yield FigureSpec("speed", section, caption, (10, 5), draw)
 
 
 def _one_legend(figure: Figure, columns: int) -> None:
@@ -247,11 +247,7 @@ def _one_legend(figure: Figure, columns: int) -> None:
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 
-def _metric(record: Record | None, name: str) -> float | None:
-    return None if record is None else finite(record["metrics"].get(name))
-
-
-DRAWN: dict[str, Callable[[Results, str], Iterator[Plate]]] = {
+DRAWN: dict[str, Callable[[Results, str], Iterator[FigureSpec]]] = {
     **dict.fromkeys(SECTIONS, _settings),
     "tables": _tables,
     "slices": _slices,

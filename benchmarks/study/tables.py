@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from statistics import median
 
-from nerif.study.cases import METHODS, NOISES, PHANTOMS
-from nerif.study.claims import worse_than_paper
-from nerif.study.claims_of_method import to_paper_error
-from nerif.study.paper import CORRELATION, L2, MEMORY_GB, MINUTES, paper_value
-from nerif.study.results import Record, Results, finite
-from nerif.study.words import NOTHING, cc, duration, listed, markdown_table, memory, share
+from study.cases import METHODS, NOISES, PHANTOMS
+from study.claims import worse_than_paper
+from study.claims_of_method import to_paper_error
+from study.paper import CORRELATION, L2, MEMORY_GB, MINUTES, paper_value
+from study.results import Record, Results, finite, metric
+from study.words import NOTHING, cc, duration, listed, markdown_table, memory, share
 
 __all__ = ["WORSE", "accuracy", "convergence", "costs", "slices"]
 
@@ -58,7 +58,7 @@ def _left_by_cc(results: Results) -> str:
     for phantom in PHANTOMS:
         row = [phantom]
         for method, noise in FIRST:
-            ours = _metric(results.cell(phantom, noise, method), "cc")
+            ours = metric(results.cell(phantom, noise, method), "cc")
             paper = paper_value(CORRELATION, phantom, method, noise)
             text = share(None if ours is None else math.sqrt(1 - ours**2))
             row.append(text if paper is None else f"{text} ({math.sqrt(1 - paper**2):.1%})")
@@ -71,12 +71,12 @@ def _summary(results: Results) -> list[str]:
     best, compared, errors, honest = 0, 0, [], []
     for phantom in PHANTOMS:
         for noise in NOISES:
-            found = {m: _metric(results.cell(phantom, noise, m), "l2") for m in METHODS}
+            found = {m: metric(results.cell(phantom, noise, m), "l2") for m in METHODS}
             ours = found.pop("NeRIF")
             if ours is None:
                 continue
             errors.append(ours)
-            honest.append(_metric(results.cell(phantom, noise, "NeRIF"), "l2_variation"))
+            honest.append(metric(results.cell(phantom, noise, "NeRIF"), "l2_variation"))
             others = [v for v in found.values() if v is not None]
             if len(others) == len(found):
                 compared += 1
@@ -101,7 +101,7 @@ def _table(results: Results, columns: Sequence[Column], name: str) -> str:
 
 def _cell(results: Results, phantom: str, noise: float, method: str, name: str) -> str:
     form, table = FORMS[name]
-    value, paper = _metric(results.cell(phantom, noise, method), name), paper_value(table, phantom, method, noise)
+    value, paper = metric(results.cell(phantom, noise, method), name), paper_value(table, phantom, method, noise)
     text = "failed" if results.failed_cell(phantom, noise, method) else form(value)
     if paper is None:
         return text
@@ -140,7 +140,7 @@ def convergence(results: Results) -> list[str]:
             f"{noise:g}", share(level),
             never if point is None else count(epochs),
             never if point is None else duration(point["seconds"]),
-            share(_metric(record, "l2")), count(finite(record.get("epochs")) if record else None),
+            share(metric(record, "l2")), count(finite(record.get("epochs")) if record else None),
             duration(record["seconds"]) if record else NOTHING,
         ])  # fmt: skip
     head = ["Noise", "Paper's L2", "epochs to it", "time to it", "L2 at the end", "epochs in all", "time in all"]
@@ -181,7 +181,3 @@ def count(value: float | None) -> str:
 
 def _known(records: Sequence[Record], name: str) -> Iterator[float]:
     return (v for v in (finite(r.get(name)) for r in records) if v is not None)
-
-
-def _metric(record: Record | None, name: str) -> float | None:
-    return None if record is None else finite(record["metrics"].get(name))

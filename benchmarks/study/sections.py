@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 from nerif.report.summary import number
-from nerif.study import tables
-from nerif.study.cases import METHODS, SECTIONS
-from nerif.study.claims_of_method import MARGIN, resolution_of, to_paper_error
-from nerif.study.paper import L2, NETWORK_LOSS, RESOLUTION
-from nerif.study.results import Missing, Record, Results, finite, first_at
-from nerif.study.tables import count
-from nerif.study.words import NOTHING, bare, cc, duration, factor, listed, markdown_table, share
+from study import tables
+from study.cases import METHODS, SECTIONS
+from study.claims_of_method import MARGIN, resolution_of, to_paper_error
+from study.paper import L2, NETWORK_LOSS, RESOLUTION
+from study.results import NoResult, Record, Results, finite, first_at, metric
+from study.tables import count
+from study.words import NOTHING, bare, cc, duration, factor, listed, markdown_table, share
 
 __all__ = ["section_text"]
 
@@ -34,7 +34,7 @@ def _of_settings(section: str, remark: str) -> Callable[[Results], list[str]]:
 
 
 def _best(results: Results, section: str) -> list[str]:
-    known = {label: _metric(record, "l2_variation") for label, _, record in results.rows(section)}
+    known = {label: metric(record, "l2_variation") for label, _, record in results.rows(section)}
     errors = {label: value for label, value in known.items() if value is not None}
     if len(errors) < 2:
         return []
@@ -49,7 +49,7 @@ def _best(results: Results, section: str) -> list[str]:
 
 def _scores(record: Record | None) -> list[str]:
     forms = {"l2_variation": share, "l2": share, "cc": cc, "ssim": cc}
-    return [form(_metric(record, name)) for name, form in forms.items()]
+    return [form(metric(record, name)) for name, form in forms.items()]
 
 
 def _run(record: Record | None) -> list[str]:
@@ -78,7 +78,7 @@ def _resolution(results: Results) -> list[str]:
         if record is not None:
             try:
                 value, words = resolution_of(record)
-            except Missing:
+            except NoResult:
                 words = "not measured"
         times = f"{2 * value / pixels:.2f}" if value and pixels else NOTHING
         edge = finite((record or {}).get("resolution", {}).get("lp_per_mm")) if record else None
@@ -96,7 +96,7 @@ def _resolution(results: Results) -> list[str]:
 def _views(results: Results) -> list[str]:
     rows = [[bare(label), *_scores(record), *_run(record)[1:]] for label, _, record in results.rows("views")]
     head = ["Views", "Error of the variation", "L2", "CC", "SSIM", "Epochs", "Time"]
-    known = [(case.ring.views, _metric(record, "l2_variation")) for _, case, record in results.rows("views")]
+    known = [(case.ring.views, metric(record, "l2_variation")) for _, case, record in results.rows("views")]
     errors = [(n, value) for n, value in known if value is not None]
     text = "Phantom 2 at noise 0.1, cameras evenly over 180°; the paper has nine."
     if len(errors) > 1:
@@ -110,7 +110,7 @@ def _views(results: Results) -> list[str]:
 
 
 def _speed(results: Results) -> list[str]:
-    rivals = {m: _metric(results.cell("2", 0.0, m), "l2_variation") for m in METHODS[1:]}
+    rivals = {m: metric(results.cell("2", 0.0, m), "l2_variation") for m in METHODS[1:]}
     rows = []
     for label, _, record in results.rows("speed"):
         point = to_paper_error(record) if record else None
@@ -132,10 +132,6 @@ def _speed(results: Results) -> list[str]:
 
 def _when(record: Record | None, point: dict[str, float] | None) -> str:
     return NOTHING if record is None else "not reached" if point is None else duration(point["seconds"])
-
-
-def _metric(record: Record | None, name: str) -> float | None:
-    return None if record is None else finite(record["metrics"].get(name))
 
 
 SETTING = "Phantom 2 at noise 0.1; each run changes only this, and has the same limits of time and steps."

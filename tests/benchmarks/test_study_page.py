@@ -10,12 +10,12 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from benchmarks.study_records import ABOUT, MADE, page, pairs, results
 from nerif.report.pages import style
-from nerif.study.cases import QUICK, SECTIONS, Case, cases
-from nerif.study.page import markdown, write_page
-from nerif.study.page_html import render
-from nerif.study.plates import plates
-from study.records import ABOUT, page, pairs, results
+from study.cases import QUICK, SECTIONS, Case, cases
+from study.page import markdown, write_page
+from study.page_figures import page_figures
+from study.page_html import render
 
 NAN = re.compile(r"\bnan\b", re.IGNORECASE)
 
@@ -80,7 +80,7 @@ def test_what_is_not_there_yet_and_what_failed_show_as_such():
 def test_a_section_alone(name):
     found = [pair for pair in pairs() if name in pair[0].labels]
     text = markdown(found, {**ABOUT, "sections": (name,)})
-    assert re.findall("^## (.*)$", text, re.MULTILINE) == ["Claims", SECTIONS[name], "Left out"]
+    assert re.findall("^## (.*)$", text, re.MULTILINE) == ["Claims", SECTIONS[name], "Left out", "Made by"]
     assert not NAN.search(text)
 
 
@@ -99,7 +99,7 @@ def test_values_that_are_no_numbers_show_as_nothing():
         text = page(lambda case, v=value: {**dict.fromkeys(nothing, v), "loss": v, "epochs": v, "outcome": "diverged"})
         assert not NAN.search(text)
         assert "None" not in text
-        assert plates(results(lambda case, v=value: dict.fromkeys(nothing, v))) is not None
+        assert page_figures(results(lambda case, v=value: dict.fromkeys(nothing, v))) is not None
 
 
 def test_forward_models_show_where_they_are_known():
@@ -120,31 +120,32 @@ def test_written_page_needs_nothing_else(tmp_path):
     assert "url(" not in text
     assert not NAN.search(re.sub(r'src="[^"]*"', "", text))
     written = sorted(p.name for p in (tmp_path / "figures").iterdir())
-    assert written == sorted(f"{plate.name}.svg" for plate in plates(results()))
+    assert written == sorted(f"{spec.name}.svg" for spec in page_figures(results()))
     for picture in re.findall(r"base64,([^\"]*)", text):
         assert b"<path" in base64.b64decode(picture)
     for name in re.findall(r"\]\((figures/.*?)\)", (tmp_path / "study.md").read_text()):
         assert (tmp_path / name).is_file()
     assert not list(tmp_path.rglob("*.part"))
-    assert text.count("<h2 ") == text.count('<li><a href="#') == 1 + len(SECTIONS)
+    assert text.count("<h2 ") == text.count('<li><a href="#') == 2 + len(SECTIONS)
     assert 'class="good">✓ reproduced' in text
 
 
+@pytest.mark.slow
 def test_every_figure_is_whole():
     """Nothing beyond the edge, a unit or a count on every axis, something drawn in every panel."""
     with style(10):
-        for plate in plates(results()):
-            figure = Figure(figsize=plate.size, layout="constrained")
+        for spec in page_figures(results()):
+            figure = Figure(figsize=spec.size, layout="constrained")
             FigureCanvasAgg(figure)
-            plate.draw(figure)
+            spec.draw(figure)
             figure.canvas.draw()
             box, (width, height) = figure.get_tightbbox().extents, figure.get_size_inches()
-            assert box[0] > -0.01, plate.name
-            assert box[1] > -0.01, plate.name
-            assert box[2] < width + 0.01, plate.name
-            assert box[3] < height + 0.01, plate.name
+            assert box[0] > -0.01, spec.name
+            assert box[1] > -0.01, spec.name
+            assert box[2] < width + 0.01, spec.name
+            assert box[3] < height + 0.01, spec.name
             for axes in figure.axes:
-                assert axes.has_data() or axes.get_legend() or axes.get_label() == "<colorbar>", plate.name
+                assert axes.has_data() or axes.get_legend() or axes.get_label() == "<colorbar>", spec.name
                 for words in (axes.get_xlabel(), axes.get_ylabel()):
                     known = ("phantom", "views over 180°", "epochs (passes over all rays)")
                     assert not words or words.endswith("]") or words in known, words
@@ -153,14 +154,14 @@ def test_every_figure_is_whole():
 def test_lines_of_a_figure_can_be_told_apart():
     """No two of one panel share colour and dashes, or colour and mark."""
     with style(10):
-        for plate in plates(results()):
-            figure = Figure(figsize=plate.size, layout="constrained")
-            plate.draw(figure)
+        for spec in page_figures(results()):
+            figure = Figure(figsize=spec.size, layout="constrained")
+            spec.draw(figure)
             for axes in figure.axes:
                 drawn = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
                 looks = [(x.get_color(), x.get_linestyle(), x.get_marker(), x.get_markerfacecolor()) for x in drawn]
-                assert len(set(looks)) == len(looks), (plate.name, looks)
-                if plate.name == "speed":
+                assert len(set(looks)) == len(looks), (spec.name, looks)
+                if spec.name == "speed":
                     curves = looks[: sum(x.get_linestyle() != "None" for x in drawn)]
                     assert len({look[:2] for look in curves}) == len(curves) > 7
 
@@ -170,3 +171,20 @@ def test_a_page_of_what_is_asked_for_by_name_has_the_cases_of_it():
         asked = cases(QUICK, (name,))
         text = markdown([(case, None) for case in asked], {**ABOUT, "sections": (name,)})
         assert f"**0 of {len(asked)} reconstructions are done" in text
+
+
+def test_each_record_is_shown_with_version_date_and_machine():
+    """Reconstructions made elsewhere, or by another version, stand in a row of their own."""
+    heading = "## Made by"
+    assert rows_of(page(), heading) == [["0.1.0", "2.6.0", "2 cores", "2025-01-02", f"all {len(pairs())}"]]
+    other = {"nerif": "0.0.9", "torch": "2.5.0", "machine": "a laptop", "date": "2024-12-31"}
+    found = rows_of(page(lambda case: {"made": other} if case.key == "2-0-nerif" else {}), heading)
+    assert [*other.values(), "2-0-nerif"] in found
+    assert [row[:4] for row in found] == [list(MADE.values()), list(other.values())]
+
+
+def test_records_of_another_version_are_named_on_the_page():
+    text = page(not_used={"2-0-nerif": "0.0.9", "octahedron-tikhonov": "unknown"})
+    assert "Made by another version of nerif (0.0.9 and unknown) and so not used" in text
+    assert "2-0-nerif and octahedron-tikhonov." in text
+    assert "another version" not in page()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from nerif import __version__
 from nerif.conventions import InputError
-from nerif.geometry import Ring
+from nerif.geometry import Box, Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.landweber import Landweber
@@ -18,7 +21,21 @@ from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 
-__all__ = ["FULL", "METHODS", "NOISES", "PHANTOMS", "QUICK", "SECTIONS", "Case", "Scale", "cases", "check_sections"]
+__all__ = [
+    "BOX",
+    "FULL",
+    "METHODS",
+    "NOISES",
+    "NOISE_SEED",
+    "N_AMBIENT",
+    "PHANTOMS",
+    "QUICK",
+    "SECTIONS",
+    "Case",
+    "Scale",
+    "cases",
+    "check_sections",
+]
 
 SECTIONS = {
     "tables": "Correlation and L2 of seven phantoms at three noise levels",
@@ -39,6 +56,9 @@ SECTIONS = {
 PHANTOMS = ("1", "2", "3", "4", "5", "6", "7")
 NOISES = (0.0, 0.1, 0.15)
 METHODS = ("NeRIF", "Tikhonov", "Landweber", "TV")
+N_AMBIENT = 1.00027
+BOX = Box.cube(50.0)
+NOISE_SEED = 1
 EQUAL = ((24, 48), 10)  # samples and their jitter where intervals are equal
 
 
@@ -108,14 +128,16 @@ class Case:
 
     @property
     def data_key(self) -> str:
-        """Name of the simulated measurement without noise."""
-        return f"phantom{self.phantom}-{self.ring.views}x{self.ring.image_size[0]}-{self.ring.arc[1]:g}"
+        """Name of the simulated measurement without noise, with a hash of all that it depends on."""
+        ring = dataclasses.asdict(self.ring)
+        told = json.dumps([self.phantom, ring, dataclasses.asdict(BOX), N_AMBIENT, __version__])
+        return f"phantom{self.phantom}-{self.ring.views}views-{hashlib.sha256(told.encode()).hexdigest()[:12]}"
 
     def request(self) -> dict[str, Any]:
-        """All that the result depends on, as plain values."""
-        plain = dataclasses.asdict(self)
-        del plain["labels"]
-        return plain
+        """All that is asked for, as it reads back from JSON."""
+        plain = dataclasses.asdict(self) | {"box": dataclasses.asdict(BOX), "n_ambient": N_AMBIENT, "seed": NOISE_SEED}
+        del plain["labels"], plain["key"]
+        return dict(json.loads(json.dumps(plain)))
 
 
 def check_sections(names: tuple[str, ...]) -> tuple[str, ...]:
