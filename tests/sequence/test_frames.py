@@ -36,15 +36,15 @@ def begun(measurement: Path, out: Path, **changes: object) -> SequencePlan:
 
 
 @pytest.fixture(scope="module")
-def whole(five: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[SequencePlan, list[dict]]:
+def undisturbed(five: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[SequencePlan, list[dict]]:
     """Five frames reconstructed without disturbance, and what was told of them."""
     plan, told = begun(five, tmp_path_factory.mktemp("whole") / "whole.zarr"), []
     reconstruct_frames(plan, 0, 5, told.append)
     return plan, told
 
 
-def test_every_frame_is_written_with_what_it_came_from(whole):
-    plan, told = whole
+def test_every_frame_is_written_with_what_it_came_from(undisturbed):
+    plan, told = undisturbed
     assert [t["what"] for t in told] == ["begun", "done"] * 5
     store = SequenceStore(plan.out)
     assert (store.status == DONE).all()
@@ -61,16 +61,16 @@ def test_every_frame_is_written_with_what_it_came_from(whole):
     assert "5 of 5 frames done" in outcome_table(store)
 
 
-def test_weights_of_another_version_are_refused(whole, tmp_path):
-    copied = Path(shutil.copytree(whole[0].out, tmp_path / "r.zarr"))
+def test_weights_of_another_version_are_refused(undisturbed, tmp_path):
+    copied = Path(shutil.copytree(undisturbed[0].out, tmp_path / "r.zarr"))
     group = zarr.open_group(copied, mode="r+")
     group.attrs["network"] = {**group.attrs["network"], "gone": 0.0}
     with pytest.raises(InputError, match=r"another version of nerif \(.*gone.*reconstruct it again"):
         SequenceStore(copied).field(0)
 
 
-def test_a_warm_frame_begins_where_the_one_before_ended(whole, five):
-    plan, _ = whole
+def test_a_warm_frame_begins_where_the_one_before_ended(undisturbed, five):
+    plan, _ = undisturbed
     before = SequenceStore(plan.out).field(0)
     one = replace(COLD, max_steps=1, rate_after_fit=1e-12)
     after = one(MeasurementSequence.read(five).frame(1), start=before).field
@@ -81,7 +81,7 @@ def test_a_warm_frame_begins_where_the_one_before_ended(whole, five):
     assert float((x - y - (x - y).mean()).abs().max()) < 1e-4 * float(x.abs().max())
 
 
-def test_going_on_gives_what_an_undisturbed_run_gives(whole, short, tmp_path):
+def test_going_on_gives_what_an_undisturbed_run_gives(undisturbed, short, tmp_path):
     plan = begun(short, tmp_path / "parts.zarr")
 
     class Killed(BaseException):
@@ -97,7 +97,7 @@ def test_going_on_gives_what_an_undisturbed_run_gives(whole, short, tmp_path):
     assert store.status.tolist() == [DONE, DONE, MISSING, MISSING, MISSING]
     reconstruct_frames(plan, 0, 5)
     for i in range(5):
-        a, b = (SequenceStore(p.out).volume(i, "index_excess").values for p in (whole[0], plan))
+        a, b = (SequenceStore(p.out).volume(i, "index_excess").values for p in (undisturbed[0], plan))
         assert torch.equal(a, b)
 
 

@@ -18,6 +18,7 @@ from nerif.geometry import Box, Grid
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction import files
 from nerif.reconstruction.base import State
+from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.target import Target
@@ -275,12 +276,13 @@ def test_ambient_points_of_an_instant_lie_outside_its_own_masks(moving):
 
 
 def test_each_frame_of_a_joint_network_is_found_within_its_own_masks(moving, tmp_path):
-    plan = begun(moving, tmp_path / "r.zarr", 150, points_per_batch=2000)
+    """The ambient counts a hundredfold, so that a frame pinned where it is not ambient comes out flat."""
+    plan = begun(moving, tmp_path / "r.zarr", 150, points_per_batch=2000, weights=LossWeights(gauge=100.0))
     reconstruct_jointly(plan, 0, 2)
     store = SequenceStore(plan.out)
     for i in (0, 1):
         here, there = store.field(i)(CENTRES.float()[[i, 1 - i]]).tolist()
-        assert here < -1e-4  # of -2e-4
+        assert here < -1.2e-4  # of -2e-4
         assert abs(there) < 0.3e-4
 
 
