@@ -49,7 +49,7 @@ def undisturbed(measurement: Measurement) -> Reconstruction:
 
 
 def test_finds_the_balls_without_seeing_them(measurement, ball):
-    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=160, points_per_batch=2048)(
+    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=250, points_per_batch=2048)(
         measurement
     )
     grid = Grid.of_resolution(measurement.box, 30)
