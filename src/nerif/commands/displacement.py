@@ -10,10 +10,9 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
-from nerif.geometry import Box
-from nerif.imaging.assembly import World
+from nerif.commands.settings import Flat, Settings, read_settings
+from nerif.conventions import InputError
+from nerif.imaging.assembly import Scene
 from nerif.imaging.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, measure_instant
@@ -38,10 +37,7 @@ class Displacement(Settings):
     """Folder of the experiment."""
     calibration: Path
     """Calibrated cameras: of nerif calibrate, or any file it can take over. Names are those of the views."""
-    lower: tuple[float, float, float]
-    """Lower corner (x y z) of the box to reconstruct, mm."""
-    upper: tuple[float, float, float]
-    """Upper corner of the box, mm."""
+    scene: Annotated[Scene, Flat]
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Measurement to write, NAME.nc, and NAME.png to show the displacements; NAME.zarr with --frames."""
     views: tuple[str, ...] = ()
@@ -58,25 +54,18 @@ class Displacement(Settings):
     """Most reference pictures to read; 0 for all."""
     mask: float = 0.0
     """Flow mask (for the visual hull) where |d| exceeds this many sigma; 0 for none. 4 is a good value."""
-    n_ambient: float = 1.00027
-    """Refractive index around the flow."""
-    wavelength_nm: float = 532.0
-    """Wavelength of the light, nm."""
-    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
-    """Faces of the box on which the index is ambient."""
     force: bool = False
     """Overwrite existing files."""
-    method: Annotated[DisplacementSettings, tyro.conf.arg(name="")] = field(default_factory=DisplacementSettings)
+    method: Annotated[DisplacementSettings, Flat] = field(default_factory=DisplacementSettings)
 
     def recording(self) -> Recording:
         """Find the pictures and the cameras."""
         from nerif.imaging.importers import import_cameras
 
-        world = World(Box(self.lower, self.upper), self.n_ambient, self.wavelength_nm, self.ambient_faces)
         masks = MaskSettings(self.mask) if self.mask else None
         views = find_views(self.folder, self.views)
         cameras = {c.name: c for c in import_cameras(self.calibration)}
-        return Recording(views, cameras, world, self.method, masks, self.references)
+        return Recording(views, cameras, self.scene, self.method, masks, self.references)
 
 
 def run(settings: Displacement) -> Measurement:
@@ -131,5 +120,5 @@ def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
 def main(arguments: list[str]) -> None:
     """Parse and run."""
     missing = tyro.MISSING
-    default = Displacement(folder=missing, calibration=missing, lower=missing, upper=missing, out=missing)
+    default = Displacement(folder=missing, calibration=missing, scene=Scene(missing, missing), out=missing)
     run(read_settings(default, arguments, "displacement"))
