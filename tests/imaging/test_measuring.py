@@ -51,7 +51,7 @@ def write_experiment(folder, frames: int = 3, shift: int = 0, spot: bool = False
             path.parent.mkdir(parents=True, exist_ok=True)
             tifffile.imwrite(path, images, photometric="minisblack")
     calibrated = {c.name: CalibratedCamera.from_camera(c) for c in cameras}
-    return Recording(find_views(folder), calibrated, Scene(BOX.lower, BOX.upper))
+    return Recording(find_views(folder), calibrated, Scene(BOX))
 
 
 @pytest.fixture

@@ -12,7 +12,8 @@ import tyro
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
-from nerif.imaging.assembly import Scene
+from nerif.geometry import Box
+from nerif.imaging.assembly import Scene, Surroundings
 from nerif.imaging.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, measure_instant
@@ -37,7 +38,10 @@ class Displacement(Settings):
     """Folder of the experiment."""
     calibration: Path
     """Calibrated cameras: of nerif calibrate, or any file it can take over. Names are those of the views."""
-    scene: Annotated[Scene, Flat]
+    lower: tuple[float, float, float]
+    """Lower corner (x y z) of the box to reconstruct, mm."""
+    upper: tuple[float, float, float]
+    """Upper corner of the box, mm."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Measurement to write, NAME.nc, and NAME.png to show the displacements; NAME.zarr with --frames."""
     views: tuple[str, ...] = ()
@@ -56,16 +60,18 @@ class Displacement(Settings):
     """Flow mask (for the visual hull) where |d| exceeds this many sigma; 0 for none. 4 is a good value."""
     force: bool = False
     """Overwrite existing files."""
+    surroundings: Annotated[Surroundings, Flat] = field(default_factory=Surroundings)
     method: Annotated[DisplacementSettings, Flat] = field(default_factory=DisplacementSettings)
 
     def recording(self) -> Recording:
         """Find the pictures and the cameras."""
         from nerif.imaging.importers import import_cameras
 
+        scene = Scene(Box(self.lower, self.upper), self.surroundings)
         masks = MaskSettings(self.mask) if self.mask else None
         views = find_views(self.folder, self.views)
         cameras = {c.name: c for c in import_cameras(self.calibration)}
-        return Recording(views, cameras, self.scene, self.method, masks, self.references)
+        return Recording(views, cameras, scene, self.method, masks, self.references)
 
 
 def run(settings: Displacement) -> Measurement:
@@ -120,5 +126,5 @@ def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
 def main(arguments: list[str]) -> None:
     """Parse and run."""
     missing = tyro.MISSING
-    default = Displacement(folder=missing, calibration=missing, scene=Scene(missing, missing), out=missing)
+    default = Displacement(folder=missing, calibration=missing, lower=missing, upper=missing, out=missing)
     run(read_settings(default, arguments, "displacement"))

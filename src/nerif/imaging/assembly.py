@@ -14,19 +14,15 @@ from nerif.geometry import Box, Camera
 from nerif.imaging.displacement import DisplacementMap
 from nerif.measurement import Measurement
 
-__all__ = ["Scene", "join_views"]
+__all__ = ["Scene", "Surroundings", "join_views"]
 
 Mask = Bool[np.ndarray, "row column"]
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What a measurement holds beside its views: the volume of interest, the gas around the flow, and the light."""
+class Surroundings:
+    """The gas around the flow, and the light through it."""
 
-    lower: tuple[float, float, float]
-    """Lower corner (x y z) of the box to reconstruct, mm."""
-    upper: tuple[float, float, float]
-    """Upper corner of the box, mm."""
     n_ambient: float = 1.00027
     """Refractive index around the flow."""
     wavelength_nm: float = 532.0
@@ -34,10 +30,13 @@ class Scene:
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
     """Faces of the box on which the index is ambient."""
 
-    @property
-    def box(self) -> Box:
-        """The box to reconstruct."""
-        return Box(self.lower, self.upper)
+
+@dataclass(frozen=True)
+class Scene:
+    """What a measurement holds beside its views: the box to reconstruct, and what is around the flow."""
+
+    box: Box
+    surroundings: Surroundings = Surroundings()
 
 
 def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], scene: Scene) -> Measurement:
@@ -73,10 +72,10 @@ def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], sce
         cameras=tuple(cameras),
         displacement=stack("displacement"),
         box=scene.box,
-        n_ambient=scene.n_ambient,
+        n_ambient=scene.surroundings.n_ambient,
         sigma=stack("sigma"),
         valid=stack("valid"),
         flow_mask=stack("flow_mask") if masked else None,
-        wavelength_nm=scene.wavelength_nm,
-        ambient_faces=scene.ambient_faces,
+        wavelength_nm=scene.surroundings.wavelength_nm,
+        ambient_faces=scene.surroundings.ambient_faces,
     )
