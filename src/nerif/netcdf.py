@@ -8,12 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from nerif.conventions import InputError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["opened", "reason"]
+__all__ = ["opened", "reason", "values"]
 
 
 @contextmanager
@@ -36,7 +38,8 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected {expected}")
     try:
-        h5py.File(path, "r").close()  # h5netcdf leaves a half-made object behind where this fails
+        with h5py.File(path, "r") as file:
+            file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
         dataset = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
     except Exception as error:  # the libraries raise whatever the damage leads them to
         raise InputError(f"{path}: not a readable NetCDF-4 file, or truncated ({reason(error)})") from None
@@ -45,8 +48,23 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
             yield dataset
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-        except (OSError, RuntimeError) as error:
-            raise InputError(f"{path}: not a readable NetCDF-4 file, or truncated ({reason(error)})") from None
+
+
+def values(variable: xr.DataArray) -> np.ndarray:
+    """Read the numbers of a variable.
+
+    Raises
+    ------
+    InputError
+        If they are no numbers, or the file is damaged there.
+    """
+    try:
+        read = np.asarray(variable.values)
+    except Exception as error:  # as above
+        raise InputError(f"variable '{variable.name}': cannot be read; is the file damaged? ({reason(error)})") from None
+    if read.dtype.kind not in "fiub":
+        raise InputError(f"variable '{variable.name}': expected numbers, got {read.dtype}")
+    return read
 
 
 def reason(error: Exception) -> str:
