@@ -8,18 +8,14 @@ Ratios within one run are what counts: the machine may be shared.
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write
 from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame
@@ -31,6 +27,7 @@ from nerif.simulation import add_noise, simulate
 from nerif.volume import Volume
 
 POINTS = 8192
+PIXELS = 64
 
 
 def rate(work: Callable[[], None], points: int) -> float:
@@ -85,25 +82,22 @@ def main() -> None:
     """Run and print both tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--time-limit", type=float, default=45.0, help="seconds of training of each variant")
-    parser.add_argument("--write", type=Path)
+    add_write(parser)
     arguments = parser.parse_args()
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}",
-        "",
-        f"Network of 4 layers of 128, {POINTS} points a step, median of 7; thousand points a second.",
-        "",
-        "| | malloc as it is | freed memory kept | ratio |",
-        "|---|---|---|---|",
-    ]
+    table = Table(
+        "Choices behind the fast preset",
+        ("", "malloc as it is", "freed memory kept", "ratio"),
+        arguments.write,
+        f"\n\nNetwork of 4 layers of 128, {POINTS} points a step, median of 7; thousand points a second.",
+    )
     network = Network(NetworkShape())
     before = {k: rate(w, POINTS) for k, w in steps(network).items()} | sampling_rates(network)
     keep_freed_memory()
     after = {k: rate(w, POINTS) for k, w in steps(network).items()} | sampling_rates(network)
-    lines += [f"| {k} | {before[k]:.0f} | {after[k]:.0f} | {after[k] / before[k]:.2f} |" for k in before]
+    for k in before:
+        table.row([k, f"{before[k]:.0f}", f"{after[k]:.0f}", f"{after[k] / before[k]:.2f}"])
 
-    cameras, box = paper_rig(64)
+    cameras, box = paper_rig(PIXELS)
     flame = Flame(box)
     grid = Grid.of_resolution(box, 64)
     truth = Volume(flame.sample(grid), grid)
@@ -121,23 +115,15 @@ def main() -> None:
         "central differences alone": replace(base, weights=LossWeights(numerical=1, automatic=0)),
         "mean length of residuals (the paper's norm)": replace(base, norm="l2"),
     }
-    lines += [
-        "",
-        f"Flame, 9 views of 64 x 64, noise 0.05, {arguments.time_limit:g} s of training each:",
-        "",
-        "| | steps | L2 | L2 of variation | CC |",
-        "|---|---|---|---|---|",
-    ]
-    print("\n".join(lines), flush=True)
+    table.text(
+        "", f"Flame, 9 views of {PIXELS} x {PIXELS}, noise 0.05, {arguments.time_limit:g} s of training each:", ""
+    )
+    table.begin(("", "steps", "L2", "L2 of variation", "CC"))
     for name, settings in variants.items():
         result = settings(measurement)
         m = evaluate_volume(result.field, truth, N_AMBIENT)
         steps_done = result.history[-1]["step"]
-        lines.append(f"| {name} | {steps_done:.0f} | {m['l2']:.3%} | {m['l2_variation']:.2%} | {m['cc']:.5f} |")
-        print(lines[-1], flush=True)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        arguments.write.write_text("# Choices behind the fast preset\n\n" + "\n".join(lines) + "\n")
+        table.row([name, f"{steps_done:.0f}", f"{m['l2']:.3%}", f"{m['l2_variation']:.2%}", f"{m['cc']:.5f}"])
 
 
 if __name__ == "__main__":
