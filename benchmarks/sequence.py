@@ -32,8 +32,9 @@ from nerif.metrics import volume_errors
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
-from nerif.sequence.frames import Plan, reconstruct_frames, warm
+from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
+from nerif.sequence.plan import SequencePlan, warm
 from nerif.sequence.store import DONE, Frame, SequenceStore
 from nerif.volume_sequence import VolumeSequence
 
@@ -60,7 +61,7 @@ def run(
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
     steps, rate, joint = (changes.get(k, 0) for k in ("warm_steps", "warm_rate", "joint_steps"))
     octaves = int(changes.get("time_octaves", 3))
-    plan = Plan(
+    plan = SequencePlan(
         film,
         out,
         cold,
@@ -96,7 +97,7 @@ def run(
 def first_frame(film: Path, out: Path, cold: NeRIF, voxels: int) -> SequenceStore:
     """The frame that the warm starts begin with: from nothing."""
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
-    plan = Plan(film, out, cold, cold, voxels)
+    plan = SequencePlan(film, out, cold, cold, voxels)
     about = {"chunk": len(sequence), "hold_out": [], "settings": dataclasses.asdict(cold)}
     store = SequenceStore.begin(out, sequence, truth.grid, plan.quantities, cold.network, about)
     reconstruct_frames(plan, 0, 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings, derive
 from nerif.reconstruction.base import OnStep, Reconstruction, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
-from nerif.reconstruction.files import read_field, read_state, write_state
+from nerif.reconstruction.files import checkpoints, read_field, read_state
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.presets import preset
 from nerif.report.result import RUN
@@ -71,7 +70,8 @@ def run(settings: Reconstruct) -> Reconstruction:
         _scalars(settings) as scalars,
         progress_bar("training" if settings.method == "nerif" else "solving") as bar,
     ):
-        callbacks: list[OnStep] = [begin, bar, _checkpoints(settings), lambda _: asked[0], *scalars]  # type: ignore[list-item]
+        keep = checkpoints(settings.out, settings.checkpoint_every)
+        callbacks: list[OnStep] = [begin, bar, keep, lambda _: asked[0], *scalars]  # type: ignore[list-item]
         result = settings.reconstructor(training, compose(*callbacks), resume, start)
     say(f"{result.outcome.reason}: {result.outcome.message}")
     begin(None)
@@ -138,17 +138,6 @@ def _begin(settings: Reconstruct) -> Callable[[Step | None], None]:
         done.append(True)
 
     return prepare
-
-
-def _checkpoints(settings: Reconstruct) -> Callable[[Step], None]:
-    last = [time.monotonic()]
-
-    def write(step: Step) -> None:
-        if time.monotonic() - last[0] >= settings.checkpoint_every:
-            write_state(settings.out, step.capture())
-            last[0] = time.monotonic()
-
-    return write
 
 
 def _scalars(settings: Reconstruct) -> AbstractContextManager[list[OnStep]]:

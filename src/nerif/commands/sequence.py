@@ -20,7 +20,7 @@ from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
 from nerif.sequence.cluster import check_workers, open_cluster
-from nerif.sequence.frames import Plan, warm
+from nerif.sequence.plan import SequencePlan, warm
 from nerif.sequence.run import Progress, outcome_table, run_sequence
 from nerif.sequence.store import MISSING, SequenceStore
 from nerif.volume import QUANTITIES
@@ -113,7 +113,7 @@ def run(settings: Sequence) -> SequenceStore:
     if settings.retry:
         say(f"{store.forget_failures()} failed frames are tried again")
     cold = settings.reconstructor
-    plan = Plan(
+    plan = SequencePlan(
         measurement=settings.measurement.resolve(),
         out=settings.out.resolve(),
         cold=cold,

@@ -28,10 +28,9 @@ from pathlib import Path
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.imaging.calibration import ViewPictures
 from nerif.imaging.crop import Crop
 from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames, size_in_words
-from nerif.imaging.targets import Detection, Target
+from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
 
 __all__ = ["SOURCES", "View", "find_targets", "find_views", "good_pictures"]
 
@@ -205,10 +204,10 @@ def good_pictures(view: View, source: str, say: Callable[[str], None], most: int
 
 def find_targets(
     view: View,
-    target: Target,
+    target: CalibrationTarget,
     say: Callable[[str], None],
     on_picture: Callable[[], None] = lambda: None,
-    on_background: Target | None = None,
+    on_background: CalibrationTarget | None = None,
 ) -> ViewPictures:
     """Find the target in all pictures of a view; say which pictures were of no use.
 
