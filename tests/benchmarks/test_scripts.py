@@ -11,7 +11,7 @@ import pytest
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SMALLEST = {
     "calibration": "--views 2 --arc 20 --pixels 320 --poses 8 --backgrounds 2",
-    "choices": "--time-limit 0.5",
+    "choices": "--points 256 --pixels 12 --time-limit 3",
     "displacement": "--pixels 64 --phantom gaussians --background dots --method correlation",
     "ensemble": "--members 2 --steps 5 --phantoms gaussians --noise 0.05 --leave-one-out no",
     "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 1 --voxels 12",
