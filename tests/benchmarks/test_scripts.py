@@ -11,14 +11,14 @@ import pytest
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SMALLEST = {
     "calibration": "--views 2 --arc 20 --pixels 320 --poses 8 --backgrounds 2",
-    "choices": "--points 256 --pixels 12 --time-limit 3",
+    "choices": "--points 256 --pixels 12 --time-limit 5",
     "displacement": "--pixels 64 --phantom gaussians --background dots --method correlation",
     "ensemble": "--members 2 --steps 5 --phantoms gaussians --noise 0.05 --leave-one-out no",
-    "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 1 --voxels 12",
-    "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 1",
+    "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 5 --voxels 12",
+    "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",
     "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5 --joint 5",
     "voxel_cost": "--voxels 8 --basis linear --iterations 1 --pixels 12",
-    "warm_start": "--pixels 12 --seconds 4 --voxels 12 --fit-steps 5",
+    "warm_start": "--pixels 12 --seconds 8 --voxels 12 --fit-steps 5",
 }
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem != "bench")
 
