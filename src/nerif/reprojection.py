@@ -63,9 +63,8 @@ class Reprojection:
         about = {"units": "1", "long_name": "1 where the reconstruction has not seen it"}
         dataset["held_out"] = (("view",), held, about)
         dataset.attrs |= {"predicted_by": self.accuracy.how, "predicted_error_px": self.accuracy.error_px}
-        packed = encoding(dataset)
         with atomic(path) as part:
-            dataset.to_netcdf(part, engine="h5netcdf", encoding={**packed, "measured": packed["displacement"]})
+            dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding(dataset))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Reprojection:
