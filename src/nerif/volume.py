@@ -167,7 +167,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
         raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
     if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
-        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got numbers beyond {LARGEST_INDEX}")
+        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got some beyond {LARGEST_INDEX}")
     try:
         n_ambient = volume.n_ambient
     except InputError as error:

@@ -21,7 +21,8 @@ import numpy as np
 import tomli_w
 import xarray as xr
 
-EXTREME = (float("nan"), float("inf"), float("-inf"), 0.0, -1.0, 1e-300, 1e-30, 1e-9, 1e9, 1e30, 1e300, -1e30, 255.0, 0.5)
+EXTREME = (float("nan"), float("inf"), float("-inf"), 0.0, -1.0, 0.5, 255.0)
+EXTREME += (1e-300, 1e-30, 1e-9, 1e9, 1e30, -1e30, 1e300)
 FACTORS = (-1.0, 0.0, 1e-6, 1e-3, 0.1, 10.0, 1e3, 1e6, 1e12, 180 / np.pi)
 VALUES = (
     *EXTREME, "", "air", "x- x+", "nan", b"1.00027", True, 5, np.array([1.0, 2.0]), np.array([1.00027]), np.array([]),
@@ -128,7 +129,8 @@ def names(data: xr.Dataset, rng: random.Random) -> tuple[xr.Dataset, str]:
 
 
 STRUCTURE: tuple[Callable[[xr.Dataset, random.Random], tuple[xr.Dataset, str]], ...] = (
-    spoil_numbers, spoil_numbers, spoil_numbers, drop, transpose, rename, resize, units, types, attributes, attributes, names,
+    spoil_numbers, spoil_numbers, spoil_numbers, drop, transpose, rename, resize, units, types, attributes, attributes,
+    names,
 )  # fmt: skip
 
 
