@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.atomic import atomic
-from nerif.conventions import LARGEST_INDEX, InputError, ambient_index
+from nerif.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError, ambient_index
 from nerif.geometry import Box, Grid
 from nerif.netcdf import opened, values
 
@@ -167,7 +167,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
         raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
     if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
-        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got numbers beyond {LARGEST_INDEX}")
+        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got some beyond {LARGEST_INDEX}")
     try:
         n_ambient = volume.n_ambient
     except InputError as error:
@@ -249,6 +249,8 @@ def _ends(dataset: xr.Dataset, axis: str) -> tuple[float, float]:
     if not (isinstance(unit, str) and unit == "mm"):
         raise InputError(f"coordinate '{axis}': expected units 'mm', got '{unit}'")
     centres = values(dataset[axis]).astype(np.float64)
+    if not (np.abs(centres) <= LARGEST_LENGTH).all():
+        raise InputError(f"coordinate '{axis}': expected voxel centres in mm, got {centres.tolist()[:4]} ...")
     corners = [np.asarray(dataset.attrs.get(name)) for name in ("box_lower_mm", "box_upper_mm")]
     if len(centres) and all(c.shape == (3,) and c.dtype.kind in "fiu" for c in corners):
         lower, upper = (float(c["xyz".index(axis)]) for c in corners)
