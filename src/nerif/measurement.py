@@ -301,10 +301,14 @@ class Measurement:
         def array(name: str) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(dataset[name].values.astype(np.float64)))
 
-        def mask(name: str) -> Tensor | None:
-            return array(name) != 0 if name in dataset else None
+        def floats(name: str) -> Tensor:
+            values = dataset[name].values  # maps of a large camera are not copied
+            return torch.from_numpy(values) if values.dtype == np.float32 else array(name).float()
 
-        displacement = array("displacement").float()
+        def mask(name: str) -> Tensor | None:
+            return torch.from_numpy(np.ascontiguousarray(dataset[name].values != 0)) if name in dataset else None
+
+        displacement = floats("displacement")
         views = displacement.shape[0]
         names = [str(n) for n in dataset["view"].values] if "view" in dataset.coords else [str(i) for i in range(views)]
         sizes = dataset["image_size"].values if "image_size" in dataset else [displacement.shape[1:3]] * views
@@ -339,7 +343,7 @@ class Measurement:
             displacement=displacement,
             box=box,
             n_ambient=float(dataset.attrs["n_ambient"]),
-            sigma=array("sigma").float() if "sigma" in dataset else None,
+            sigma=floats("sigma") if "sigma" in dataset else None,
             valid=mask("valid"),
             flow_mask=mask("flow_mask"),
             wavelength_nm=None if wavelength is None else float(wavelength),

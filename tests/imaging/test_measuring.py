@@ -1,4 +1,4 @@
-"""From the folders of an experiment to measurements, in Python: what is left out, what is masked, how often files are read."""
+"""From the folders of an experiment to measurements, in Python: what is left out or masked, how often files are read."""
 
 from __future__ import annotations
 
@@ -155,11 +155,14 @@ def test_a_film_is_opened_once_and_each_page_read_once(tmp_path, monkeypatch):
 
 def test_a_view_is_measured_without_opening_its_files_again(recording, monkeypatch):
     resting = RestingView.of(recording, recording.views[0])
-    opens: list[str] = []
+    opens = []
     tiff = tifffile.TiffFile.__init__
-    monkeypatch.setattr(
-        tifffile.TiffFile, "__init__", lambda self, file, *a, **k: (opens.append(file.name), tiff(self, file, *a, **k))[1]
-    )
+
+    def counting_open(self, file, *args, **kwargs):
+        opens.append(file.name)
+        tiff(self, file, *args, **kwargs)
+
+    monkeypatch.setattr(tifffile.TiffFile, "__init__", counting_open)
     for number in range(3):
         resting.measure([number])
     assert not opens

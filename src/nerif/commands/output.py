@@ -85,9 +85,10 @@ def interruptible() -> Iterator[list[bool]]:
 def counting_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a bar that goes away when done: a callable that is told how many of `total` are."""
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import MofNCompleteColumn, Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())  # title, bar, percent, time left; m/n
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
 
