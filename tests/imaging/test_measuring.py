@@ -1,4 +1,4 @@
-"""From the folders of an experiment to measurements, in Python: what is left out or masked, how often files are read."""
+"""From the folders of an experiment to measurements, in Python: what is left out, masked, and how often files are read."""
 
 from __future__ import annotations
 
