@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
 from nerif.geometry import Box
 from nerif.imaging.assembly import World
@@ -26,7 +26,7 @@ __all__ = ["Displacement", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Displacement:
+class Displacement(Settings):
     """Find the displacements of all views and write them, with the calibration, as a measurement.
 
     FOLDER has a folder for each view with VIEW/reference (pictures without flow; with three or more, the noise is taken
@@ -66,8 +66,6 @@ class Displacement:
     """Faces of the box on which the index is ambient."""
     force: bool = False
     """Overwrite existing files."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     method: Annotated[DisplacementSettings, tyro.conf.arg(name="")] = field(default_factory=DisplacementSettings)
 
     def recording(self) -> Recording:
@@ -134,7 +132,4 @@ def main(arguments: list[str]) -> None:
     """Parse and run."""
     missing = tyro.MISSING
     default = Displacement(folder=missing, calibration=missing, lower=missing, upper=missing, out=missing)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif displacement", Displacement.__doc__ or ""))
+    run(read_settings(default, arguments, "displacement"))

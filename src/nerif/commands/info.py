@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,17 +9,19 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
-from nerif.measurement import CONVENTIONS, Measurement
-from nerif.reconstruction.files import read_field
+from nerif.measurement import Measurement
+from nerif.measurement_file import CONVENTIONS
+from nerif.netcdf import opened
+from nerif.result import METRICS, ResultDirectory
 from nerif.volume import Volume, read_volume
 
 __all__ = ["Info", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Info:
+class Info(Settings):
     """Print what a measurement, a volume or a result directory holds."""
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -40,13 +41,11 @@ def run(settings: Info) -> None:
 
 def _is_measurement(path: Path) -> bool:
     """A volume says CF, a measurement BOST; what says nothing is left to the stricter reader."""
-    import xarray as xr
-
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as dataset:
+        with opened(path, "a measurement or a volume") as dataset:
             said = dataset.attrs.get("Conventions") == CONVENTIONS or "displacement" in dataset
             return said or not {"x", "y", "z"} <= set(dataset.coords)
-    except (OSError, ValueError, KeyError):
+    except InputError:
         return True
 
 
@@ -64,7 +63,7 @@ def _measurement(path: Path, m: Measurement) -> None:
     noise = "unknown" if sigma is None else f"rms {float(sigma.square().mean().sqrt()):.4g} px"
     rms = float(d.square().mean().sqrt())
     say(f"  rays           {len(rays)} cross the box; rms displacement {rms:.4g} px; sigma {noise}")
-    say(f"  masked         {m.bad_pixels} pixels with NaN or infinite displacement")
+    say(f"  masked         {m.bad_pixels} pixels whose displacement or sigma is NaN, infinite or impossible")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
     say("  view            size [px]      f [px]   centre to camera [mm]   to background [mm]   usable   rms [px]")
     usable = m.usable
@@ -94,18 +93,15 @@ def _volume(path: Path, v: Volume) -> None:
 
 
 def _result(path: Path) -> None:
-    _, box, n_ambient = read_field(path)
+    directory = ResultDirectory(path)
+    _, box, n_ambient = directory.field()
     say(f"{path}: reconstruction")
     say(f"  box            {_corners(box.lower, box.upper)}")
     say(f"  n_ambient      {n_ambient:.8g}")
-    file = path / "metrics.json"
-    if not file.is_file():
-        say("  metrics.json is missing; the run may not have ended")
+    if not directory.has(METRICS):
+        say(f"  {METRICS} is missing; the run may not have ended")
         return
-    try:
-        metrics = json.loads(file.read_text())
-    except ValueError:
-        raise InputError(f"{file}: not a JSON file, or truncated") from None
+    metrics = directory.metrics()
     for name, value in metrics.items():
         if not isinstance(value, list):
             say(f"  {name:<18} {value}")
@@ -116,4 +112,4 @@ def _result(path: Path) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Info(tyro.MISSING), arguments, "nerif info", Info.__doc__ or ""))
+    run(read_settings(Info(tyro.MISSING), arguments, "info"))

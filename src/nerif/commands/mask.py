@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Grid
 from nerif.imaging.masks import MaskSettings, drawn_masks, with_flow_masks
@@ -20,7 +20,7 @@ __all__ = ["Mask", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Mask:
+class Mask(Settings):
     """Put flow masks into a measurement: by threshold on |d| / sigma, or drawn; tells what hull they leave.
 
     Where a pixel is not valid nothing is known, so flow may be there: it is inside the mask.
@@ -38,8 +38,6 @@ class Mask:
     """Take the masks out instead."""
     force: bool = False
     """Overwrite existing files."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     masks: Annotated[MaskSettings, tyro.conf.arg(name="")] = field(default_factory=MaskSettings)
 
 
@@ -75,8 +73,4 @@ def run(settings: Mask) -> Measurement:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Mask(measurement=tyro.MISSING, out=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif mask", Mask.__doc__ or ""))
+    run(read_settings(Mask(measurement=tyro.MISSING, out=tyro.MISSING), arguments, "mask"))

@@ -30,13 +30,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.conventions import InputError
-from nerif.imaging.calibration import ViewPictures
 from nerif.imaging.crop import Crop
 from nerif.imaging.exposure import check_exposure, full_scale
 from nerif.imaging.frames import Frames, read_each, size_in_words
 from nerif.imaging.masks import read_mask
 from nerif.imaging.readers import open_frames
-from nerif.imaging.targets import Detection, Target
+from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
 
 __all__ = ["SOURCES", "Pictures", "View", "find_targets", "find_views", "good_pictures"]
 
@@ -246,10 +245,10 @@ def good_pictures(view: View, source: str, say: Callable[[str], None], most: int
 
 def find_targets(
     view: View,
-    target: Target,
+    target: CalibrationTarget,
     say: Callable[[str], None],
     on_picture: Callable[[], None] = lambda: None,
-    on_background: Target | None = None,
+    on_background: CalibrationTarget | None = None,
 ) -> ViewPictures:
     """Find the target in all pictures of a view; say which pictures were of no use.
 
