@@ -11,8 +11,6 @@ process, and the largest sum over all processes at one moment.
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -23,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 import tifffile
-from flame import machine
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from bench import Table, add_write
 from nerif.geometry import Camera, Ring
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 
@@ -94,7 +92,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--references", type=int, default=5)
     parser.add_argument("--folder", type=Path, help="where to keep pictures and results; a temporary one if left out")
-    parser.add_argument("--write", type=Path)
+    add_write(parser)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.folder or Path(temporary)
@@ -106,21 +104,11 @@ def main() -> None:
             "mask": [measured, "-o", masked, "--force"],
             "check": [masked],
         }
-        rows = []
+        size = f"{given.views} views of {given.pixels} x {given.pixels} px, {given.references} reference pictures each"
+        table = Table("Pictures of full size", COLUMNS, given.write, f"; {size}")
         for verb, words in commands.items():
             seconds, largest, together, code = run([verb, *words])
-            rows.append(f"| {verb} | {seconds:.0f} | {largest:.2f} | {together:.2f} | {code} |")
-            print(rows[-1], flush=True)
-    lines = [
-        "# Pictures of full size", "",
-        f"{given.views} views of {given.pixels} x {given.pixels} px, {given.references} reference pictures each.", "",
-        f"Command: `python {shlex.join(sys.argv)}`  ", f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}", "",
-        f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS), *rows,
-    ]  # fmt: skip
-    print("\n".join(lines))
-    if given.write:
-        given.write.write_text("\n".join(lines) + "\n")
+            table.row((verb, f"{seconds:.0f}", f"{largest:.2f}", f"{together:.2f}", str(code)))
 
 
 if __name__ == "__main__":
