@@ -73,8 +73,9 @@ def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[...,
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 
+    console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())  # title, bar, percent, time left; m/n
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=total)
 
         def update(done: int, of: int | None = None) -> None:
