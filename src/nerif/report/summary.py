@@ -244,10 +244,14 @@ def _of_held_out(result: Result) -> list[Statement]:
 
 def _of_residual(result: Result) -> list[Statement]:
     seen = _views(result, False)
+    if not seen:
+        text = "No training view was compared, so there is no telling whether what the field leaves unexplained is noise."
+        remedy = "nerif evaluate --measurement FILE compares the views of the reconstruction."
+        return [Statement("note", f"{text} {remedy}")] if _views(result, True) else []
     known = [v for v in seen if v.get("rms_over_sigma") is not None]
     if not known:
-        text = "The noise of the measurement is not known, so it cannot be told whether the residual is noise."
-        return [Statement("note", f"{text} nerif displacement writes sigma.")] if seen else []
+        text = "The noise of the measurement is not known, so there is no telling whether the residual is noise."
+        return [Statement("note", f"{text} nerif displacement writes sigma.")]
     lowest, highest = (f(known, key=lambda v: v["rms_over_sigma"]) for f in (min, max))
     low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
     found = []
