@@ -14,6 +14,8 @@ SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 LAYERS = (
     ("atomic", "conventions"),
     ("geometry",),
+    ("drawing",),
+    ("notebook",),
     ("measurement", "measurement_sequence", "volume", "volume_sequence", "vti", "reprojection"),
     ("imaging",),
     ("fields",),

@@ -214,6 +214,37 @@ class Measurement:
             flow_mask=pick(self.flow_mask),
         )
 
+    def summary(self, held_out: int = 0) -> list[tuple[str, str]]:
+        """Return what was measured as names and values with units; `held_out` of the views were not used."""
+        from nerif.notebook import number
+
+        def rms(values: Tensor) -> str:
+            return number(float(values.square().mean().sqrt()), 3)
+
+        sizes = sorted({c.image_size for c in self.cameras})
+        held = f", of which {held_out} held out" if held_out else ""
+        usable = self.usable
+        d = self.displacement[usable]
+        inside = sum(height * width for height, width in (c.image_size for c in self.cameras))
+        light = f" at {self.wavelength_nm:g} nm" if self.wavelength_nm else ""
+        return [
+            ("Views", f"{len(self.cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
+            ("Displacement", f"rms {rms(d)} px, up to {number(float(d.abs().max()), 3)} px"),
+            ("Noise σ", "not known" if self.sigma is None else f"rms {rms(self.sigma[usable])} px"),
+            ("Usable pixels", f"{float(usable.sum()) / inside:.1%}"),
+            ("Volume", " × ".join(f"{e:g}" for e in self.box.edges) + " mm (x, y, z)"),
+            ("Ambient index", f"{self.n_ambient:.7g}{light}"),
+        ]
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: u and v of the views, and the summary."""
+        from nerif.notebook import panel, show_views
+
+        shown = torch.where(self.usable[..., None], self.displacement, torch.nan).numpy()
+        maps = [d[: c.image_size[0], : c.image_size[1]] for d, c in zip(shown, self.cameras, strict=True)]
+        picture = show_views(self.names, maps)
+        return panel("Measurement", self.summary(), picture, "Displacement u and v of each view, in px")
+
     # -- files ---------------------------------------------------------------------------------------------------
 
     def write(self, path: str | os.PathLike[str]) -> None:

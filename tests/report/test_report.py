@@ -14,11 +14,12 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views
 from nerif.geometry import Box, Grid
+from nerif.notebook import number
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import html, packing
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.result import Result, read_result
-from nerif.report.summary import headline, number, trust
+from nerif.report.summary import headline, trust
 from nerif.report.view_images import _shrink, view_images
 from nerif.reprojection import Reprojection
 from nerif.volume import Volume

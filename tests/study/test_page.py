@@ -10,7 +10,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from nerif.report.pages import style
+from nerif.drawing import style
 from nerif.study.cases import QUICK, SECTIONS, Case, cases
 from nerif.study.page import markdown, write_page
 from nerif.study.page_html import render

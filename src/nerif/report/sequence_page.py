@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerif.conventions import InputError
+from nerif.drawing import COLOUR_MAPS, colour_range
+from nerif.notebook import number
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import packing
-from nerif.report.figures import COLOUR_MAPS, colour_range
 from nerif.report.html import QUANTITIES, flat, render_page, svg
 from nerif.report.isosurface import default_level
 from nerif.report.movie import frames_there
-from nerif.report.summary import Statement, number
+from nerif.report.summary import Statement
 from nerif.report.view_images import colour_table
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerif.report.figures import DIVERGING
+from nerif.drawing import DIVERGING
 from nerif.reprojection import Reprojection
 
 __all__ = ["ViewImages", "colour_table", "view_images"]

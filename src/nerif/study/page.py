@@ -163,7 +163,7 @@ def _svg(plate: Plate) -> bytes:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    from nerif.report.pages import style
+    from nerif.drawing import style
 
     with style(size=10), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": plate.name}):
         figure = Figure(figsize=plate.size, layout="constrained")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nerif.report.figures import COLOURS
+from nerif.drawing import COLOURS
 from nerif.study.cases import METHODS, NOISES, PHANTOMS, SECTIONS
 from nerif.study.figures import (
     Line,

@@ -38,10 +38,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError
+from nerif.drawing import COLOURS, colour_range
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Camera
-from nerif.report.figures import COLOURS, colour_range
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from nerif.report.summary import number
+from nerif.notebook import number
 from nerif.study import tables
 from nerif.study.cases import METHODS, SECTIONS
 from nerif.study.claims_of_method import MARGIN, resolution_of, to_paper_error
