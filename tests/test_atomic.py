@@ -21,9 +21,14 @@ def test_a_file_takes_its_name_at_the_end_and_keeps_its_ending(tmp_path):
 def test_an_error_leaves_what_was_there_and_no_part(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text("old")
-    with pytest.raises(RuntimeError), atomic(path) as part:
-        part.write_text("half")
-        raise RuntimeError
+
+    def fails() -> None:
+        with atomic(path) as part:
+            part.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fails()
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["a.toml"]
 

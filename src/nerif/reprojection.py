@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -12,7 +11,8 @@ from torch import Tensor
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
-from nerif.measurement import VARIABLES, Measurement
+from nerif.measurement import Measurement
+from nerif.measurement_file import VARIABLES
 
 __all__ = ["REPROJECTION", "Reprojection"]
 

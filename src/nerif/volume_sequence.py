@@ -92,9 +92,11 @@ class VolumeSequence:
         with atomic(path) as part:
             fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=3)
             group = zarr.open_group(part, mode="r+")
-            for name in quantities:
-                unit, meaning = describe(name)
-                add_frames(group, name, len(times), grid.shape, ("z", "y", "x"), "float32", units=unit, long_name=meaning)
+            for quantity in quantities:
+                unit, name = describe(quantity)
+                add_frames(
+                    group, quantity, len(times), grid.shape, ("z", "y", "x"), "float32", units=unit, long_name=name
+                )
         return cls(path)
 
     def array(self, name: str) -> Any:  # zarr's own types do not know what an index gives

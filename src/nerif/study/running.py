@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from nerif.atomic import atomic
 from nerif.evaluation import evaluate_volume, write_json
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
