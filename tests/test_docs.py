@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = (
-    "index", "tutorial", "images", "sequences", "choosing", "limits", "conventions", "method", "formats", "benchmarks",
+    "index", "tutorial", "images", "sequences", "python", "contributing", "choosing", "limits", "conventions", "method", "formats", "benchmarks",
     "api", "architecture", "changelog", "api/geometry", "api/reconstruction",
     "repository/benchmarks/results/methods-cpu", "repository/examples/own_data",
 )  # fmt: skip
@@ -107,3 +107,16 @@ def test_links_of_a_page_lead_somewhere_on_a_forge_too(page: str) -> None:
         if not re.match(r"[a-z]+:", link):
             file = link.split("#")[0]
             assert not file or (ROOT / "docs" / file).exists(), link
+
+
+def test_the_page_of_python_runs(tmp_path: Path) -> None:
+    """Every block in order, in one namespace, as in a notebook."""
+    page = (ROOT / "docs" / "python.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    assert len(blocks) >= 8
+    told = "\nassert scores['cc'] > 0.9, scores\nassert views[3]['cc'] > 0.8, views\n"
+    script = tmp_path / "page.py"
+    script.write_text("\n".join(blocks) + told)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"page.py", "flame.nc", "flame.vti", "flame_volume.nc"}
