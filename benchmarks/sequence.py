@@ -36,9 +36,11 @@ from nerif.metrics import volume_errors
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
-from nerif.sequence.frames import Plan, reconstruct_frames, warm
+from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
+from nerif.sequence.plan import SequencePlan, warm
 from nerif.sequence.store import DONE, Frame, SequenceStore
+from nerif.simulation import Simulation
 from nerif.volume_sequence import VolumeSequence
 
 
@@ -57,7 +59,8 @@ def film(folder: Path, views: int, frames: int, pixels: int, interval: float, no
     ring = Ring(views=views, image_size=(pixels, pixels), pixel_pitch=0.02 * 200 / pixels)
     times = f"0:{(frames - 1) * interval}:{frames}"
     assert len(instants(times)) == frames
-    simulate(Simulate(out=out, phantom="flame", times=times, noise=noise, truth_voxels=voxels, ring=ring))
+    simulation = Simulation(noise=noise, truth_voxels=voxels)
+    simulate(Simulate(out=out, times=times, simulation=simulation, ring=ring))
     return out
 
 
@@ -68,7 +71,7 @@ def run(
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
     steps, rate, joint = (changes.get(k, 0) for k in ("warm_steps", "warm_rate", "joint_steps"))
     octaves = int(changes.get("time_octaves", 3))
-    plan = Plan(
+    plan = SequencePlan(
         film,
         out,
         cold,
@@ -103,7 +106,7 @@ def run(
 def first_frame(film: Path, out: Path, cold: NeRIF, voxels: int) -> SequenceStore:
     """The frame that the warm starts begin with: from nothing."""
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
-    plan = Plan(film, out, cold, cold, voxels)
+    plan = SequencePlan(film, out, cold, cold, voxels)
     about = {"chunk": len(sequence), "hold_out": [], "settings": dataclasses.asdict(cold)}
     store = SequenceStore.begin(out, sequence, truth.grid, plan.quantities, cold.network, about)
     reconstruct_frames(plan, 0, 1)

@@ -12,20 +12,23 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions"),
+    ("atomic", "conventions", "netcdf"),
     ("geometry",),
     ("drawing",),
     ("notebook",),
-    ("measurement", "measurement_sequence", "volume", "volume_sequence", "vti", "reprojection"),
+    ("measurement_file", "measurement", "measurement_sequence"),
+    ("volume", "volume_sequence", "vti", "exports", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),
-    ("metrics", "simulation", "rendering"),
+    ("metrics", "resolution", "simulation", "rendering"),
     ("experiment",),
     ("reconstruction",),
-    ("evaluation", "consistency", "mistakes"),
+    ("result", "monitor"),
+    ("prediction", "evaluation", "consistency", "mistakes"),
+    ("members",),
     ("report", "sequence"),
-    ("study",),
+    ("workflow",),
     ("commands",),
     ("cli", "__main__"),
 )

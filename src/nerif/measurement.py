@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -156,11 +157,11 @@ class Measurement:
             mask[i, : camera.image_size[0], : camera.image_size[1]] = True
         return mask
 
-    @property
+    @cached_property
     def sees_box(self) -> Bool[Tensor, "view row column"]:
         """Pixels whose rays cross the box on the way to the background."""
         mask = self._inside
-        for _ in self._crossing(mask):
+        for _ in self._crossing(mask, sensitivity=False):
             pass
         return mask
 
@@ -170,7 +171,7 @@ class Measurement:
         rays = Rays.collect(self._crossing(mask), int(mask.sum()))
         return rays, self.displacement[mask].float(), None if self.sigma is None else self.sigma[mask].float()
 
-    def _crossing(self, mask: Bool[Tensor, "view row column"]) -> Iterator[Rays]:
+    def _crossing(self, mask: Bool[Tensor, "view row column"], sensitivity: bool = True) -> Iterator[Rays]:
         """Trace the pixels of a mask, some at a time, and clear those whose ray does not cross the box.
 
         Rays are made in double precision: cameras stand far off, and positions lose digits in single precision.
@@ -181,7 +182,7 @@ class Measurement:
                 block = wanted[first : first + rows]  # a view, through which the mask is changed
                 row, column = block.nonzero().unbind(-1)
                 pixels = torch.stack([column, row + first], dim=-1).to(camera.intrinsics.dtype)
-                rays = camera.rays(pixels).clip(self.box)
+                rays = camera.rays(pixels, sensitivity).clip(self.box)
                 keep = rays.crosses & (rays.background > rays.far)
                 block[row, column] = keep
                 yield rays[keep]
@@ -219,30 +220,37 @@ class Measurement:
         """Return what was measured as names and values with units; `held_out` of the views were not used."""
         from nerif.notebook import number
 
-        def rms(values: Tensor) -> str:
-            return number(float(values.square().mean().sqrt()), 3)
-
-        sizes = sorted({c.image_size for c in self.cameras})
-        held = f", of which {held_out} held out" if held_out else ""
         usable = self.usable
-        d = self.displacement[usable]
+        count = max(int(usable.sum()), 1)
+        squares, noise, largest = 0.0, 0.0, 0.0
+        for i, mask in enumerate(usable):  # view by view: pictures may be large
+            d = self.displacement[i][mask].double()
+            squares, largest = squares + float(d.square().sum()), max(largest, float(d.abs().max()))
+            if self.sigma is not None:
+                noise += float(self.sigma[i][mask].double().square().sum())
+        rms, sigma = (number((total / (2 * count)) ** 0.5, 3) for total in (squares, noise))
+        sizes = sorted({c.image_size for c in self.cameras})
         inside = sum(height * width for height, width in (c.image_size for c in self.cameras))
+        held = f", of which {held_out} held out" if held_out else ""
         light = f" at {self.wavelength_nm:g} nm" if self.wavelength_nm else ""
         return [
             ("Views", f"{len(self.cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
-            ("Displacement", f"rms {rms(d)} px, up to {number(float(d.abs().max()), 3)} px"),
-            ("Noise σ", "not known" if self.sigma is None else f"rms {rms(self.sigma[usable])} px"),
-            ("Usable pixels", f"{float(usable.sum()) / inside:.1%}"),
+            ("Displacement", f"rms {rms} px, up to {number(largest, 3)} px"),
+            ("Noise σ", "not known" if self.sigma is None else f"rms {sigma} px"),
+            ("Usable pixels", f"{count / inside:.1%}"),
             ("Volume", " × ".join(f"{e:g}" for e in self.box.edges) + " mm (x, y, z)"),
             ("Ambient index", f"{self.n_ambient:.7g}{light}"),
         ]
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: u and v of the views, and the summary."""
-        from nerif.notebook import panel, show_views
+        from nerif.notebook import PIXELS, panel, show_views
 
-        shown = torch.where(self.usable[..., None], self.displacement, torch.nan).numpy()
-        maps = [d[: c.image_size[0], : c.image_size[1]] for d, c in zip(shown, self.cameras, strict=True)]
+        maps, usable = [], self.usable
+        for i, (height, width) in enumerate(c.image_size for c in self.cameras):
+            step = -(-max(height, width) // PIXELS)
+            part = i, slice(0, height, step), slice(0, width, step)
+            maps.append(torch.where(usable[part][..., None], self.displacement[part], torch.nan).numpy())
         picture = show_views(self.names, maps)
         return panel("Measurement", self.summary(), picture, "Displacement u and v of each view, in px")
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["number", "panel", "percent", "png", "show_slices", "show_views", "span"]
 
 VIEWS = 9  # that are drawn: of more, as many, evenly spread
-PIXELS = 120  # along an edge of a view as it is drawn
+PIXELS = 120  # along an edge of a view, beyond which nothing more is seen
 
 
 def number(value: object, digits: int = 4) -> str:
@@ -104,9 +104,8 @@ def show_views(names: Sequence[str], maps: Sequence[Float[np.ndarray, "row colum
     def draw(figure: Figure) -> None:
         grid = figure.subplots(2, len(chosen), squeeze=False)
         for column, view in enumerate(chosen):
-            step = -(-max(maps[view].shape[:2]) // PIXELS)
             for row, component in enumerate("uv"):
-                axes = draw_displacement(grid[row, column], maps[view][::step, ::step, row], limit)
+                axes = draw_displacement(grid[row, column], maps[view][..., row], limit)
                 axes.set(xticks=[], yticks=[], xlabel="", ylabel="" if column else component)
             grid[0, column].set_title(names[view], parse_math=False)
         add_colour_bar(list(grid.ravel()), "displacement [px]")

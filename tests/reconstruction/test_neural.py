@@ -14,8 +14,10 @@ from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
-from nerif.reconstruction import neural
+from nerif.reconstruction import training
+from nerif.reconstruction.base import Step
 from nerif.reconstruction.files import read_state, write_state
+from nerif.reconstruction.gauge import AmbientRegion
 from nerif.reconstruction.losses import LossWeights, numerical_displacement
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
@@ -94,7 +96,7 @@ def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(
 def test_resumed_run_equals_one_that_was_not_interrupted(measurement, tmp_path):
     whole = SMALL(measurement)
 
-    def stop_at_13(step: neural.Step) -> bool:
+    def stop_at_13(step: Step) -> bool:
         return step.step == 13
 
     first = SMALL(measurement, on_step=stop_at_13)
@@ -116,15 +118,15 @@ def test_same_seed_same_result_other_seed_another(measurement):
 
 
 def test_non_finite_loss_goes_back_to_the_last_good_state(measurement, monkeypatch):
-    real, calls = neural.loss_terms, []
+    real, calls = training.loss_terms, []
 
     def poisoned(*args, **kwargs):
         calls.append(1)
         terms = real(*args, **kwargs)
         return {k: v * float("nan") for k, v in terms.items()} if len(calls) == 15 else terms
 
-    monkeypatch.setattr(neural, "loss_terms", poisoned)
-    monkeypatch.setattr(neural, "KEEP_EVERY", 10)
+    monkeypatch.setattr(training, "loss_terms", poisoned)
+    monkeypatch.setattr(training, "KEEP_EVERY", 10)
     result = SMALL(measurement)
     assert result.outcome.reason == "steps"
     assert sum("taken_back" in record for record in result.history) == 1
@@ -133,15 +135,15 @@ def test_non_finite_loss_goes_back_to_the_last_good_state(measurement, monkeypat
 
 
 def test_loss_that_stays_non_finite_ends_with_the_last_good_state(measurement, monkeypatch):
-    real, calls = neural.loss_terms, []
+    real, calls = training.loss_terms, []
 
     def poisoned(*args, **kwargs):
         calls.append(1)
         terms = real(*args, **kwargs)
         return {k: v * float("nan") for k, v in terms.items()} if len(calls) > 15 else terms
 
-    monkeypatch.setattr(neural, "loss_terms", poisoned)
-    monkeypatch.setattr(neural, "KEEP_EVERY", 10)
+    monkeypatch.setattr(training, "loss_terms", poisoned)
+    monkeypatch.setattr(training, "KEEP_EVERY", 10)
     result = SMALL(measurement)
     assert result.outcome.reason == "diverged"
     assert "step 10" in result.outcome.message
@@ -192,7 +194,7 @@ def test_masks_widen_the_ambient_region(measurement, ball):
     moving = (measurement.displacement.norm(dim=-1) > 0.01).float()[:, None]
     mask = torch.nn.functional.max_pool2d(moving, 3, 1, 1)[:, 0] > 0
     masked = replace(measurement, flow_mask=mask)
-    region = neural.AmbientRegion.of(masked, ())
+    region = AmbientRegion.of(masked, ())
     points = region.sample(400, torch.Generator().manual_seed(0))
     assert len(points) == 400
     inside = ball(points.double()).abs() > 0.5 * 2e-4

@@ -7,7 +7,7 @@ import torch
 
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box, Rays
-from nerif.reconstruction.sampling import BINS, EVEN, Guide, sample_count, sample_rays
+from nerif.reconstruction.sampling import BINS, EVEN, SamplingDensity, sample_count, sample_rays
 
 BOX = Box((-10.0, -10.0, -10.0), (10.0, 10.0, 10.0))
 
@@ -33,13 +33,13 @@ class Peak:
 
 
 @pytest.fixture
-def guide() -> Guide:
-    guide = Guide(NeuralField(Network(NetworkShape(depth=1, width=4, octaves=0)), BOX, 1e-4))
+def guide() -> SamplingDensity:
+    guide = SamplingDensity(NeuralField(Network(NetworkShape(depth=1, width=4, octaves=0)), BOX, 1e-4))
     guide.update(Peak())
     return guide
 
 
-def integral(sampling: str, seed: int, guide: Guide | None = None, count: int = 12) -> torch.Tensor:
+def integral(sampling: str, seed: int, guide: SamplingDensity | None = None, count: int = 12) -> torch.Tensor:
     """Of the layer's slope along each ray; 2 by the closed form."""
     r = rays()
     s, interval = sample_rays(r, count, torch.Generator().manual_seed(seed), sampling, guide)
@@ -61,7 +61,7 @@ def test_adaptive_samples_scatter_least(guide):
 
 
 def test_the_density_follows_the_layer_and_keeps_some_samples_everywhere(guide):
-    density = guide.density(rays())
+    density = guide.along(rays())
     assert density.shape == (400, BINS)
     torch.testing.assert_close(density.mean(1), torch.ones(400))
     assert float(density.min()) >= EVEN * 0.99
@@ -82,7 +82,7 @@ def test_intervals_fill_the_ray(guide):
 
 
 def test_a_guide_that_knows_nothing_changes_nothing():
-    blank = Guide(NeuralField(Network(NetworkShape(depth=1, width=4, octaves=0)), BOX, 1e-4))
+    blank = SamplingDensity(NeuralField(Network(NetworkShape(depth=1, width=4, octaves=0)), BOX, 1e-4))
     a = sample_rays(rays(), 12, torch.Generator().manual_seed(2), "adaptive", blank)
     b = sample_rays(rays(), 12, torch.Generator().manual_seed(2), "shifted")
     assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
@@ -93,9 +93,9 @@ def test_a_field_of_nothing_is_sampled_evenly():
         def value_and_gradient(self, p, heads):
             return p[:, 0] * 0, p * 0, None
 
-    guide = Guide(NeuralField(Network(NetworkShape(depth=1, width=4, octaves=0)), BOX, 1e-4))
+    guide = SamplingDensity(NeuralField(Network(NetworkShape(depth=1, width=4, octaves=0)), BOX, 1e-4))
     guide.update(Nothing())
-    torch.testing.assert_close(guide.density(rays()), torch.ones(400, BINS))
+    torch.testing.assert_close(guide.along(rays()), torch.ones(400, BINS))
 
 
 def test_counts_grow_and_stay_within_the_jitter():

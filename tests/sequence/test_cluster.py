@@ -169,13 +169,13 @@ def _plan(film: Path, out: Path):
     from dataclasses import replace
 
     from nerif.geometry import Grid
-    from nerif.sequence.frames import Plan
+    from nerif.sequence.plan import SequencePlan
     from sequence.test_frames import COLD
 
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.first_good().box, 10)
     SequenceStore.begin(out, sequence, grid, ("index_excess",), COLD.network, {})
-    return Plan(film, out, COLD, replace(COLD, max_steps=10), 10, ("index_excess",), threads=1)
+    return SequencePlan(film, out, COLD, replace(COLD, max_steps=10), 10, ("index_excess",), threads=1)
 
 
 def test_a_scheduler_that_is_there_already_is_used(film, tmp_path):

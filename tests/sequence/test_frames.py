@@ -18,7 +18,8 @@ from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence import frames
-from nerif.sequence.frames import Plan, reconstruct_frames
+from nerif.sequence.frames import reconstruct_frames
+from nerif.sequence.plan import SequencePlan
 from nerif.sequence.run import chunks_of, outcome_table
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 from sequence.films import blank
@@ -29,11 +30,10 @@ COLD = NeRIF(
 )  # fmt: skip
 
 
-def begun(measurement: Path, out: Path, **changes: object) -> Plan:
+def begun(measurement: Path, out: Path, **changes: object) -> SequencePlan:
     """A plan, and its store with every frame missing."""
-    plan = replace(
-        Plan(measurement, out, COLD, replace(COLD, max_steps=15), 10, ("index_excess", "temperature")), **changes
-    )
+    quantities = ("index_excess", "temperature")
+    plan = replace(SequencePlan(measurement, out, COLD, replace(COLD, max_steps=15), 10, quantities), **changes)
     sequence = MeasurementSequence.read(measurement)
     grid = Grid.of_resolution(sequence.first_good().box, plan.voxels)
     about = {"hold_out": list(plan.hold_out), "settings": asdict(COLD)}
@@ -124,11 +124,11 @@ def test_a_frame_that_fails_warm_is_tried_from_nothing_then_with_half_the_rate(s
     tries: list[tuple[int, float, bool]] = []
     real = frames._frame
 
-    def fail_twice(plan, settings, measurement, start, parent):
+    def fail_twice(plan, settings, measurement, start, watch):
         tries.append((settings.max_steps, settings.learning_rate, start is not None))
         if len(tries) in (2, 3):
             raise ArithmeticError("diverged")
-        return real(plan, settings, measurement, start, parent)
+        return real(plan, settings, measurement, start, watch)
 
     monkeypatch.setattr(frames, "_frame", fail_twice)
     reconstruct_frames(plan, 0, 2)

@@ -15,13 +15,16 @@ from nerif.fields.mlp import NetworkShape
 from nerif.fields.space_time import AtTimes, SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Box, Grid
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.reconstruction import files
 from nerif.reconstruction.base import State
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.target import Target
+from nerif.reconstruction.training_data import FrameData
 from nerif.sequence import joint
-from nerif.sequence.frames import Plan
-from nerif.sequence.joint import Film, reconstruct_jointly
+from nerif.sequence.chunk_data import ChunkData
+from nerif.sequence.joint import reconstruct_jointly
+from nerif.sequence.plan import SequencePlan
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
 from sequence.films import QUICK, blank
 
@@ -79,28 +82,28 @@ def test_each_ray_is_taken_at_its_own_time(network):
         assert torch.allclose(AtTimes(low, tau).value(p)[mine], field(p[mine]))
 
 
-def test_a_film_holds_every_ray_of_every_frame(short):
+def test_a_chunk_holds_every_ray_of_every_frame(short):
     blank(short, 1, view=0)
     sequence = MeasurementSequence.read(short)
     frames = [sequence.frame(i) for i in range(3)]
     tau = torch.tensor([-1.0, 0.0, 1.0])
-    film = Film.of(frames, tau)
+    chunk = ChunkData(SETTINGS, [FrameData(SETTINGS, frame) for frame in frames], tau, 2)
     targets = [Target.of(frame) for frame in frames]
-    assert len(film.measured()) == sum(len(t) for t in targets)
-    assert len(film.rays) == len(targets[0])
-    of_second = film.measured()[(film.measured() // len(film.rays)) == 1]
-    target, at = film.batch(of_second, torch.device("cpu"))
+    assert len(chunk) == sum(len(t) for t in targets)
+    assert len(chunk.rays) == len(targets[0])
+    of_second = (chunk.measured // len(chunk.rays) == 1).nonzero()[:, 0]
+    target, at = chunk.batch(of_second)
     assert torch.equal(at, torch.zeros(len(targets[1])))
     assert torch.equal(target.displacement, targets[1].displacement)
     assert torch.equal(target.rays.origin, targets[1].rays.origin)
     assert torch.equal(target.rays.direction, targets[1].rays.direction)
     # weighed by sigma alone, the same for all, with a mean square of 1
-    everything, _ = film.batch(film.measured(), torch.device("cpu"))
+    everything, _ = chunk.batch(torch.arange(len(chunk)))
     scaled = everything.displacement * everything.inverse_scale
     assert float(scaled.square().mean()) == pytest.approx(1, rel=1e-4)
     sigma = frames[1].sigma[frames[1].usable][0, 0]
     other = frames[2].sigma[frames[2].usable][0, 0]
-    third, _ = film.batch(film.measured()[-5:], torch.device("cpu"))
+    third, _ = chunk.batch(torch.arange(len(chunk))[-5:])
     assert float(target.inverse_scale[0, 0] / third.inverse_scale[0, 0]) == pytest.approx(
         float(other / sigma), rel=1e-4
     )
@@ -112,8 +115,8 @@ def test_instants_of_a_chunk_run_from_minus_one_to_one():
     assert chunk_tau(times, 3, 3, 4) == 0
 
 
-def begun(film: Path, out: Path, steps: int) -> Plan:
-    plan = Plan(film, out, SETTINGS, SETTINGS, 10, joint_steps=steps, time_octaves=2)
+def begun(film: Path, out: Path, steps: int) -> SequencePlan:
+    plan = SequencePlan(film, out, SETTINGS, SETTINGS, 10, joint_steps=steps, time_octaves=2)
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.first_good().box, 10)
     about = {"temporal": "joint", "time_octaves": 2, "chunk": len(sequence), "settings": asdict(SETTINGS)}
@@ -142,22 +145,22 @@ def test_a_joint_run_that_broke_off_goes_on_from_its_checkpoint(short, tmp_path,
     whole, parts = begun(short, tmp_path / "whole.zarr", 40), begun(short, tmp_path / "parts.zarr", 40)
     monkeypatch.setattr(joint, "CHECKPOINT_EVERY", 0.0)
     reconstruct_jointly(whole, 0, 5)
-    real = joint.write_state
+    real = files.write_state
 
     class Killed(BaseException):
         pass
 
     def write_and_die(directory: Path, state: State) -> None:
         real(directory, state)
-        if state.scalars["step"] == 90:
+        if state.scalars["budget"]["step"] == 90:
             raise Killed
 
-    monkeypatch.setattr(joint, "write_state", write_and_die)
+    monkeypatch.setattr(files, "write_state", write_and_die)
     with pytest.raises(Killed):
         reconstruct_jointly(parts, 0, 5)
     assert (SequenceStore(parts.out).status == MISSING).all()
     steps: list[int] = []
-    monkeypatch.setattr(joint, "write_state", lambda d, s: steps.append(s.scalars["step"]))
+    monkeypatch.setattr(files, "write_state", lambda d, s: steps.append(s.scalars["budget"]["step"]))
     reconstruct_jointly(parts, 0, 5)
     assert steps[0] == 91
     for i in range(5):
@@ -171,7 +174,7 @@ def test_a_loss_that_is_no_number_is_recorded_after_three_attempts(short, tmp_pa
     reconstruct_jointly(wild, 0, 5)
     store = SequenceStore(plan.out)
     assert (store.status == FAILED).all()
-    assert "not finite" in store.reasons[2]
+    assert "non-finite" in store.reasons[2]
     assert store.array("attempts")[2] == 3
 
 

@@ -20,7 +20,7 @@ from nerif.fields.encoding import encode, encode_pullback, encoded_width
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 
-__all__ = ["AtTimes", "SpaceTimeField", "SpaceTimeNetwork"]
+__all__ = ["AtTimes", "SpaceTimeField", "SpaceTimeNetwork", "with_time"]
 
 
 class SpaceTimeNetwork(Network):
@@ -53,6 +53,11 @@ class SpaceTimeNetwork(Network):
         return still + encode_pullback(encoded[:, e : 2 * e], cotangent[:, e : 2 * e], octaves)
 
 
+def with_time(p: Float[Tensor, "n 3"], tau: Float[Tensor, " m"] | None) -> Float[Tensor, "n k"]:
+    """Return (x, y, z, tau), point i of n at tau[i m / n]; (x, y, z) where there is no time."""
+    return p if tau is None else torch.cat([p, tau.repeat_interleave(len(p) // len(tau))[:, None]], dim=1)
+
+
 class AtTimes:
     """A space-time network as a network over space alone, each point at a time of its own; an Evaluator of the loss.
 
@@ -65,18 +70,15 @@ class AtTimes:
     def __init__(self, network: Any, tau: Float[Tensor, " m"]) -> None:
         self.network, self.tau = network, tau
 
-    def _with_time(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-        return torch.cat([p, self.tau.repeat_interleave(len(p) // len(self.tau))[:, None]], dim=1)
-
     def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the n head."""
-        return self.network.value(self._with_time(p))
+        return self.network.value(with_time(p, self.tau))
 
     def value_and_gradient(
         self, p: Float[Tensor, "n 3"], heads: bool
     ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
         """Return the n head, its exact gradient in space, and what the gradient heads say."""
-        return self.network.value_and_gradient(self._with_time(p), heads)
+        return self.network.value_and_gradient(with_time(p, self.tau), heads)
 
 
 class SpaceTimeField(NeuralField):
@@ -95,8 +97,8 @@ class SpaceTimeField(NeuralField):
         self, network: SpaceTimeNetwork, box: Box, tau: float, index_scale: float, offset: float = 0.0
     ) -> None:
         super().__init__(network, box, index_scale, offset)
+        self.network: SpaceTimeNetwork = network
         self.tau = tau
 
     def _inputs(self, points: Points) -> Float[Tensor, "n 4"]:
-        p = self.normalise(points.reshape(-1, 3))
-        return torch.cat([p, torch.full_like(p[:, :1], self.tau)], dim=1)
+        return with_time(self.normalise(points.reshape(-1, 3)), points.new_tensor([self.tau]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.base import Reconstruction, State
+from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
 
-__all__ = ["CHECKPOINT", "FIELD", "read_field", "read_state", "write_field", "write_state"]
+__all__ = ["CHECKPOINT", "FIELD", "checkpoints", "read_field", "read_state", "write_field", "write_state"]
 
 FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
 
@@ -68,6 +69,20 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
 def write_state(directory: Path, state: State) -> None:
     """Write a checkpoint, atomically: a run killed while writing leaves the one before."""
     _save(directory / CHECKPOINT, {k: v.cpu().contiguous() for k, v in state.tensors.items()}, state.scalars)
+
+
+def checkpoints(directory: Path, seconds: float) -> OnStep:
+    """Return a callback that writes a checkpoint every so many seconds."""
+    last = time.monotonic()
+
+    def write(step: Step) -> None:
+        nonlocal last
+        if time.monotonic() - last >= seconds:
+            directory.mkdir(parents=True, exist_ok=True)
+            write_state(directory, step.capture())
+            last = time.monotonic()
+
+    return write
 
 
 def read_state(directory: Path) -> State:

@@ -16,15 +16,15 @@ from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
 from nerif.reconstruction.losses import Evaluator
 
-__all__ = ["Guide", "sample_count", "sample_rays"]
+__all__ = ["SamplingDensity", "sample_count", "sample_rays"]
 
-EVEN = 0.1  # share of the samples that are spread evenly, whatever the guide says
+EVEN = 0.1  # share of the samples that are spread evenly, whatever the field is
 BINS = 40  # along a ray, in each of which the density is constant
 RESOLUTION = 24  # of the grid, along each edge of the cube that the network's coordinates span
 
 
-class Guide:
-    """Where the field varies: |grad N| on a coarse grid, the largest of each voxel and its neighbours.
+class SamplingDensity:
+    """Density of samples in space, high where the field varies: the largest |grad N| of each voxel and its neighbours.
 
     Parameters
     ----------
@@ -36,16 +36,16 @@ class Guide:
         self.values: Float[Tensor, "z y x"] | None = None  # nothing known yet
 
     @torch.no_grad()
-    def update(self, network: Evaluator) -> None:
-        """Look at the network as it is now."""
+    def update(self, *networks: Evaluator) -> None:
+        """Look at a network as it is now, or at several (instants) that are to be sampled alike."""
         device = next(self.field.network.parameters()).device
         axis = (torch.arange(RESOLUTION, device=device) + 0.5) / RESOLUTION * 2 - 1
         z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-        _, gradient, _ = network.value_and_gradient(torch.stack([x, y, z], dim=-1).reshape(-1, 3), False)
-        size = gradient.float().norm(dim=-1).reshape(1, 1, *x.shape)
-        self.values = functional.max_pool3d(size, 3, 1, 1)[0, 0]
+        points = torch.stack([x, y, z], dim=-1).reshape(-1, 3)
+        slopes = torch.stack([n.value_and_gradient(points, False)[1].float().norm(dim=-1) for n in networks])
+        self.values = functional.max_pool3d(slopes.amax(dim=0).reshape(1, 1, *x.shape), 3, 1, 1)[0, 0]
 
-    def density(self, rays: Rays) -> Float[Tensor, "n bins"]:
+    def along(self, rays: Rays) -> Float[Tensor, "n bins"]:
         """Return the density of samples in equal bins along each ray; its mean along a ray is 1."""
         assert self.values is not None
         share = (torch.arange(BINS, device=rays.near.device) + 0.5) / BINS
@@ -65,15 +65,15 @@ def sample_count(progress: float, first: int, last: int, jitter: int, generator:
 
 
 def sample_rays(
-    rays: Rays, count: int, generator: torch.Generator, sampling: str = "random", guide: Guide | None = None
+    rays: Rays, count: int, generator: torch.Generator, sampling: str = "random", density: SamplingDensity | None = None
 ) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
     """Return path lengths t_i ~ U(t_n + (i-1)/N (t_f - t_n), t_n + i/N (t_f - t_n)) and the length each stands for, mm.
 
     Parameters
     ----------
     sampling : "random" (one draw an interval, the paper's), "shifted" (one draw a ray, the same in each interval),
-        "adaptive" (as shifted, in intervals as the guide has them) or "regular" (midpoints)
-    guide : for "adaptive"; equal intervals as long as it knows nothing
+        "adaptive" (as shifted, in intervals as the density has them) or "regular" (midpoints)
+    density : for "adaptive"; equal intervals as long as it knows nothing
     """
     n, device = len(rays), rays.near.device
     if sampling == "random":
@@ -84,11 +84,11 @@ def sample_rays(
         draw = torch.rand(n, 1, generator=generator)
     share = (torch.arange(count, device=device) + draw.to(device)) / count
     length = (rays.far - rays.near)[:, None]
-    if sampling != "adaptive" or guide is None or guide.values is None:
+    if sampling != "adaptive" or density is None or density.values is None:
         return rays.near[:, None] + share * length, (length / count).expand(n, count)
-    density = guide.density(rays)
-    reached = functional.pad(density.cumsum(dim=1) / BINS, (1, 0))  # share of the samples before each bin
+    local = density.along(rays)
+    reached = functional.pad(local.cumsum(dim=1) / BINS, (1, 0))  # share of the samples before each bin
     cell = torch.searchsorted(reached, share, right=True).clamp(1, BINS) - 1
-    here = density.gather(1, cell)
+    here = local.gather(1, cell)
     share = (cell + (share - reached.gather(1, cell)) * BINS / here) / BINS
     return rays.near[:, None] + share * length, length / (count * here)

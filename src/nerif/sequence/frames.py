@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -26,74 +24,53 @@ from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.metrics import correlation
 from nerif.physics.deflection import Deflection, project
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.quantities import derive
+from nerif.reconstruction.base import OnStep, Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
+from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
 from nerif.volume import Volume
 
-__all__ = ["ATTEMPTS", "Event", "Plan", "finished_frame", "reconstruct_frames", "warm"]
+__all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame", "reconstruct_frames"]
 
 ATTEMPTS = 3  # at a frame
-WARM_UP = 10  # steps over which the learning rate rises from weights that are good already
 PIXELS = 256  # of each view, evenly over it, in which a frame is compared with what was measured
 SAMPLES = 60  # a ray, for that
 
-Event = Callable[[dict[str, object]], None]
-"""Told {"frame", "what": "begun" | "done" | "failed", ...} as a frame goes along."""
+FAILURES = (InputError, ArithmeticError, RuntimeError, MemoryError, OSError)
+"""What fails a frame, and is worth another attempt; anything else fails the chunk (run.py)."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What every worker has to know.
-
-    Parameters
-    ----------
-    measurement, out : stores
-    cold : settings of a frame that starts from nothing
-    warm : settings of a frame that starts from the one before
-    voxels : of the volumes, along the longest edge
-    quantities : written
-    gas : what density and temperature are computed for
-    hold_out : views kept out
-    threads : of a worker on a CPU; 0 for its share of the cores
-    joint_steps : of training for each frame of a network over space and time; 0 for a network for each frame
-    time_octaves : of the encoding of time in it
-    """
-
-    measurement: Path
-    out: Path
-    cold: NeRIF
-    warm: NeRIF
-    voxels: int = 100
-    quantities: tuple[str, ...] = ("index_excess",)
-    gas: GasSettings = field(default_factory=GasSettings)
-    hold_out: tuple[str, ...] = ()
-    threads: int = 0
-    joint_steps: int = 0
-    time_octaves: int = 3
+class FrameError(Exception):
+    """A frame could not be reconstructed in as many attempts as there are."""
 
 
-def warm(cold: NeRIF, steps: int, rate: float) -> NeRIF:
-    """Return the settings of a frame that starts from the one before: fewer steps, at a share of the learning rate."""
-    return replace(cold, max_steps=steps, rate_after_fit=rate, warm_up=min(cold.warm_up, WARM_UP))
+def end_without(parent: int) -> OnStep:
+    """Return a callback that ends this process when its parent is gone: the command was killed, and may run again."""
+
+    def watch(_: Step) -> None:
+        if os.getppid() != parent:
+            os._exit(1)
+
+    return watch
 
 
-def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda told: None) -> None:
+def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event = lambda told: None) -> None:
     """Reconstruct the frames first to last - 1 that the store lacks."""
     if plan.threads:
         torch.set_num_threads(plan.threads)
     keep_freed_memory()
     sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
-    parent = os.getppid()
+    watch = end_without(os.getppid())
     before: NeuralField | None = None
     for index in range(first, last):
         status = store.status[index]
         if status == MISSING:
             event({"frame": index, "what": "begun"})
             try:
-                frame = _attempts(plan, sequence, index, before, parent)
-            except _FrameError as error:
+                frame = _attempts(plan, sequence, index, before, watch)
+            except FrameError as error:
                 store.fail(index, str(error), ATTEMPTS)
                 event({"frame": index, "what": "failed", "reason": str(error)})
                 continue
@@ -104,31 +81,26 @@ def reconstruct_frames(plan: Plan, first: int, last: int, event: Event = lambda 
             before = store.field(index)
 
 
-class _FrameError(Exception):
-    """A frame could not be reconstructed in as many attempts as there are."""
-
-
-def _attempts(plan: Plan, sequence: MeasurementSequence, index: int, before: NeuralField | None, parent: int) -> Frame:
+def _attempts(
+    plan: SequencePlan, sequence: MeasurementSequence, index: int, before: NeuralField | None, watch: OnStep
+) -> Frame:
     """One frame: as planned, then from nothing, then more cautiously."""
     careful = replace(plan.cold, learning_rate=plan.cold.learning_rate / 2)
     tries = [(plan.cold, None) if before is None else (plan.warm, before), (plan.cold, None), (careful, None)]
     reason = ""
     for number, (settings, start) in enumerate(tries, start=1):
         try:
-            return replace(_frame(plan, settings, sequence.frame(index), start, parent), attempts=number)
-        except (InputError, ArithmeticError, RuntimeError, MemoryError, OSError) as error:
+            return replace(_frame(plan, settings, sequence.frame(index), start, watch), attempts=number)
+        except FAILURES as error:
             reason = str(error) or type(error).__name__
-    raise _FrameError(reason)
+    raise FrameError(reason)
 
 
-def _frame(plan: Plan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, parent: int) -> Frame:
+def _frame(
+    plan: SequencePlan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, watch: OnStep
+) -> Frame:
     begun = time.perf_counter()
     training = measurement.select([name for name in measurement.names if name not in plan.hold_out])
-
-    def watch(_: object) -> None:
-        if os.getppid() != parent:  # the command was killed, and may run again: leave the frames to the new one
-            os._exit(1)
-
     result = settings(training, watch, None, start)
     if result.outcome.reason == "diverged":
         raise ArithmeticError(result.outcome.message)
@@ -138,7 +110,7 @@ def _frame(plan: Plan, settings: NeRIF, measurement: Measurement, start: NeuralF
     return replace(frame, seconds=time.perf_counter() - begun, steps=steps)
 
 
-def finished_frame(plan: Plan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
+def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return what is written of a field: its volumes, and how it compares with what was measured."""
     grid = Grid.of_resolution(measurement.box, plan.voxels)
     excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})

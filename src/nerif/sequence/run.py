@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerif.sequence.frames import ATTEMPTS, Plan, reconstruct_frames
+from nerif.sequence.frames import ATTEMPTS, reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
+from nerif.sequence.plan import SequencePlan
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[in
 
 
 def run_sequence(
-    client: Client, plan: Plan, length: int, on_progress: Callable[[Progress], None] = lambda progress: None
+    client: Client, plan: SequencePlan, length: int, on_progress: Callable[[Progress], None] = lambda progress: None
 ) -> Progress:
     """Reconstruct every missing frame of a store; whatever happens to workers, the rest goes on.
 
@@ -132,7 +133,7 @@ def run_sequence(
     return progress
 
 
-def _in_worker(plan: Plan, first: int, last: int, topic: str) -> None:
+def _in_worker(plan: SequencePlan, first: int, last: int, topic: str) -> None:
     from dask.system import CPU_COUNT  # what a job or container leaves of the machine
     from distributed import get_worker
 

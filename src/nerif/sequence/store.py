@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +83,7 @@ class SequenceStore(VolumeSequence):
         network: NetworkShape,
         attributes: dict[str, Any],
     ) -> SequenceStore:
-        """Make a store in which every frame is missing; what is there is replaced.
+        """Make a store in which every frame is missing; what is there is replaced, checkpoints included.
 
         Parameters
         ----------
@@ -91,6 +92,7 @@ class SequenceStore(VolumeSequence):
         attributes : settings and whatever else is to be kept, JSON
         """
         like, frames = sequence.first_good(), len(sequence)
+        shutil.rmtree(_checkpoints(path), ignore_errors=True)
         about = {"kind": KIND, "network": vars(network), "views": list(like.names), **attributes}
         with atomic(path) as part:
             group = VolumeSequence.create(part, sequence.times, grid, quantities, like.n_ambient, about).group
@@ -117,6 +119,11 @@ class SequenceStore(VolumeSequence):
         return cls(path)
 
     # -- frames --------------------------------------------------------------------------------------------------
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where joint networks in training are kept, beside the store."""
+        return _checkpoints(self.path)
 
     @property
     def status(self) -> np.ndarray:
@@ -197,6 +204,10 @@ class SequenceStore(VolumeSequence):
                     f"{self.path}: {name}: expected {kept!r}, with which it was begun, got {asked!r}; "
                     "give another --out, or --force to begin anew"
                 )
+
+
+def _checkpoints(path: Path) -> Path:
+    return path.with_name(path.name + ".joint")
 
 
 def _network(attributes: dict[str, Any]) -> Network:

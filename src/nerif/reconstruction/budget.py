@@ -1,0 +1,84 @@
+"""How much a run has used of what it may: steps, passes over the rays, seconds."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+
+from nerif.reconstruction.base import Outcome
+from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.settings import TrainingSettings
+
+__all__ = ["Budget"]
+
+
+class Budget:
+    """The steps, rays and seconds of a run, earlier parts of a resumed run included.
+
+    Parameters
+    ----------
+    settings : epochs, max_steps and time_limit are the limits
+    rays : of one pass over all of them
+    ranks : processes that go by the clock of the first
+    device : where the ranks talk to each other
+    """
+
+    def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
+        self.settings, self.rays, self.ranks, self.device = settings, rays, ranks, device
+        self.step, self.rays_done = 0, 0
+        self._before, self._began, self._agreed = 0.0, time.perf_counter(), 0.0
+
+    def agree(self) -> None:
+        """Let all processes go by the clock of the first."""
+        if self.ranks.size > 1:
+            (self._agreed,) = self.ranks.decided([self._clock()], self.device)
+
+    @property
+    def seconds(self) -> float:
+        """Spent on training."""
+        return self._clock() if self.ranks.size == 1 else self._agreed
+
+    def _clock(self) -> float:
+        return self._before + time.perf_counter() - self._began
+
+    @property
+    def epoch(self) -> float:
+        """Passes over all rays."""
+        return self.rays_done / self.rays
+
+    @property
+    def progress(self) -> float:
+        """0 at the start, 1 when the first of the limits is reached."""
+        settings = self.settings
+        shares = [self.epoch / settings.epochs]
+        if settings.max_steps:
+            shares.append(self.step / settings.max_steps)
+        if settings.time_limit:
+            shares.append(self.seconds / settings.time_limit)
+        return max(shares)
+
+    def exhausted(self) -> Outcome | None:
+        """Return which limit is reached, if one is."""
+        settings = self.settings
+        if self.epoch >= settings.epochs:
+            return Outcome("epochs", f"all {settings.epochs:g} epochs done")
+        if settings.max_steps and self.step >= settings.max_steps:
+            return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may give more")
+        if settings.time_limit and self.seconds >= settings.time_limit:
+            return Outcome("time_limit", f"time limit of {settings.time_limit:g} s reached; more time may give more")
+        return None
+
+    def where(self) -> dict[str, float]:
+        """Return step, epoch and seconds, as the history has them."""
+        return {"step": float(self.step), "epoch": self.epoch, "seconds": self.seconds}
+
+    def used(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps."""
+        return {"step": self.step, "rays_done": self.rays_done, "seconds": self.seconds}
+
+    def restore(self, used: dict[str, Any]) -> None:
+        """Go on from what a checkpoint kept."""
+        self.step, self.rays_done = int(used["step"]), int(used["rays_done"])
+        self._before, self._began = float(used["seconds"]), time.perf_counter()

@@ -1,0 +1,77 @@
+"""Whether two runs see the same data: a digest of each part of a measurement."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from typing import Any
+
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.geometry import Camera
+from nerif.measurement import Measurement
+
+__all__ = ["check_fingerprint", "digest", "fingerprint"]
+
+
+def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
+    """Return a digest of each part of what a reconstruction sees of a measurement, by the part's name.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    open_faces : faces whose rays are dropped
+    """
+    usable = measurement.usable
+    return {
+        "views": digest(measurement.names),
+        "cameras": digest(part for camera in measurement.cameras for part in _parts(camera)),
+        "displacement": digest([measurement.displacement[usable]]),
+        "sigma": digest([None if measurement.sigma is None else measurement.sigma[usable]]),
+        "valid pixels": digest([usable]),
+        "flow_mask": digest([measurement.flow_mask]),
+        "box": digest([measurement.box.lower, measurement.box.upper]),
+        "n_ambient": digest([measurement.n_ambient]),
+        "ambient_faces": digest(sorted(measurement.ambient_faces)),
+        "open_faces": digest(sorted(open_faces)),
+    }
+
+
+def check_fingerprint(kept: dict[str, str] | None, asked: dict[str, str]) -> None:
+    """Refuse to go on with a run that saw other data.
+
+    Raises
+    ------
+    InputError
+        Naming the parts that differ.
+    """
+    if kept is None:
+        raise InputError(
+            "resume: the checkpoint does not tell which data it belongs to, so it is of another version of nerif; "
+            "start without --resume"
+        )
+    changed = [name for name in asked if kept.get(name) != asked[name]]
+    if changed:
+        raise InputError(
+            f"resume: expected the data that the run began with, got other {', '.join(changed)}; "
+            "give the same measurement, --hold-out and --open-faces, or start without --resume"
+        )
+
+
+def _parts(camera: Camera) -> tuple[Any, ...]:
+    plane = camera.background
+    optics = (camera.intrinsics, camera.rotation, camera.translation, camera.distortion)
+    return (*optics, camera.image_size, plane.normal, plane.offset)
+
+
+def digest(parts: Iterable[Any]) -> str:
+    """Return a digest of tensors and plain values, in their order."""
+    seen = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        if isinstance(part, Tensor):
+            seen.update(str(tuple(part.shape)).encode() + part.contiguous().numpy().tobytes())
+        else:
+            seen.update(repr(part).encode())
+        seen.update(b"|")
+    return seen.hexdigest()

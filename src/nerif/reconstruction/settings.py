@@ -1,0 +1,119 @@
+"""Settings of the training of a network: its size, its loss, where rays are sampled, rates, limits and the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from nerif.conventions import InputError, parse_faces
+from nerif.fields.mlp import NetworkShape
+from nerif.physics.deflection import MODELS
+from nerif.reconstruction.base import Reconstructor
+from nerif.reconstruction.losses import LossWeights
+from nerif.reconstruction.optimiser import OPTIMISERS
+
+__all__ = ["TrainingSettings"]
+
+CHOICES = {
+    "model": MODELS,
+    "optimiser": OPTIMISERS,
+    "sampling": ("adaptive", "random", "shifted", "regular"),
+    "norm": ("l2", "squared"),
+    "schedule": ("cosine", "constant"),
+    "precision": ("auto", "float32", "tf32", "bf16"),
+    "compile": ("auto", "on", "off"),
+}
+
+
+@dataclass(frozen=True)
+class TrainingSettings(Reconstructor):
+    """Settings of every method that trains a network."""
+
+    network: NetworkShape = field(default_factory=NetworkShape)
+    """Size of the network."""
+    weights: LossWeights = field(default_factory=LossWeights)
+    """Weights of the terms of the loss."""
+    norm: str = "squared"
+    """Either "squared" residuals (maximum likelihood for Gaussian noise) or "l2", the paper's."""
+    model: str = "lever_arm"
+    """Forward model: lever_arm, paraxial, or curved (along the ray that the present field bends)."""
+    samples: tuple[int, int] = (12, 24)
+    """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
+    sample_jitter: int = 4
+    """Half-range of the random number of samples a ray, see samples."""
+    sampling: str = "adaptive"
+    """In equal intervals, one draw each ("random", the paper's), one a ray ("shifted") or midpoints ("regular"), or
+    "adaptive", where the field varies."""
+    points_per_batch: int = 8192
+    """Sample points of a step; a step takes points_per_batch / N rays."""
+    optimiser: str = "muon"
+    """Muon for weight matrices and Adam for the rest, or adam for all (the paper's)."""
+    learning_rate: float = 1.5e-2
+    """Adam's, at its highest."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Adam's decay rates."""
+    matrix_rate: float = 2.0
+    """Muon's learning rate, in units of Adam's."""
+    momentum: float = 0.9
+    """Muon's."""
+    warm_up: int = 50
+    """Steps over which the learning rate rises; with the cosine schedule."""
+    schedule: str = "cosine"
+    """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
+    epochs: float = 40.0
+    """Stop after so many passes over all rays (the paper's n_outer)."""
+    max_steps: int = 0
+    """Stop after so many steps; 0 for no limit."""
+    time_limit: float = 0.0
+    """Stop after so many seconds; 0 for no limit."""
+    stop_ratio: float = 0.0
+    """Stop when the loss is below this share of the initial loss; 0 never (paper: 0.005)."""
+    fit_steps: int = 400
+    """Steps in which the network is fitted to the field it starts from (--start-from)."""
+    rate_after_fit: float = 0.3
+    """Share of the learning rate that a run goes on with from such a start."""
+    ambient_faces: tuple[str, ...] = ()
+    """Faces on which the index is ambient; empty: those of the measurement."""
+    open_faces: tuple[str, ...] = ()
+    """Faces through which flow leaves the box; rays that cross them are dropped."""
+    seed: int = 0
+    """Of weights and samples; makes a CPU run repeatable."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda, cuda:1, ..."""
+    precision: str = "auto"
+    """One of auto, float32, tf32, bf16 (mixed; the last part of the run in float32)."""
+    full_precision_from: float = 0.85
+    """Share of the run after which bf16 gives way to float32."""
+    compile: str = "auto"
+    """Compile the network: on, off, or auto (on CUDA only)."""
+
+    def __post_init__(self) -> None:
+        for name, allowed in CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
+        for name in (
+            "epochs",
+            "learning_rate",
+            "matrix_rate",
+            "points_per_batch",
+            "fit_steps",
+            "rate_after_fit",
+            "warm_up",
+        ):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("max_steps", "time_limit", "stop_ratio", "sample_jitter"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if not (len(self.samples) == 2 and min(self.samples) > self.sample_jitter):
+            raise InputError(
+                f"samples: expected two counts above sample_jitter ({self.sample_jitter}), got {self.samples}"
+            )
+        if self.points_per_batch < max(self.samples) + self.sample_jitter:
+            raise InputError(
+                f"points_per_batch: expected room for one ray ({max(self.samples) + self.sample_jitter} points), "
+                f"got {self.points_per_batch}"
+            )
+        if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
+            raise InputError("weights: the head and consistency terms need gradient_head = true")
+        parse_faces(self.ambient_faces)
+        parse_faces(self.open_faces, "open_faces")

@@ -1,0 +1,309 @@
+"""The training of a network, on one frame or on several at once: the loop, and what it does when something goes wrong.
+
+    batch of rays -> samples -> loss_terms -> one step of the optimiser, until the budget is used up
+
+A loss or weights that turn non-finite take the run back to its last good state, with half the learning rate.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.fields.base import Field
+from nerif.fields.space_time import AtTimes, with_time
+from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
+from nerif.reconstruction.budget import Budget
+from nerif.reconstruction.device import peak_memory
+from nerif.reconstruction.fingerprint import check_fingerprint
+from nerif.reconstruction.losses import Evaluator, loss_terms
+from nerif.reconstruction.optimiser import NetworkOptimiser
+from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.precision import MixedPrecision
+from nerif.reconstruction.sampling import SamplingDensity, sample_count, sample_rays
+from nerif.reconstruction.settings import TrainingSettings
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.training_data import TrainingData
+from nerif.reconstruction.warm_start import adopt, fit_network
+
+__all__ = ["Training"]
+
+RETRIES = 5  # times a run that turned non-finite is taken back before it gives up
+GAUGE_POINTS = 256  # a step
+DENSITY_EVERY = 60  # steps between looks at where the field varies
+LEVEL_POINTS = 1 << 14  # at which the ambient level is taken at the end
+LOG_EVERY, KEEP_EVERY = 20, 200  # steps
+
+
+class Training:
+    """One run: the data, the network, its optimiser, and the loop.
+
+    Parameters
+    ----------
+    settings : TrainingSettings
+    data : TrainingData, on its device
+    resume : State of an earlier run to go on from, or None
+    start : Field to fit the network to before the first step, or None; unused when resuming
+
+    Raises
+    ------
+    InputError
+        If there are fewer rays than processes, or the state is of other data or another network.
+    """
+
+    def __init__(
+        self, settings: TrainingSettings, data: TrainingData, resume: State | None = None, start: Field | None = None
+    ) -> None:
+        self.settings, self.data, self.device = settings, data, data.device
+        self.ranks = Ranks.from_environment()
+        self.ranks.join(self.device)
+        if len(data) < self.ranks.size:
+            raise InputError(
+                f"torchrun: expected at least a ray a process, got {len(data)} rays for {self.ranks.size}"
+            )
+        self.budget = Budget(settings, len(data), self.ranks, self.device)
+        self.generator = torch.Generator().manual_seed(settings.seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.seed)
+            self.field = data.untrained(settings.network)
+        network = self.field.network
+        self.density = SamplingDensity(self.field)
+        self.optimiser = NetworkOptimiser(settings.optimiser, network, settings.betas, settings.momentum)
+        self.network = MixedPrecision(network, self.device, settings.precision, settings.compile)
+        self.history: list[dict[str, float]] = []
+        self.order = torch.empty(0, dtype=torch.long)
+        self.retries, self.rate = 0, 1.0
+        self.initial_loss, self.running = float("nan"), float("nan")
+        if resume is not None:
+            check_fingerprint(resume.scalars.get("fingerprint"), data.fingerprint)
+            self._restore(resume)
+        self.start = start if resume is None else None
+        self.good = self._capture()
+
+    # -- the loop ------------------------------------------------------------------------------------------------
+
+    def run(self, on_step: OnStep | None = None) -> Reconstruction:
+        """Train until something says stop, and return what there is."""
+        settings, budget, outcome = self.settings, self.budget, self._outcome() or self._fit(on_step)
+        clock, rays_then = time.perf_counter(), budget.rays_done
+        while outcome is None:
+            self._agree()
+            target, tau, s, interval, rays = self._batch()
+            terms = self._terms(target, tau, s, interval)
+            loss = sum(getattr(settings.weights, name) * term for name, term in terms.items())
+            assert isinstance(loss, Tensor)
+            rate = self._learning_rate()
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.ranks.average_gradients(self.field.network, len(target), rays)
+            self.optimiser.step({"adam": rate, "muon": rate * settings.matrix_rate})
+            budget.step += 1
+            outcome = self._outcome()
+            if self.device.type == "cuda" and budget.step % LOG_EVERY and outcome is None:
+                continue  # looking at a number waits for the GPU, so look now and then
+            figures = torch.stack([term.detach().float() for term in (*terms.values(), loss)])
+            values = dict(zip((*terms, "loss"), self.ranks.average(figures, len(target), rays).tolist(), strict=True))
+            if not math.isfinite(values["loss"]) or (outcome is not None and not self._finite()):
+                outcome = self._take_back()
+                continue
+            self._follow(values["loss"])
+            speed = (budget.rays_done - rays_then) / max(time.perf_counter() - clock, 1e-9)
+            if budget.step % LOG_EVERY == 0 or budget.step == 1 or outcome is not None:
+                self._log({**values, "rays_per_second": speed})
+            if budget.step % KEEP_EVERY == 0 and self._finite():
+                self.good = self._capture()
+            if self._asked(on_step, self._tell(values, speed)) and outcome is None:
+                outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
+        return self._result(outcome)
+
+    def _agree(self) -> None:
+        """Let all processes go by the clock of the first (on GPUs now and then: it waits for them)."""
+        if self.device.type == "cpu" or self.budget.step % LOG_EVERY == 0:
+            self.budget.agree()
+
+    def _asked(self, on_step: OnStep | None, step: Step) -> bool:
+        """Tell of a step, and whether the first process is asked to stop."""
+        asked = on_step is not None and bool(on_step(step))
+        return bool(self.ranks.decided([float(asked)], self.device)[0])
+
+    def _fit(self, on_step: OnStep | None) -> Outcome | None:
+        """Take over the field that the run starts from, or fit the network to it; the steps after it are smaller."""
+        if self.start is None:
+            return None
+        settings, outcome = self.settings, None
+
+        def log(step: int, loss: float) -> bool:
+            nonlocal outcome
+            values = {"fit_step": float(step), "fit_loss": loss}
+            if step % LOG_EVERY == 0 or step == 1:
+                self._log(values)
+            self._agree()
+            outcome = self._outcome()
+            if self._asked(on_step, self._tell(values, 0.0)) and outcome is None:
+                outcome = Outcome("interrupted", "stopped while fitting the start; --resume goes on from here")
+            return outcome is not None
+
+        self.network.low = True
+        if not adopt(self.field, self.start):
+            fit_network(
+                self.field, self.network, self.start, settings.fit_steps, settings.points_per_batch,
+                settings.learning_rate, self.generator, log,
+            )  # fmt: skip
+        self._look()
+        self.rate, self.good = settings.rate_after_fit, self._capture()
+        return outcome
+
+    # -- a step --------------------------------------------------------------------------------------------------
+
+    def _draw(self, count: int) -> Tensor:
+        """The numbers of the next rays, of a random order that has each once an epoch."""
+        if len(self.order) < count:
+            self.order = torch.cat([self.order, torch.randperm(len(self.data), generator=self.generator)])
+        index, self.order = self.order[:count], self.order[count:]
+        self.budget.rays_done += count
+        return index
+
+    def _batch(self) -> tuple[Target, Tensor | None, Tensor, Tensor, int]:
+        """Rays, their instants and samples: this process's share of a step, and how many rays the step has in all."""
+        settings, step = self.settings, self.budget.step
+        count = sample_count(self.budget.progress, *settings.samples, settings.sample_jitter, self.generator)
+        rays = min(max(self.ranks.size, settings.points_per_batch // count), len(self.data))
+        target, tau = self.data.batch(self._draw(rays))
+        if settings.sampling == "adaptive" and step and step % DENSITY_EVERY == 0:
+            self._look()
+        s, interval = sample_rays(target.rays, count, self.generator, settings.sampling, self.density)
+        mine = self.ranks.share
+        return target[mine], None if tau is None else tau[mine], s[mine], interval[mine], rays
+
+    def _look(self) -> None:
+        """Look at where the field varies."""
+        self.density.update(*(self._at(tau) for tau in self.data.instants))
+
+    def _terms(self, target: Target, tau: Tensor | None, s: Tensor, interval: Tensor) -> dict[str, Tensor]:
+        settings = self.settings
+        self.network.low = self.budget.progress < settings.full_precision_from
+        terms = loss_terms(
+            self.field, self._at(tau), target, s, interval,
+            settings.weights, settings.model, settings.norm, self.data.n_ambient,
+        )  # fmt: skip
+        terms["gauge"] = self._at_ambient(GAUGE_POINTS, self.generator).square().mean()
+        return terms
+
+    def _at(self, tau: Tensor | None) -> Evaluator:
+        """The network as a function of space, at the instants given."""
+        return self.network if tau is None else AtTimes(self.network, tau)
+
+    def _at_ambient(self, count: int, generator: torch.Generator) -> Tensor:
+        """What the network gives where it should give one constant, in full precision."""
+        points, tau = self.data.ambient_points(count, generator)
+        return self.field.network(with_time(self.field.normalise(points), tau))
+
+    def _learning_rate(self) -> float:
+        """Adam's, of the next step."""
+        settings, rate = self.settings, self.rate * self.settings.learning_rate
+        if settings.schedule == "cosine":
+            rate *= min(1.0, (self.budget.step + 1) / settings.warm_up)
+            rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(self.budget.progress, 1.0)))
+        return rate
+
+    # -- whether to stop, or to go back --------------------------------------------------------------------------
+
+    def _outcome(self) -> Outcome | None:
+        """Why the run is over, if it is."""
+        outcome, share = self.budget.exhausted(), self.settings.stop_ratio
+        if outcome is None and share and self.running <= share * self.initial_loss:
+            return Outcome("converged", f"loss fell to {share:g} of its initial value")
+        return outcome
+
+    def _follow(self, loss: float) -> None:
+        """A running mean of the loss; squares are rooted so that ratios mean the same for both norms."""
+        loss = math.sqrt(loss) if self.settings.norm == "squared" else loss
+        if math.isnan(self.initial_loss):
+            self.initial_loss = self.running = loss
+        self.running += 0.1 * (loss - self.running)
+
+    def _finite(self) -> bool:
+        """Whether the weights are: a finite loss can have a gradient that is not."""
+        return all(bool(torch.isfinite(w).all()) for w in self.field.network.parameters())
+
+    def _take_back(self) -> Outcome | None:
+        """Return to the last good state with half the learning rate."""
+        retries, rate, seconds = self.retries + 1, self.rate / 2, self.budget.seconds
+        self._restore(self.good)
+        self.budget.restore({**self.budget.used(), "seconds": seconds})
+        self.retries, self.rate = retries, rate
+        self._log({"taken_back": float(retries)})
+        if retries > RETRIES:
+            return Outcome(
+                "diverged",
+                f"loss turned non-finite {retries} times; kept the last good state of step {self.budget.step}; "
+                "try a smaller --learning-rate or --precision float32",
+            )
+        return None
+
+    # -- what is told and kept -----------------------------------------------------------------------------------
+
+    def _log(self, values: dict[str, float]) -> None:
+        self.history.append({**self.budget.where(), **values})
+
+    def _tell(self, values: dict[str, float], speed: float) -> Step:
+        budget = self.budget
+        progress = min(budget.progress, 1.0)
+        return Step(budget.step, budget.epoch, budget.seconds, progress, values, speed, self._capture)
+
+    def _capture(self) -> State:
+        tensors = {f"network.{k}": v.detach().clone() for k, v in self.field.network.state_dict().items()}
+        tensors |= {f"optimiser.{k}": v for k, v in self.optimiser.tensors().items()}
+        tensors["generator"] = self.generator.get_state().clone()
+        tensors["order"] = self.order.clone()
+        if self.density.values is not None:
+            tensors["density"] = self.density.values.clone()
+        names = ("retries", "rate", "initial_loss", "running")
+        scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
+        kept = {"budget": self.budget.used(), "history": list(self.history), "fingerprint": self.data.fingerprint}
+        return State(tensors, {**scalars, **kept})
+
+    def _restore(self, state: State) -> None:
+        tensors, scalars = state.tensors, dict(state.scalars)
+        try:
+            network = {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}
+            self.field.network.load_state_dict(network)
+        except RuntimeError:
+            raise InputError("resume: the checkpoint is of another network; give the same settings") from None
+        self.optimiser.restore({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser.")})
+        self.generator.set_state(tensors["generator"])
+        self.order = tensors["order"].clone()
+        density = tensors.get("density")
+        self.density.values = None if density is None else density.clone().to(self.device)
+        del scalars["fingerprint"]
+        self.history = list(scalars.pop("history"))
+        self.budget.restore(scalars.pop("budget"))
+        for name, value in scalars.items():
+            setattr(self, name, value)
+
+    def _result(self, outcome: Outcome) -> Reconstruction:
+        state = self._capture()
+        if self.retries and outcome.reason != "diverged":
+            taken_back = f"; taken back {self.retries} time(s) to the last good state after a non-finite loss"
+            outcome = Outcome(outcome.reason, outcome.message + taken_back)
+        self.field.network.eval().requires_grad_(False)
+        # the constant that the data leave open
+        self.field.offset = float(self._at_ambient(LEVEL_POINTS, torch.Generator().manual_seed(0)).mean())
+        return Reconstruction(
+            field=self.field,
+            box=self.data.box,
+            n_ambient=self.data.n_ambient,
+            history=self.history,
+            outcome=outcome,
+            settings=asdict(self.settings),
+            seconds=self.budget.seconds,
+            peak_memory_bytes=peak_memory(self.device),
+            device=str(self.device),
+            state=state,
+        )
