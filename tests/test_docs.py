@@ -114,9 +114,11 @@ def test_the_page_of_python_runs(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "python.md").read_text()
     blocks = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
     assert len(blocks) >= 8
-    told = "\nassert scores['cc'] > 0.9, scores\nassert views[3]['cc'] > 0.8, views\n"
+    held_out = "\nassert scores['cc'] > 0.9, scores\nassert losses[-1] < losses[0], losses\n"
+    shown = "".join(f"\n{noun}._repr_html_()" for noun in ("measurement", "result", "temperature"))
     script = tmp_path / "page.py"
-    script.write_text("\n".join(blocks) + told)
+    script.write_text("\n".join(blocks) + held_out + shown)
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert {p.name for p in tmp_path.iterdir()} == {"page.py", "flame.nc", "flame.vti", "flame_volume.nc"}
+    assert {p.name for p in tmp_path.iterdir()} >= {"flame.nc", "flame.vti", "flame_volume.nc", "truth.nc", "flame"}
+    assert (tmp_path / "flame" / "report.html").is_file()
