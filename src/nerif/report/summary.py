@@ -130,10 +130,10 @@ def headline(statements: list[Statement]) -> Statement:
     return Statement(
         worst,
         {
-            "good": "It predicts a view it has not seen, and what it leaves unexplained is the noise.",
-            "note": "Nothing found speaks against it; read the notes.",
-            "warning": "Use it with the reservations below.",
-            "bad": "Not to be relied on as it is; see below.",
+            "good": "It predicts a view it has not seen, and what remains unexplained is noise.",
+            "note": "No problems found; see the notes below.",
+            "warning": "Usable, with the reservations below.",
+            "bad": "Not to be relied on as it stands; see below.",
         }[worst],
     )
 
@@ -162,10 +162,10 @@ def _of_outcome(result: Result) -> list[Statement]:
     if outcome == "diverged":
         return [Statement("bad", f"The run diverged. {message}".strip())]
     if outcome == "interrupted":
-        return [Statement("warning", f"The run was interrupted; --resume goes on. {message}".strip())]
+        return [Statement("warning", f"The run was interrupted; --resume continues it. {message}".strip())]
     if outcome in ("time_limit", "steps"):
         limit = "time limit" if outcome == "time_limit" else "limit of steps"
-        return [Statement("note", f"The run ended at its {limit}; more may give more.")]
+        return [Statement("note", f"The run ended at its {limit}; a longer one may be more accurate.")]
     return []
 
 
@@ -179,11 +179,11 @@ def _of_held_out(result: Result) -> list[Statement]:
         if not seen:
             text = "The field was not compared with any view: nerif evaluate --measurement FILE does it."
             return [Statement("warning", text)]
-        text = "No view was held out, so nothing was checked against data that the reconstruction has not seen."
+        text = "No view was held out, so the field was not checked against data the reconstruction has not seen."
         return [Statement("warning", f"{text} Repeat with --hold-out VIEW.")]
     known = [v for v in held if v.get("cc") is not None]
     if not known:
-        return [Statement("warning", "The held-out views have no pixel to compare.")]
+        return [Statement("warning", "The held-out views have no pixels to compare.")]
     worst = min(known, key=lambda v: v["cc"])
     cc, noise, name = worst["cc"], _largest(known, "rms_over_sigma"), worst["name"]
     among = f"; the worst of {len(known)}" if len(known) > 1 else ""
