@@ -115,7 +115,7 @@ def _statements(store: VolumeSequence) -> list[Statement]:
     missing, failed = int((status == 0).sum()), np.flatnonzero(status == 2)
     if missing:
         found.append(
-            Statement("warning", f"{missing} of {len(status)} frames are missing; run the same command again to do them.")
+            Statement("warning", f"{missing} of {len(status)} frames are missing; the same command again does them.")
         )
     if len(failed):
         reasons = [str(r) for r in store.array("reason")[:]]
@@ -123,7 +123,7 @@ def _statements(store: VolumeSequence) -> list[Statement]:
         found.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
     held = set(store.attributes.get("hold_out", ()))
     if not held:
-        found.append(Statement("note", "No view was held out, so nothing here tests the field against data it has not seen."))
+        found.append(Statement("note", "No view was held out, so nothing here is a test on unseen data."))
     return found
 
 
