@@ -102,6 +102,27 @@ class Volume:
             self, values=values, quantity="index_excess", attributes={**self.attributes, "n_ambient": n_ambient}
         )
 
+    def summary(self) -> list[tuple[str, str]]:
+        """Return what it holds as names and values with units."""
+        from nerif.drawing import shown
+        from nerif.notebook import span
+
+        shape = " × ".join(str(n) for n in self.grid.shape[::-1])
+        edges = " × ".join(f"{e:g}" for e in self.grid.box.edges)
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        name = "n − 1" if self.quantity == "n" else self.quantity.replace("_", " ").capitalize()
+        rows = [(name, span(shown(self), unit)), ("Voxels", f"{shape} (x, y, z)"), ("Volume", f"{edges} mm (x, y, z)")]
+        if self.n_ambient is not None:
+            rows.append(("Ambient index", f"{self.n_ambient:.7g}"))
+        return rows
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the three middle slices, and the summary."""
+        from nerif.notebook import panel, show_slices
+
+        title = describe(self.quantity)[1].capitalize()
+        return panel(title, self.summary(), show_slices(self), f"{title} in the three middle slices")
+
 
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid to a NetCDF-4 file by the CF conventions, coordinates in mm, atomically."""

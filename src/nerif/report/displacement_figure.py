@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from nerif.atomic import atomic
+from nerif.drawing import draw_displacement
 from nerif.measurement import Measurement
-from nerif.report.figures import draw_displacement
 
 __all__ = ["save_displacements", "save_masks"]
 
