@@ -415,13 +415,21 @@ def test_flags_win_over_the_file(work, tmp_path):
     assert m.displacement.shape == (2, 9, 11, 2)
 
 
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_takes_a_settings_file(tmp_path, capsys, verb):
+    file = tmp_path / "s.toml"
+    file.write_text("nothing_of_the_kind = 1\n")
+    assert "unknown key 'nothing_of_the_kind'" in refused(capsys, [verb, "--config", str(file)])
+    assert "no such settings file" in refused(capsys, [verb, f"--config={tmp_path / 'none.toml'}"])
+
+
 def test_help_is_quick_and_whole(capsys):
     assert main(["--help"]) == 0
     said = capsys.readouterr().out
     assert all(verb in said for verb in VERBS)
     for verb in VERBS:
         assert main([verb, "--help"]) == 0
-        assert "default" in capsys.readouterr().out or verb == "info"
+        assert "TOML file of settings" in " ".join(capsys.readouterr().out.split())
     loaded = subprocess.run(
         [sys.executable, "-c", "import sys, nerif.cli; nerif.cli.main(['--help']); print('torch' in sys.modules)"],
         capture_output=True, text=True, check=True,

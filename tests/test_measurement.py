@@ -11,7 +11,8 @@ import xarray as xr
 
 from nerif.conventions import InputError
 from nerif.geometry import Ring
-from nerif.measurement import VARIABLES, Measurement
+from nerif.measurement import Measurement
+from nerif.measurement_file import VARIABLES
 from nerif.simulation import simulate
 
 
@@ -78,7 +79,7 @@ def test_usable_pixels_and_rays(full):
     sigma = full.sigma.clone()
     sigma[1, 4, 5] = 0.0
     m = replace(full, displacement=spoilt, sigma=sigma, valid=torch.ones_like(full.valid))
-    assert m.bad_pixels == 1
+    assert m.bad_pixels == 2
     usable = m.usable
     assert not bool(usable[0, 2, 3])
     assert not bool(usable[1, 4, 5])

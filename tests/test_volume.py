@@ -62,6 +62,21 @@ def test_n_becomes_index_excess(tmp_path):
     assert float((back.values - VALUES).abs().max()) < 1e-12
 
 
+def test_n_stays_n_where_nobody_said_the_ambient_index(tmp_path):
+    n = VALUES.double() + 1.00027
+    write_netcdf(tmp_path / "n.nc", [Volume(n, GRID, "n")])
+    back = read_volume(tmp_path / "n.nc")
+    assert (back.quantity, back.n_ambient) == ("n", None)
+    assert torch.equal(back.values, n)
+
+
+@pytest.mark.parametrize("value", [float("nan"), 0.00027, "air"])
+def test_ambient_index_that_cannot_be_one(tmp_path, value):
+    write_netcdf(tmp_path / "n.nc", [Volume(VALUES, GRID, attributes={"n_ambient": value})])
+    with pytest.raises(InputError, match="n.nc: attribute n_ambient: expected a refractive index such as 1.00027, got"):
+        read_volume(tmp_path / "n.nc")
+
+
 def test_a_volume_from_elsewhere(tmp_path):
     """Coordinates are enough: the box is half a voxel wider on each side; dimensions may come in any order."""
     values = np.random.default_rng(0).random((4, 3, 5)).astype(np.float32)

@@ -5,6 +5,8 @@ Lengths are millimetres, image quantities pixels, angles radians, times seconds.
 
 from __future__ import annotations
 
+from typing import SupportsFloat
+
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -12,6 +14,7 @@ __all__ = [
     "COMPONENTS",
     "DEFAULT_AMBIENT_FACES",
     "FACES",
+    "LARGEST_LENGTH",
     "InputError",
     "Mask",
     "Matrix3",
@@ -20,6 +23,7 @@ __all__ = [
     "Values",
     "Vectors",
     "VoxelIndex",
+    "ambient_index",
     "parse_faces",
 ]
 
@@ -32,6 +36,9 @@ FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
 """Where the index is taken as ambient when nothing else is said: the side faces (the gauge)."""
 
+LARGEST_LENGTH = 1e7
+"""Beyond ten kilometres (mm) a length is taken for a mistake of its unit."""
+
 Points = Float[Tensor, "*batch 3"]  # mm, world frame
 Vectors = Float[Tensor, "*batch 3"]  # direction (1) or gradient (1/mm)
 Values = Float[Tensor, "*batch"]  # index excess n - n_ambient (1)
@@ -43,6 +50,19 @@ VoxelIndex = Int[Tensor, "*batch 3"]
 
 class InputError(ValueError):
     """Input that cannot be right: the message names what, what was expected, what came, and the remedy."""
+
+
+def ambient_index(value: object, name: str = "n_ambient") -> float:
+    """Return the refractive index around the flow as a number.
+
+    Raises
+    ------
+    InputError
+        If it is not a number between 0.9 and 4, as of gases, liquids and glasses.
+    """
+    if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < 4:
+        raise InputError(f"{name}: expected a refractive index such as 1.00027, got {value}")
+    return float(value)
 
 
 def parse_faces(text: str | tuple[str, ...] | list[str], name: str = "ambient_faces") -> tuple[str, ...]:

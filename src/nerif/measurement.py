@@ -1,49 +1,35 @@
-"""A Measurement: cameras and the displacement each of them saw, and its file (NetCDF-4, Conventions BOST-1.0)."""
+"""A Measurement: cameras and the displacement each of them saw."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif import measurement_file
 from nerif.atomic import atomic
-from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
-from nerif.geometry import Box, Camera, Plane, Rays
+from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces
+from nerif.geometry import Box, Camera, Rays
+from nerif.netcdf import opened
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["CONVENTIONS", "MAPS", "Measurement"]
+__all__ = ["LIMITS_PX", "Measurement"]
 
-CONVENTIONS = "BOST-1.0"
+LIMITS_PX = (1e-6, 1e5)
+"""Least sigma, and largest displacement and sigma, that a camera can have measured, px."""
 
-VARIABLES = {
-    "displacement": (("view", "row", "column", "component"), "px"),
-    "sigma": (("view", "row", "column", "component"), "px"),
-    "valid": (("view", "row", "column"), "1"),
-    "flow_mask": (("view", "row", "column"), "1"),
-    "intrinsics": (("view", "i", "j"), "px"),
-    "distortion": (("view", "coefficient"), "1"),
-    "rotation": (("view", "i", "j"), "1"),
-    "translation": (("view", "i"), "mm"),
-    "background_normal": (("view", "i"), "1"),
-    "background_offset": (("view",), "mm"),
-    "box": (("corner", "i"), "mm"),
-    "image_size": (("view", "side"), "px"),
-}
-"""Dimensions and unit of every variable of the file."""
+LIMITS_NM = (100.0, 30000.0)
+"""Wavelengths from ultraviolet to thermal infrared, nm."""
 
-MAPS = ("displacement", "sigma", "valid", "flow_mask")
-"""What is measured; the rest is known of the rig."""
-
-OPTIONAL = ("sigma", "valid", "flow_mask", "distortion", "image_size")
-SIZES = {"component": 2, "i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2}
+CHUNK = 1 << 17
+"""Pixels that are traced at a time."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +80,9 @@ class Measurement:
                     f"image_size of view '{camera.name}': expected at most {shape[1:3]} (height, width) px, "
                     f"got {camera.image_size}"
                 )
-        if not 0.9 < self.n_ambient < 4:
-            raise InputError(f"n_ambient: expected a refractive index such as 1.00027, got {self.n_ambient}")
+        ambient_index(self.n_ambient)
+        if self.wavelength_nm is not None and not LIMITS_NM[0] <= self.wavelength_nm <= LIMITS_NM[1]:
+            raise InputError(f"wavelength_nm: expected nanometres such as 532, got {self.wavelength_nm}")
         parse_faces(self.ambient_faces)
         good = self.usable.flatten(1).sum(dim=1)
         for name, count in zip(self.names, good.tolist(), strict=True):
@@ -138,13 +125,29 @@ class Measurement:
 
     @property
     def usable(self) -> Bool[Tensor, "view row column"]:
-        """Pixels that are inside their image, valid, finite, and of positive finite sigma."""
-        mask = torch.isfinite(self.displacement).all(dim=-1)
-        if self.valid is not None:
-            mask = mask & self.valid
+        """Pixels inside their image, valid, of a displacement and, where it is known, a sigma within LIMITS_PX."""
+        mask = self._called_valid
+        for i in range(len(mask)):
+            mask[i] &= self._measured(i)
+        return mask
+
+    @property
+    def bad_pixels(self) -> int:
+        """Pixels called valid that measured nothing (NaN, infinite or impossible numbers): masked, but worth a line."""
+        mask = self._called_valid
+        return sum(int((mask[i] & ~self._measured(i)).sum()) for i in range(len(mask)))
+
+    @property
+    def _called_valid(self) -> Bool[Tensor, "view row column"]:
+        mask = self._inside
+        return mask if self.valid is None else mask.logical_and_(self.valid)
+
+    def _measured(self, view: int) -> Bool[Tensor, "row column"]:
+        least, most = LIMITS_PX
+        mask = (self.displacement[view].abs() <= most).all(dim=-1)  # NaN compares false
         if self.sigma is not None:
-            mask = mask & (torch.isfinite(self.sigma) & (self.sigma > 0)).all(dim=-1)
-        return mask & self._inside
+            mask &= ((self.sigma[view] >= least) & (self.sigma[view] <= most)).all(dim=-1)
+        return mask
 
     @property
     def _inside(self) -> Bool[Tensor, "view row column"]:
@@ -155,37 +158,33 @@ class Measurement:
 
     @property
     def sees_box(self) -> Bool[Tensor, "view row column"]:
-        """Pixels whose rays cross the box."""
-        mask = torch.zeros(self.displacement.shape[:3], dtype=torch.bool)
-        for i, camera in enumerate(self.cameras):
-            height, width = camera.image_size
-            crosses = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(self.box).crosses
-            mask[i, :height, :width] = crosses.reshape(height, width)
+        """Pixels whose rays cross the box on the way to the background."""
+        mask = self._inside
+        for _ in self._crossing(mask):
+            pass
         return mask
-
-    @property
-    def bad_pixels(self) -> int:
-        """Pixels called valid whose displacement is NaN or infinite: masked, but worth a line."""
-        called = self._inside if self.valid is None else self._inside & self.valid
-        return int((called & ~torch.isfinite(self.displacement).all(dim=-1)).sum())
 
     def rays(self) -> tuple[Rays, Float[Tensor, "n 2"], Float[Tensor, "n 2"] | None]:
         """Return the usable rays that cross the box, their displacement and sigma (None if unknown), px."""
-        parts, displacement, sigma = [], [], []
-        usable = self.usable
-        for i, camera in enumerate(self.cameras):
-            mask = usable[i, : camera.image_size[0], : camera.image_size[1]]
-            rays = camera.rays(camera.pixel_grid()[mask]).clip(self.box)
-            keep = rays.crosses
-            parts.append(rays[keep].to(dtype=torch.float32))
-            displacement.append(self.displacement[i][usable[i]][keep])
-            if self.sigma is not None:
-                sigma.append(self.sigma[i][usable[i]][keep])
-        return (
-            Rays.concatenate(parts),
-            torch.cat(displacement).float(),
-            torch.cat(sigma).float() if self.sigma is not None else None,
-        )
+        mask = self.usable
+        rays = Rays.collect(self._crossing(mask), int(mask.sum()))
+        return rays, self.displacement[mask].float(), None if self.sigma is None else self.sigma[mask].float()
+
+    def _crossing(self, mask: Bool[Tensor, "view row column"]) -> Iterator[Rays]:
+        """Trace the pixels of a mask, some at a time, and clear those whose ray does not cross the box.
+
+        Rays are made in double precision: cameras stand far off, and positions lose digits in single precision.
+        """
+        for camera, wanted in zip(self.cameras, mask, strict=True):
+            rows = max(1, CHUNK // wanted.shape[1])
+            for first in range(0, wanted.shape[0], rows):
+                block = wanted[first : first + rows]  # a view, through which the mask is changed
+                row, column = block.nonzero().unbind(-1)
+                pixels = torch.stack([column, row + first], dim=-1).to(camera.intrinsics.dtype)
+                rays = camera.rays(pixels).clip(self.box)
+                keep = rays.crosses & (rays.background > rays.far)
+                block[row, column] = keep
+                yield rays[keep]
 
     def select(self, names: Sequence[str]) -> Measurement:
         """Return the measurement of the named views only.
@@ -201,6 +200,8 @@ class Measurement:
         index = [i for i, name in enumerate(self.names) if name in names]
         if not index:
             raise InputError(f"view: expected at least one of {', '.join(self.names)}, got none")
+        if len(index) == len(self.cameras):
+            return self
 
         def pick(x: Tensor | None) -> Tensor | None:
             return None if x is None else x[index]
@@ -219,44 +220,8 @@ class Measurement:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file of docs/formats.md, atomically."""
         dataset = self.to_dataset()
-        packed = {k: {"zlib": True, "complevel": 3} for k in MAPS if k in dataset}
         with atomic(path) as part:
-            dataset.to_netcdf(part, engine="h5netcdf", encoding=packed)
-
-    def to_dataset(self) -> xr.Dataset:
-        """Return the variables and attributes of the file."""
-        import numpy as np
-        import xarray as xr
-
-        def stack(values: list[Tensor]) -> np.ndarray:
-            return torch.stack(values).numpy()
-
-        cameras = self.cameras
-        data: dict[str, np.ndarray] = {
-            "displacement": self.displacement.float().numpy(),
-            "intrinsics": stack([c.intrinsics for c in cameras]),
-            "distortion": stack([c.distortion for c in cameras]),
-            "rotation": stack([c.rotation for c in cameras]),
-            "translation": stack([c.translation for c in cameras]),
-            "background_normal": stack([c.background.normal for c in cameras]),
-            "background_offset": np.array([c.background.offset for c in cameras]),
-            "box": np.array([self.box.lower, self.box.upper]),
-            "image_size": np.array([c.image_size for c in cameras], dtype=np.int32),
-        }
-        for name in MAPS[1:]:
-            value = getattr(self, name)
-            if value is not None:
-                data[name] = value.to(torch.int8 if value.dtype == torch.bool else torch.float32).numpy()
-        dataset = xr.Dataset({k: (VARIABLES[k][0], v, {"units": VARIABLES[k][1]}) for k, v in data.items()})
-        dataset = dataset.assign_coords(view=list(self.names), component=list(COMPONENTS))
-        dataset.attrs = {
-            "Conventions": CONVENTIONS,
-            "n_ambient": self.n_ambient,
-            "ambient_faces": " ".join(self.ambient_faces),
-        }
-        if self.wavelength_nm is not None:
-            dataset.attrs["wavelength_nm"] = self.wavelength_nm
-        return dataset
+            dataset.to_netcdf(part, engine="h5netcdf", encoding=measurement_file.encoding(dataset))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Measurement:
@@ -267,20 +232,12 @@ class Measurement:
         InputError
             If the file is missing, foreign, truncated, or breaks the contract; the message names the variable.
         """
-        import xarray as xr
-
-        path = Path(path)
-        if not path.is_file():
-            raise InputError(f"{path}: no such file; expected a measurement (NetCDF-4, {CONVENTIONS})")
-        try:
-            dataset = xr.load_dataset(path, engine="h5netcdf")
-        except (OSError, ValueError, KeyError, RuntimeError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(f"{path}: not a readable NetCDF-4 file, or truncated ({reason})") from None
-        try:
+        with opened(path, f"a measurement (NetCDF-4, {measurement_file.CONVENTIONS})") as dataset:
             return cls.from_dataset(dataset)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return the variables and attributes of the file."""
+        return measurement_file.to_dataset(self)
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> Measurement:
@@ -291,80 +248,4 @@ class Measurement:
         InputError
             If they break the contract; the message names the variable.
         """
-        import numpy as np
-
-        found = dataset.attrs.get("Conventions")
-        if found != CONVENTIONS:
-            raise InputError(f"attribute Conventions: expected '{CONVENTIONS}', got '{found}'; is it a measurement?")
-        _check_variables(dataset)
-
-        def array(name: str) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(dataset[name].values.astype(np.float64)))
-
-        def mask(name: str) -> Tensor | None:
-            return array(name) != 0 if name in dataset else None
-
-        displacement = array("displacement").float()
-        views = displacement.shape[0]
-        names = [str(n) for n in dataset["view"].values] if "view" in dataset.coords else [str(i) for i in range(views)]
-        sizes = dataset["image_size"].values if "image_size" in dataset else [displacement.shape[1:3]] * views
-        distortion = array("distortion") if "distortion" in dataset else torch.zeros(views, 5, dtype=torch.float64)
-        corners = array("box").tolist()
-        box = Box(tuple(corners[0]), tuple(corners[1]))
-        intrinsics, rotation, translation = array("intrinsics"), array("rotation"), array("translation")
-        normals, offsets = array("background_normal"), array("background_offset")
-        cameras = []
-        for i in range(views):
-            length = float(normals[i].norm())
-            if not 0.99 < length < 1.01:
-                raise InputError(
-                    f"background_normal of view '{names[i]}': expected a unit vector, got length {length:g}"
-                )
-            cameras.append(
-                Camera(
-                    intrinsics=intrinsics[i],
-                    rotation=rotation[i],
-                    translation=translation[i],
-                    image_size=(int(sizes[i][0]), int(sizes[i][1])),
-                    background=Plane(normals[i] / length, float(offsets[i]) / length),
-                    distortion=distortion[i],
-                    name=names[i],
-                )
-            )
-        if "n_ambient" not in dataset.attrs:
-            raise InputError("attribute n_ambient: expected the index around the flow, e.g. 1.00027, got none")
-        wavelength = dataset.attrs.get("wavelength_nm")
-        return cls(
-            cameras=tuple(cameras),
-            displacement=displacement,
-            box=box,
-            n_ambient=float(dataset.attrs["n_ambient"]),
-            sigma=array("sigma").float() if "sigma" in dataset else None,
-            valid=mask("valid"),
-            flow_mask=mask("flow_mask"),
-            wavelength_nm=None if wavelength is None else float(wavelength),
-            ambient_faces=parse_faces(str(dataset.attrs.get("ambient_faces", " ".join(DEFAULT_AMBIENT_FACES)))),
-        )
-
-
-def _check_variables(dataset: xr.Dataset) -> None:
-    """Refuse missing variables and wrong dimensions, sizes and units, by name."""
-    for name, (dimensions, unit) in VARIABLES.items():
-        if name not in dataset:
-            if name in OPTIONAL:
-                continue
-            raise InputError(f"variable '{name}': expected on ({', '.join(dimensions)}) in {unit}, got none")
-        variable = dataset[name]
-        if tuple(variable.dims) != dimensions:
-            got = tuple(map(str, variable.dims))
-            raise InputError(f"variable '{name}': expected dimensions {dimensions}, got {got}")
-        for dimension in dimensions:
-            size = SIZES.get(dimension)
-            if size is not None and variable.sizes[dimension] != size:
-                got_size = variable.sizes[dimension]
-                raise InputError(f"variable '{name}': expected {size} along {dimension}, got {got_size}")
-        given = variable.attrs.get("units")
-        if given is not None and given != unit:
-            raise InputError(f"variable '{name}': expected units '{unit}', got '{given}'")
-        if variable.dtype.kind not in "fiub":
-            raise InputError(f"variable '{name}': expected numbers, got {variable.dtype}")
+        return cls(**measurement_file.from_dataset(dataset))

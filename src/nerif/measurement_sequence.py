@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
-from nerif.measurement import CONVENTIONS, MAPS, VARIABLES, Measurement
+from nerif.measurement import Measurement
+from nerif.measurement_file import CONVENTIONS, MAPS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray as xr

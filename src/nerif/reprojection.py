@@ -11,7 +11,8 @@ from torch import Tensor
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
-from nerif.measurement import VARIABLES, Measurement
+from nerif.measurement import Measurement
+from nerif.measurement_file import VARIABLES
 
 __all__ = ["REPROJECTION", "Reprojection"]
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Box, Grid
 
 __all__ = ["QUANTITIES", "Volume", "describe", "read_volume", "read_volumes", "write_netcdf"]
@@ -68,6 +68,12 @@ class Volume:
                 f"got {tuple(self.values.shape)}"
             )
 
+    @property
+    def n_ambient(self) -> float | None:
+        """Refractive index around the flow, from which an excess is counted; None where nobody said."""
+        value = self.attributes.get("n_ambient")
+        return None if value is None else ambient_index(value, "attribute n_ambient")
+
 
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid to a NetCDF-4 file by the CF conventions, coordinates in mm, atomically."""
@@ -112,7 +118,8 @@ def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
     """Read one quantity of a .nc or .vti file as a Volume.
 
-    Without `quantity`, index_excess is taken, or n with the file's n_ambient, or the only variable there is.
+    Without `quantity`, index_excess is taken, or n, or the only variable there is. n becomes the index excess where the
+    file says its n_ambient, and stays n, in double precision, where it does not.
 
     Raises
     ------
@@ -130,9 +137,12 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     volume = _volume(quantity, arrays[quantity], grid, attributes)
     if "masked_voxels" not in volume.notes and not bool(torch.isfinite(volume.values).all()):
         raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
-    if quantity == "n":
-        n_ambient = float(attributes.get("n_ambient", 1.0))
-        return Volume((arrays["n"].double() - n_ambient).float(), grid, "index_excess", "1", volume.attributes)
+    try:
+        n_ambient = volume.n_ambient
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    if quantity == "n" and n_ambient is not None:
+        return Volume((volume.values - n_ambient).float(), grid, "index_excess", "1", volume.attributes)
     return volume
 
 
@@ -165,7 +175,7 @@ def _volume(quantity: str, values: Tensor, grid: Grid, attributes: dict[str, flo
     own = f"{quantity}."
     notes = {k.removeprefix(own): v for k, v in attributes.items() if k.startswith(own) and k != f"{own}units"}
     shared = {k: v for k, v in attributes.items() if "." not in k}
-    values = values if quantity == "n" else values.float()
+    values = values.double() if quantity == "n" else values.float()
     return Volume(values, grid, quantity, describe(quantity)[0], shared, notes)
 
 

@@ -104,7 +104,7 @@ def test_intrinsics_that_cannot_be_right(camera):
         replace(camera, intrinsics=camera.intrinsics.T)
     with pytest.raises(InputError, match="translation"):
         replace(camera, translation=camera.translation * math.nan)
-    with pytest.raises(InputError, match="image size"):
+    with pytest.raises(InputError, match="image_size"):
         replace(camera, image_size=(0, 10))
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from nerif.commands.output import check_file, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Box, Camera, Plane
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
@@ -25,7 +25,7 @@ __all__ = ["Calibrate", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Calibrate:
+class Calibrate(Settings):
     """Calibrate cameras from target pictures, or take over a calibration; both draw the rig in 3-D.
 
     SOURCE is a folder with a folder for each view (VIEW/target/*.tif: the target free in space, one pose under one
@@ -66,8 +66,6 @@ class Calibrate:
     """Upper corner of the box to draw, mm."""
     force: bool = False
     """Overwrite existing files."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
 
 
 def run(settings: Calibrate) -> None:
@@ -241,8 +239,4 @@ def _draw(path: Path, cameras: Sequence[CalibratedCamera] | Sequence[Camera], bo
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Calibrate(source=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif calibrate", Calibrate.__doc__ or ""))
+    run(read_settings(Calibrate(source=tyro.MISSING), arguments, "calibrate"))

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from nerif.commands.output import say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.consistency import Consistency, check_consistency
 from nerif.conventions import InputError
 from nerif.measurement import Measurement
@@ -17,7 +17,7 @@ __all__ = ["Check", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Check:
+class Check(Settings):
     """Predict every view by a quick reconstruction from the others, and name the ones that do not fit, and why.
 
     Found are: u and v swapped, a flipped sign, a mirrored, reversed or turned picture, of one view or all; two views
@@ -32,8 +32,6 @@ class Check:
     """Of the quick reconstructions, along the longest edge of the box."""
     strict: bool = False
     """Exit with code 1 if something is found."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
 
 
 def run(settings: Check) -> Consistency:
@@ -64,10 +62,6 @@ def run(settings: Check) -> Consistency:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Check(measurement=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    settings = parse(default, arguments, "nerif check", Check.__doc__ or "")
+    settings = read_settings(Check(measurement=tyro.MISSING), arguments, "check")
     if run(settings).findings and settings.strict:
         raise SystemExit(1)

@@ -12,7 +12,7 @@ from nerif.commands import evaluate, reconstruct, simulate
 from nerif.commands.methods import ReconstructNeRIF
 from nerif.commands.output import check_directory, say
 from nerif.commands.report import write_report
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.physics.quantities import GasSettings
@@ -22,7 +22,7 @@ __all__ = ["Demo", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(Settings):
     """Simulate nine small views of a flame and a tenth to hold out, reconstruct, evaluate, and write a report."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
@@ -77,4 +77,4 @@ def run(settings: Demo) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Demo(), arguments, "nerif demo", Demo.__doc__ or ""))
+    run(read_settings(Demo(), arguments, "demo"))

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.physics.design import Expectation, Plan, expect
@@ -19,7 +19,7 @@ __all__ = ["Design", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Design:
+class Design(Settings):
     """Expected displacement, sensitivity, field of view, blur and resolution of a rig, before anyone drills a hole."""
 
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -46,8 +46,6 @@ class Design:
     """What the optical flow averages over, px."""
     force: bool = False
     """Overwrite an existing drawing."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     ring: Annotated[Ring, tyro.conf.arg(name="")] = field(default_factory=Ring)
 
 
@@ -115,8 +113,4 @@ def _tell(e: Expectation, plan: Plan) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Design()
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif design", Design.__doc__ or ""))
+    run(read_settings(Design(), arguments, "design"))

@@ -12,7 +12,7 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.recording import FrameJob, RestingView, frame_numbers, instants_of, measure_frames
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.assembly import World, join_views
@@ -27,7 +27,7 @@ __all__ = ["Displacement", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Displacement:
+class Displacement(Settings):
     """Find the displacements of all views and write them, with the calibration, as a measurement.
 
     FOLDER has a folder for each view with VIEW/reference (pictures without flow; with three or more, the noise is taken
@@ -67,8 +67,6 @@ class Displacement:
     """Faces of the box on which the index is ambient."""
     force: bool = False
     """Overwrite existing files."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     method: Annotated[DisplacementSettings, tyro.conf.arg(name="")] = field(default_factory=DisplacementSettings)
 
     def world(self, box: Box) -> World:
@@ -248,7 +246,4 @@ def main(arguments: list[str]) -> None:
     """Parse and run."""
     missing = tyro.MISSING
     default = Displacement(folder=missing, calibration=missing, lower=missing, upper=missing, out=missing)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif displacement", Displacement.__doc__ or ""))
+    run(read_settings(default, arguments, "displacement"))

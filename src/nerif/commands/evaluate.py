@@ -10,7 +10,7 @@ import tyro
 from torch import Tensor
 
 from nerif.commands.output import counting_bar, say
-from nerif.commands.settings import parse, read_toml
+from nerif.commands.settings import Settings, read_settings, read_toml
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject, update_json, write_json
 from nerif.fields.grid import VoxelField
@@ -27,7 +27,7 @@ __all__ = ["Evaluate", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Settings):
     """Compare a reconstruction with a truth over the volume, or with measured views; adds to its metrics.json."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -161,4 +161,4 @@ def _coverage(result: Path, truth: Volume) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Evaluate(result=tyro.MISSING), arguments, "nerif evaluate", Evaluate.__doc__ or ""))
+    run(read_settings(Evaluate(result=tyro.MISSING), arguments, "evaluate"))

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, say, say_masked
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings, derive
@@ -21,7 +21,7 @@ __all__ = ["Export", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Settings):
     """Write a reconstruction as .vti (opens in ParaView), .nc, .npz, .mat or .csv, on any grid."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -71,4 +71,4 @@ def run(settings: Export) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Export(tyro.MISSING, tyro.MISSING), arguments, "nerif export", Export.__doc__ or ""))
+    run(read_settings(Export(tyro.MISSING, tyro.MISSING), arguments, "export"))

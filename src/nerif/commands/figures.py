@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.report.pages import JOURNALS, save_figures
 from nerif.report.result import FIGURES, read_result
@@ -18,7 +18,7 @@ __all__ = ["Figures", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Figures:
+class Figures(Settings):
     """Write every figure of a result as vector PDF and PNG at journal column widths."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -52,4 +52,4 @@ def run(settings: Figures) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Figures(tyro.MISSING), arguments, "nerif figures", Figures.__doc__ or ""))
+    run(read_settings(Figures(tyro.MISSING), arguments, "figures"))

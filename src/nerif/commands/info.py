@@ -10,9 +10,11 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
-from nerif.measurement import CONVENTIONS, Measurement
+from nerif.measurement import Measurement
+from nerif.measurement_file import CONVENTIONS
+from nerif.netcdf import opened
 from nerif.reconstruction.files import read_field
 from nerif.volume import Volume, read_volume
 
@@ -20,7 +22,7 @@ __all__ = ["Info", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Info:
+class Info(Settings):
     """Print what a measurement, a volume or a result directory holds."""
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -40,13 +42,11 @@ def run(settings: Info) -> None:
 
 def _is_measurement(path: Path) -> bool:
     """A volume says CF, a measurement BOST; what says nothing is left to the stricter reader."""
-    import xarray as xr
-
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as dataset:
+        with opened(path, "a measurement or a volume") as dataset:
             said = dataset.attrs.get("Conventions") == CONVENTIONS or "displacement" in dataset
             return said or not {"x", "y", "z"} <= set(dataset.coords)
-    except (OSError, ValueError, KeyError):
+    except InputError:
         return True
 
 
@@ -64,7 +64,7 @@ def _measurement(path: Path, m: Measurement) -> None:
     noise = "unknown" if sigma is None else f"rms {float(sigma.square().mean().sqrt()):.4g} px"
     rms = float(d.square().mean().sqrt())
     say(f"  rays           {len(rays)} cross the box; rms displacement {rms:.4g} px; sigma {noise}")
-    say(f"  masked         {m.bad_pixels} pixels with NaN or infinite displacement")
+    say(f"  masked         {m.bad_pixels} pixels whose displacement or sigma is NaN, infinite or impossible")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
     say("  view            size [px]      f [px]   centre to camera [mm]   to background [mm]   usable   rms [px]")
     usable = m.usable
@@ -116,4 +116,4 @@ def _result(path: Path) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Info(tyro.MISSING), arguments, "nerif info", Info.__doc__ or ""))
+    run(read_settings(Info(tyro.MISSING), arguments, "info"))

@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from nerif.commands.output import check_file, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
@@ -21,7 +21,7 @@ __all__ = ["Mask", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Mask:
+class Mask(Settings):
     """Put flow masks into a measurement: by threshold on |d| / sigma, or drawn; tells what hull they leave."""
 
     measurement: tyro.conf.Positional[Path]
@@ -44,8 +44,6 @@ class Mask:
     """Take the masks out instead."""
     force: bool = False
     """Overwrite existing files."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
 
 
 def run(settings: Mask) -> Measurement:
@@ -119,8 +117,4 @@ def _drawn(measurement: Measurement, folder: Path) -> dict[str, Path]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Mask(measurement=tyro.MISSING, out=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif mask", Mask.__doc__ or ""))
+    run(read_settings(Mask(measurement=tyro.MISSING, out=tyro.MISSING), arguments, "mask"))

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from nerif.commands.settings import Settings
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.landweber import Landweber
@@ -23,7 +24,7 @@ Flat = tyro.conf.arg(name="")
 
 
 @dataclass(frozen=True)
-class Reconstruct:
+class Reconstruct(Settings):
     """Reconstruct the refractive-index field of a measurement and write a result directory."""
 
     measurement: Annotated[Path, tyro.conf.Positional]
@@ -50,8 +51,6 @@ class Reconstruct:
     """Seconds between checkpoints."""
     tensorboard: bool = False
     """Write TensorBoard scalars to OUT/tensorboard."""
-    config: Path | None = None
-    """TOML file of settings (such as the run.toml of a result); flags win over it."""
     gas: GasSettings = field(default_factory=GasSettings)
     """What the density is computed for."""
     reconstructor: Annotated[Reconstructor, tyro.conf.Suppress] = field(default_factory=NeRIF)

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.report.movie import Movie, frames_there
 from nerif.volume_sequence import VolumeSequence
@@ -18,7 +18,7 @@ __all__ = ["MovieCommand", "main", "run"]
 
 
 @dataclass(frozen=True)
-class MovieCommand:
+class MovieCommand(Settings):
     """Draw an isosurface or slices of a sequence over time, off-screen, as .mp4 or .gif."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -50,5 +50,4 @@ def run(settings: MovieCommand) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = MovieCommand(result=tyro.MISSING, out=tyro.MISSING)
-    run(parse(default, arguments, "nerif movie", MovieCommand.__doc__ or ""))
+    run(read_settings(MovieCommand(result=tyro.MISSING, out=tyro.MISSING), arguments, "movie"))

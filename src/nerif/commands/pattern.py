@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.imaging import background, targets
 from nerif.imaging.background import MARGIN, Background, write_pattern
@@ -22,7 +22,7 @@ LARGEST = 400e6  # pixels of a raster: more would not fit into the memory of a l
 
 
 @dataclass(frozen=True)
-class Pattern:
+class Pattern(Settings):
     """Write a background (dots, wavelet, multiscale) or calibration target (chessboard, charuco, circles) to print."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -49,8 +49,6 @@ class Pattern:
     """Of the printer; coarser where a dot has 12 pixels already."""
     force: bool = False
     """Overwrite an existing file."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
 
 
 def run(settings: Pattern) -> None:
@@ -93,8 +91,4 @@ def _check_size(width: float, height: float, pixel: float) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Pattern(out=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif pattern", Pattern.__doc__ or ""))
+    run(read_settings(Pattern(out=tyro.MISSING), arguments, "pattern"))

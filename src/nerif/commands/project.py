@@ -10,7 +10,7 @@ import torch
 import tyro
 
 from nerif.commands.output import check_file, say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.evaluation import predict_view
 from nerif.geometry import Ring
@@ -23,7 +23,7 @@ __all__ = ["Project", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Project:
+class Project(Settings):
     """Predict the displacement that cameras would see of a reconstruction, and write it as a measurement."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -79,4 +79,4 @@ def run(settings: Project) -> Measurement:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Project(tyro.MISSING, tyro.MISSING), arguments, "nerif project", Project.__doc__ or ""))
+    run(read_settings(Project(tyro.MISSING, tyro.MISSING), arguments, "project"))

@@ -16,7 +16,7 @@ from nerif.commands.methods import METHODS, Reconstruct
 from nerif.commands.output import check_directory, interruptible, progress_bar, say
 from nerif.commands.report import write_report
 from nerif.commands.result_files import clear, run_toml, write_result
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import flag_value, read_settings, value_given
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Grid
@@ -53,7 +53,7 @@ def run(settings: Reconstruct) -> Reconstruction:
         settings = replace(settings, gas=replace(settings.gas, wavelength_nm=measurement.wavelength_nm))
     derive_check(settings.gas, measurement)
     if measurement.bad_pixels:
-        say(f"{settings.measurement}: {measurement.bad_pixels} pixels with NaN or infinite displacement left out")
+        say(f"{settings.measurement}: {measurement.bad_pixels} pixels left out whose displacement or sigma is NaN, infinite or impossible")
     resume = read_state(settings.out) if settings.resume else None
     start = _start(settings, measurement) if resume is None else None
     if not settings.resume:
@@ -168,22 +168,18 @@ def _scalars(settings: Reconstruct) -> AbstractContextManager[list[OnStep]]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    config = flag_value(arguments, "--config")
-    out = flag_value(arguments, "-o", "--out")
-    if "--resume" in arguments and config is None and out is not None:
-        if not (Path(out) / RUN).is_file():
+    file, out = None, flag_value(arguments, "-o", "--out")
+    if "--resume" in arguments and flag_value(arguments, "--config") is None and out is not None:
+        file = Path(out) / RUN
+        if not file.is_file():
             raise InputError(f"{out}: expected an interrupted run to resume, got no {RUN} in it")
-        config = str(Path(out) / RUN)
-    values = read_toml(Path(config)) if config else {}
-    method = flag_value(arguments, "--method") or values.get("method", "nerif")
+    method = value_given("method", arguments, "nerif", file)
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got '{method}'")
     chosen: dict[str, Any] = {"method": method}
     if method == "nerif":
-        name = flag_value(arguments, "--preset") or values.get("preset", "auto")
+        name = value_given("preset", arguments, "auto", file)
         # settings of a file are complete: there the preset has had its say already
         chosen |= {"preset": name, "reconstructor": preset(name)}
     default = METHODS[method](measurement=tyro.MISSING, out=tyro.MISSING, **chosen)
-    if config:
-        default = merge(default, values, config)
-    run(parse(default, arguments, "nerif reconstruct", METHODS[method].__doc__ or ""))
+    run(read_settings(default, arguments, "reconstruct", file))

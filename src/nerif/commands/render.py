@@ -10,7 +10,7 @@ import tyro
 
 from nerif.atomic import atomic
 from nerif.commands.output import check_directory, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml, to_toml
+from nerif.commands.settings import Settings, read_settings, to_toml
 from nerif.conventions import InputError
 from nerif.experiment import Experiment, background_scale, world_axes
 from nerif.fields.phantoms import make_phantom
@@ -22,7 +22,7 @@ __all__ = ["Render", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Render:
+class Render(Settings):
     """Render the pictures that a rig would take: targets, background without and with flow; the truth comes with them.
 
     In the folder OUT: VIEW/target, VIEW/background, VIEW/reference, VIEW/flow for nerif calibrate and nerif
@@ -44,8 +44,6 @@ class Render:
     """Voxels of the truth along the longest edge."""
     force: bool = False
     """Write into a folder that holds something."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     pictures: Annotated[Experiment, tyro.conf.arg(name="")] = field(default_factory=Experiment)
     ring: Annotated[Ring, tyro.conf.arg(name="")] = field(default_factory=Ring)
 
@@ -87,8 +85,4 @@ def run(settings: Render) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Render(out=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif render", Render.__doc__ or ""))
+    run(read_settings(Render(out=tyro.MISSING), arguments, "render"))

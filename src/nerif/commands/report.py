@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, say
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.report import html
 from nerif.report.result import REPORT, read_result
@@ -20,7 +20,7 @@ __all__ = ["Report", "main", "run", "write_report"]
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Settings):
     """Write a page that shows a result: one HTML file, no network, opens from disk."""
 
     result: Annotated[Path, tyro.conf.Positional]
@@ -66,4 +66,4 @@ def _say_size(out: Path) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Report(tyro.MISSING), arguments, "nerif report", Report.__doc__ or ""))
+    run(read_settings(Report(tyro.MISSING), arguments, "report"))

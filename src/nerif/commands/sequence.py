@@ -12,7 +12,7 @@ import tyro
 
 from nerif.commands.output import say
 from nerif.commands.reconstruct import derive_check
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings, value_given
 from nerif.conventions import InputError
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
@@ -40,7 +40,7 @@ OWN = (
 
 
 @dataclass(frozen=True)
-class Sequence:
+class Sequence(Settings):
     """Reconstruct every frame of a measurement sequence into a Zarr store, which xarray opens at any time.
 
     The same command again does only what is missing. Frames are reconstructed in chunks of time, which run side by
@@ -79,8 +79,6 @@ class Sequence:
     """Try again frames that failed in an earlier run."""
     force: bool = False
     """Begin anew, whatever --out holds."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     preset: str = "auto"
     """One of fast, best, paper; auto is best where there is a GPU, else fast. Single settings below win over it."""
     gas: GasSettings = field(default_factory=GasSettings)
@@ -204,10 +202,6 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    config = flag_value(arguments, "--config")
-    values = read_toml(Path(config)) if config else {}
-    name = flag_value(arguments, "--preset") or values.get("preset", "auto")
+    name = value_given("preset", arguments, "auto")
     default = Sequence(measurement=tyro.MISSING, out=tyro.MISSING, preset=name, reconstructor=preset(name))
-    if config:
-        default = merge(default, values, config)
-    run(parse(default, arguments, "nerif sequence", Sequence.__doc__ or ""))
+    run(read_settings(default, arguments, "sequence"))

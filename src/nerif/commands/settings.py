@@ -1,5 +1,7 @@
 """From the command line and a TOML file to a checked record of settings.
 
+    nerif VERB --config FILE.toml --flag VALUE          the defaults, over them the file, over it the flags
+
 The names in the file are those of the flags; a nested flag such as --network.width stands in the table [network].
 """
 
@@ -8,21 +10,64 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import inspect
 import io
 import json
 import re
 import tomllib
 import typing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from nerif.conventions import InputError
 
-__all__ = ["flag_value", "merge", "parse", "read_toml", "to_toml"]
+__all__ = ["Settings", "flag_value", "merge", "parse", "read_settings", "read_toml", "to_toml", "value_given"]
 
 T = TypeVar("T")
 
 IGNORED = ("about",)  # the table of run.toml that tells what came out
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What the settings of every verb hold."""
+
+    config: Path | None = None
+    """TOML file of settings (such as the run.toml of a result); flags win over it."""
+
+
+def read_settings(default: T, arguments: list[str], verb: str, file: Path | None = None) -> T:
+    """Return the settings of a verb: `default`, over it the settings file, over that the flags.
+
+    Parameters
+    ----------
+    default : a record with tyro.MISSING where there is no default
+    arguments : of the command line, without the verb
+    verb : its name
+    file : settings file where --config names none
+
+    Raises
+    ------
+    InputError
+        If file or flags are not such settings.
+    """
+    file = _config(arguments) or file
+    if file is not None:
+        default = merge(default, read_toml(file), str(file))
+    return parse(default, arguments, f"nerif {verb}", inspect.getdoc(type(default)) or "")
+
+
+def value_given(name: str, arguments: list[str], default: str, file: Path | None = None) -> str:
+    """Return what flag or settings file say of one setting on which the defaults of the others depend."""
+    file = _config(arguments) or file
+    given = flag_value(arguments, f"--{name}") or (read_toml(file).get(name) if file is not None else None)
+    return str(given or default)
+
+
+def _config(arguments: list[str]) -> Path | None:
+    config = flag_value(arguments, "--config")
+    return Path(config) if config else None
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import flag_value, merge, parse, read_toml
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
@@ -24,7 +24,7 @@ __all__ = ["Simulate", "main", "run"]
 
 
 @dataclass(frozen=True)
-class Simulate:
+class Simulate(Settings):
     """Trace curved rays through a phantom and write a measurement, with its truth as a volume beside it."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -53,8 +53,6 @@ class Simulate:
     """Runge-Kutta steps of a ray through the box."""
     force: bool = False
     """Overwrite existing files."""
-    config: Path | None = None
-    """TOML file of settings; flags win over it."""
     ring: Annotated[Ring, tyro.conf.arg(name="")] = field(default_factory=Ring)
 
 
@@ -149,8 +147,4 @@ def _phantom(settings: Simulate) -> tuple[Field, Box]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    default = Simulate(out=tyro.MISSING)
-    config = flag_value(arguments, "--config")
-    if config:
-        default = merge(default, read_toml(Path(config)), config)
-    run(parse(default, arguments, "nerif simulate", Simulate.__doc__ or ""))
+    run(read_settings(Simulate(out=tyro.MISSING), arguments, "simulate"))

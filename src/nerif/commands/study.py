@@ -18,7 +18,7 @@ import tyro
 from nerif import __version__
 from nerif.commands.output import say
 from nerif.commands.result_files import versions
-from nerif.commands.settings import parse
+from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.presets import preset
@@ -32,7 +32,7 @@ PAGE_EVERY = 180.0  # seconds between pages while the study goes on
 
 
 @dataclass(frozen=True)
-class Study:
+class Study(Settings):
     """Repeat the paper's numerical study and write study.md and study.html; done again, it goes on where it was.
 
     Sections: tables, slices, curves, cost, network, encoding, sampling, differentiation, model, resolution, views and
@@ -179,4 +179,4 @@ class _Clock:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    run(parse(Study(), arguments, "nerif study", Study.__doc__ or ""))
+    run(read_settings(Study(), arguments, "study"))

@@ -11,10 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError, Matrix3, Pixels, Points
+from nerif.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points
 from nerif.geometry.rays import Rays
 
 __all__ = ["Camera", "Plane"]
+
+LEAST_FOCAL = 1.0  # px
+LARGEST_IMAGE = 100_000  # px
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Camera:
     Raises
     ------
     InputError
-        If the rotation is not one, or a focal length or the image size is not positive.
+        If the rotation is not one, or another number cannot be that of a camera.
     """
 
     intrinsics: Matrix3
@@ -60,6 +63,22 @@ class Camera:
     name: str = "camera"
 
     def __post_init__(self) -> None:
+        plane = self.background
+        for what, value, most, unit in (
+            ("intrinsics", self.intrinsics, 1e7, "px"),
+            ("translation", self.translation, LARGEST_LENGTH, "mm"),
+            ("distortion", self.distortion, 1e6, ""),
+            ("background_offset", torch.tensor(plane.offset), LARGEST_LENGTH, "mm"),
+        ):
+            if not bool((value.abs() <= most).all()):
+                got = value.tolist()
+                raise InputError(
+                    f"{what} of view '{self.name}': expected numbers up to {most:g} {unit}".rstrip() + f", got {got}"
+                )
+        if not abs(float(plane.normal.norm()) - 1) < 1e-2:
+            raise InputError(
+                f"background_normal of view '{self.name}': expected a unit vector, got {plane.normal.tolist()}"
+            )
         r = self.rotation
         error = float((r @ r.T - torch.eye(3, dtype=r.dtype)).abs().max())
         determinant = float(torch.linalg.det(r))
@@ -69,7 +88,7 @@ class Camera:
                 f"got |R R^T - 1| = {error:.2g}, det = {determinant:.3g}; check for a swapped or mirrored axis"
             )
         k = self.intrinsics
-        if not (bool(torch.isfinite(k).all()) and k[0, 0] > 0 and k[1, 1] > 0):
+        if not (LEAST_FOCAL <= float(k[0, 0]) and LEAST_FOCAL <= float(k[1, 1])):
             raise InputError(
                 f"intrinsics of view '{self.name}': expected positive focal lengths in px, "
                 f"got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}"
@@ -79,11 +98,11 @@ class Camera:
                 f"intrinsics of view '{self.name}': expected K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; "
                 "a transposed K (MATLAB) has to be transposed back"
             )
-        for what, value in (("translation", self.translation), ("distortion", self.distortion)):
-            if not bool(torch.isfinite(value).all()):
-                raise InputError(f"{what} of view '{self.name}': expected finite numbers, got {value.tolist()}")
-        if min(self.image_size) < 1:
-            raise InputError(f"image size of view '{self.name}': expected (height, width) > 0, got {self.image_size}")
+        if not (0 < min(self.image_size) and max(self.image_size) <= LARGEST_IMAGE):
+            raise InputError(
+                f"image_size of view '{self.name}': expected (height, width) between 1 and {LARGEST_IMAGE} px, "
+                f"got {self.image_size}"
+            )
 
     @property
     def centre(self) -> Float[Tensor, 3]:
@@ -132,15 +151,13 @@ class Camera:
         distorted, inner = self._distort(ideal)
         k = self.intrinsics[:2, :2]
         pixels = distorted @ k.T + self.intrinsics[:2, 2]
-        zero = torch.zeros_like(depth[..., 0])
-        one = torch.ones_like(zero)
-        perspective = (
-            torch.stack(
-                [torch.stack([one, zero, -ideal[..., 0]], -1), torch.stack([zero, one, -ideal[..., 1]], -1)], -2
-            )
-            / depth[..., None]
-        )
-        return pixels, k @ inner @ perspective @ self.rotation
+        # k inner (R[:2] - ideal R[2]) / depth, one row of it after the other: small matrix products are slow in a batch
+        (xx, xy), (yx, yy) = (row.unbind(-1) for row in inner.unbind(-2))
+        rows = []
+        for along_x, along_y in ((k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy), (k[1, 1] * yx, k[1, 1] * yy)):
+            rows += [along_x, along_y, -(along_x * ideal[..., 0] + along_y * ideal[..., 1])]
+        jacobian = (torch.stack(rows, dim=-1) / depth).unflatten(-1, (2, 3)) @ self.rotation
+        return pixels, jacobian
 
     def _distort(self, ideal: Pixels) -> tuple[Pixels, Float[Tensor, "*batch 2 2"]]:
         """OpenCV's distortion of ideal image coordinates, and its Jacobian."""
@@ -158,14 +175,18 @@ class Camera:
         return torch.stack([xd, yd], -1), jacobian
 
     def _undistort(self, distorted: Pixels) -> Pixels:
-        """Invert the distortion by Newton's method (at most 20 steps; exact at once when there is none)."""
+        """Invert the distortion by Newton's method (at most 20 steps)."""
+        if not bool(self.distortion.any()):
+            return distorted
         ideal = distorted
         for _ in range(20):
             value, jacobian = self._distort(ideal)
             residual = distorted - value
             if float(residual.abs().amax()) < 1e-14:
                 break
-            ideal = ideal + torch.linalg.solve(jacobian, residual)
+            (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
+            x, y = residual.unbind(-1)
+            ideal = ideal + torch.stack([d * x - b * y, a * y - c * x], dim=-1) / (a * d - b * c)[..., None]
         if not float((distorted - self._distort(ideal)[0]).abs().amax()) < 1e-9:
             raise InputError(
                 f"distortion of view '{self.name}': expected coefficients that can be inverted over the image, "

@@ -11,9 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import FACES, InputError
+from nerif.conventions import FACES, LARGEST_LENGTH, InputError
 
 __all__ = ["Box", "Grid"]
+
+SHORTEST_EDGE = 1e-5  # of the largest coordinate: voxels are told apart in single precision
 
 
 @dataclass(frozen=True)
@@ -27,15 +29,17 @@ class Box:
     Raises
     ------
     InputError
-        If an edge is not longer than zero, or a corner is not finite.
+        If an edge is not longer than zero, or a corner is not finite or beyond ten kilometres.
     """
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        edges = [b - a for a, b in zip(self.lower, self.upper, strict=True)]
-        if len(edges) != 3 or not all(0 < e < float("inf") for e in edges):
+        if not len(self.lower) == len(self.upper) == 3:
+            raise InputError(f"box: expected corners (x, y, z) in mm, got {self.lower} to {self.upper}")
+        largest = max(abs(c) for c in (*self.lower, *self.upper))
+        if not (largest <= LARGEST_LENGTH and all(e > SHORTEST_EDGE * largest for e in self.edges)):
             raise InputError(f"box: expected lower < upper along x, y and z (mm), got {self.lower} to {self.upper}")
 
     @classmethod
@@ -78,12 +82,20 @@ class Grid:
     shape: tuple[int, int, int]
 
     def __post_init__(self) -> None:
-        if len(self.shape) != 3 or min(self.shape) < 1:
+        if len(self.shape) != 3 or not all(isinstance(n, int) and n > 0 for n in self.shape):
             raise InputError(f"grid: expected three positive voxel counts (z, y, x), got {self.shape}")
 
     @classmethod
     def of_resolution(cls, box: Box, voxels: int) -> Grid:
-        """Return near-cubic voxels, `voxels` of them along the longest edge of the box."""
+        """Return near-cubic voxels, `voxels` of them along the longest edge of the box.
+
+        Raises
+        ------
+        InputError
+            If that is less than one.
+        """
+        if not voxels >= 1:
+            raise InputError(f"voxels: expected at least 1 along the longest edge, got {voxels}")
         size = max(box.edges) / voxels
         nx, ny, nz = (max(1, round(e / size)) for e in box.edges)
         return cls(box, (nz, ny, nx))

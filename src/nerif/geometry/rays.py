@@ -8,7 +8,7 @@ A ray is back-traced from a pixel. Refraction by dn at path length s moves the b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -50,6 +50,17 @@ class Rays:
     def concatenate(parts: Sequence[Rays]) -> Rays:
         """Join rays end to end."""
         return Rays(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Rays)))
+
+    @staticmethod
+    def collect(parts: Iterable[Rays], most: int) -> Rays:
+        """Join at most so many rays end to end, in single precision, holding no more than one part twice."""
+        whole = Rays(*(torch.empty(most, *shape) for shape in ((3,), (3,), (2, 3), (), (), ())))
+        count = 0
+        for part in parts:
+            for f in fields(Rays):
+                getattr(whole, f.name)[count : count + len(part)] = getattr(part, f.name)
+            count += len(part)
+        return whole[:count]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
         """Return the rays on another device or in another precision."""
