@@ -1,11 +1,12 @@
 # make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo
 # make test   set up, lint, check types, run the tests (under 10 minutes on 2 cores)
 # make docs   the documentation site: open docs/_build/html/index.html
+# make study  the paper's numerical study (hours; benchmarks/study): out/study; make study-quick: a small one, out/study-quick
 
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-all lint docs clean
+.PHONY: demo test test-all lint docs study study-quick clean
 
 demo: .venv/.run
 	$(BIN)/nerif demo --out out/demo --force
@@ -22,6 +23,12 @@ lint: .venv/.dev
 
 docs: .venv/.dev
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+
+study: .venv/.dev
+	$(BIN)/python benchmarks/study -o out/study
+
+study-quick: .venv/.dev
+	$(BIN)/python benchmarks/study --quick -o out/study-quick
 
 .venv/.run: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "nerif needs Python 3.11 or newer; try make PYTHON=python3.11")'

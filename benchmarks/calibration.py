@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from flame import machine
 from scipy.spatial.transform import Rotation
 
+from flame import machine
 from nerif.experiment import Experiment, background_scale, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.calibration import CalibrationSettings, calibrate

@@ -18,8 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from flame import N_AMBIENT, machine
 
+from flame import N_AMBIENT, machine
 from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame

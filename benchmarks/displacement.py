@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from flame import N_AMBIENT, machine
 
+from flame import N_AMBIENT, machine
 from nerif.conventions import Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom

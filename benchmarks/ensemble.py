@@ -18,8 +18,8 @@ import time
 from pathlib import Path
 
 import torch
-from flame import machine
 
+from flame import machine
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.measurement import Measurement

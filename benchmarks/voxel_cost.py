@@ -19,8 +19,8 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
-from flame import N_AMBIENT, machine
 
+from flame import N_AMBIENT, machine
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.measurement import Measurement

@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from flame import N_AMBIENT, machine
-
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom

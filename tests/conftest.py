@@ -25,7 +25,7 @@ CHECKED += (
     "experiment",
     "consistency",
     "mistakes",
-    "study",
+    "resolution",
     "measurement_sequence",
     "volume_sequence",
     "sequence",

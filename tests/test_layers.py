@@ -18,12 +18,11 @@ LAYERS = (
     ("imaging",),
     ("fields",),
     ("physics",),
-    ("metrics", "simulation", "rendering"),
+    ("metrics", "resolution", "simulation", "rendering"),
     ("experiment",),
     ("reconstruction",),
     ("evaluation", "consistency", "mistakes"),
     ("report", "sequence"),
-    ("study",),
     ("commands",),
     ("cli", "__main__"),
 )

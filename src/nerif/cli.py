@@ -27,7 +27,6 @@ VERBS = {
     "figures": "write every figure of a result as PDF and PNG at journal widths",
     "export": "write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid",
     "info": "print what a measurement, volume or result holds",
-    "study": "repeat the paper's numerical study and set it beside the paper's figures",
     "demo": "simulate, reconstruct and evaluate a small flame",
 }
 

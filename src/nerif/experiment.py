@@ -19,7 +19,7 @@ from nerif.fields.base import Field
 from nerif.geometry import Box, Camera
 from nerif.imaging.background import Background
 from nerif.imaging.bundle import Pose
-from nerif.imaging.targets import Target
+from nerif.imaging.targets import CalibrationTarget
 from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "target_poses", "world_axes"]
@@ -90,13 +90,13 @@ class Experiment:
                 self._target_picture(folder / camera.name / "background" / f"laid_{j:03d}.tif", camera, laid, pose)
                 on_picture()
 
-    def target_for(self, cameras: Sequence[Camera]) -> Target:
+    def target_for(self, cameras: Sequence[Camera]) -> CalibrationTarget:
         """Return the target, of a size that fits the pictures if none is given."""
         pitch = self.pitch
         if pitch == 0:
             seen = (c.centre.norm() / c.intrinsics[0, 0] * torch.tensor(c.image_size) for c in cameras)
             pitch = 0.75 * min(min(float(s[1]) / (self.columns + 1), float(s[0]) / (self.rows + 1)) for s in seen)
-        return Target(self.target, self.columns, self.rows, pitch)
+        return CalibrationTarget(self.target, self.columns, self.rows, pitch)
 
     def pictures(self, views: int) -> int:
         """Number of pictures of `views` views (those of targets that face away counted)."""
@@ -109,7 +109,7 @@ class Experiment:
         width, height = pattern_size(camera)
         pixel = width / 1.1 / camera.image_size[1]
         pattern = Background(self.kind, width, height, dot=self.dot * pixel, seed=1000 * self.seed + i)
-        texel = self.dot * pixel / 12
+        texel = pattern.raster_pixel(0.0)
         texture = background_texture(camera, torch.from_numpy(pattern.raster(texel)), texel)
         still = render(camera, texture, samples=self.samples, lens=lens)
         for k in range(self.references):
@@ -119,7 +119,7 @@ class Experiment:
         self._save(folder / "flow" / "flow_000.tif", flow)
         on_picture()
 
-    def _target_picture(self, path: Path, camera: Camera, target: Target, pose: Pose) -> None:
+    def _target_picture(self, path: Path, camera: Camera, target: CalibrationTarget, pose: Pose) -> None:
         self._save(path, render(camera, place(target, pose, camera), samples=self.samples))
 
     def _save(self, path: Path, light: Float[Tensor, "row column"]) -> None:
@@ -158,7 +158,7 @@ def _side(cameras: Sequence[Camera]) -> tuple[int, int]:
     return (0, 1 if y > 0 else -1)
 
 
-def target_poses(cameras: Sequence[Camera], target: Target, count: int, seed: int) -> list[Pose]:
+def target_poses(cameras: Sequence[Camera], target: CalibrationTarget, count: int, seed: int) -> list[Pose]:
     """Return poses (target to world) around the origin, turned towards the cameras; the first one stands straight.
 
     The others face a point between two neighbouring cameras, tilted by up to 35 degrees and moved by up to a tenth of
@@ -183,7 +183,7 @@ def target_poses(cameras: Sequence[Camera], target: Target, count: int, seed: in
     return poses
 
 
-def background_poses(camera: Camera, target: Target, count: int) -> list[Pose]:
+def background_poses(camera: Camera, target: CalibrationTarget, count: int) -> list[Pose]:
     """Return poses of the target laid on a camera's background: in the middle, then towards the corners."""
     from scipy.spatial.transform import Rotation
 
@@ -201,7 +201,7 @@ def background_poses(camera: Camera, target: Target, count: int) -> list[Pose]:
     return poses
 
 
-def place(target: Target, pose: Pose, camera: Camera) -> Texture:
+def place(target: CalibrationTarget, pose: Pose, camera: Camera) -> Texture:
     """Return a target in space as something to render, drawn finely enough for a camera."""
     depth = float(camera.rotation[2].numpy() @ pose.translation + float(camera.translation[2]))
     fine = depth / float(camera.intrinsics[0, 0]) / 3  # as the points of a pixel: finer edges would alias

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -12,8 +13,9 @@ from scipy.spatial import cKDTree
 
 from nerif.cli import main
 from nerif.conventions import InputError
-from nerif.imaging.background import KINDS, MARGIN, Background, write_pattern
-from nerif.imaging.targets import Target
+from nerif.imaging.background import KINDS, Background
+from nerif.imaging.printing import MARGIN, paper_for, print_pattern
+from nerif.imaging.targets import CalibrationTarget
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -68,29 +70,38 @@ def test_patterns_that_cannot_be(change, words):
 
 
 def test_files_are_of_true_size(tmp_path):
-    raster = Background("wavelet", 60.0, 40.0, dot=2.0).raster(0.25)
-    write_pattern(tmp_path / "p.png", raster, 0.25, "x")
+    pattern = Background("wavelet", 60.0, 40.0, dot=2.0)
+    print_pattern(tmp_path / "p.png", pattern, dpi=101.6)
     with Image.open(tmp_path / "p.png") as image:
         assert image.size[0] / image.info["dpi"][0] * 25.4 == pytest.approx(60.0, rel=1e-3)
         assert image.size[1] / image.info["dpi"][1] * 25.4 == pytest.approx(40.0, rel=1e-3)
-    write_pattern(tmp_path / "p.pdf", raster, 0.25, "x")
+    print_pattern(tmp_path / "p.pdf", pattern, dpi=101.6)
     box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ([\d.]+) ?\]", (tmp_path / "p.pdf").read_bytes())
     assert box is not None
     assert float(box[1]) / 72 * 25.4 == pytest.approx(60 + 2 * MARGIN, rel=1e-3)
     assert float(box[2]) / 72 * 25.4 == pytest.approx(40 + 2 * MARGIN, rel=1e-3)
-    with pytest.raises(InputError, match=r"\.png or \.pdf"):
-        write_pattern(tmp_path / "p.gif", raster, 0.25, "x")
+    with pytest.raises(InputError, match=r"\.pdf or \.png"):
+        print_pattern(tmp_path / "p.gif", pattern)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["p.pdf", "p.png"]
+
+
+def test_paper_is_the_smallest_on_which_it_fits():
+    pattern = Background(width=290.0, height=205.0)
+    assert paper_for(Path("p.png"), pattern) == "A4"
+    assert paper_for(Path("p.pdf"), pattern) == "A3"  # it has a margin for its scale bar
+    assert paper_for(Path("p.png"), Background(width=2000.0, height=500.0)) == "a plotter"
 
 
 @pytest.mark.parametrize("kind", ["dots", "chessboard", "charuco", "circles"])
 def test_the_command_writes_each_kind(tmp_path, capsys, kind):
     out = tmp_path / "p.png"
-    size = ["--columns", "8", "--rows", "7", "--pitch", "6", "--width", "70", "--height", "50", "--dpi", "150"]
+    size = ["--width", "70", "--height", "50"] if kind == "dots" else ["--columns", "8", "--rows", "7", "--pitch", "6"]
+    size += ["--dpi", "150"]
     assert main(["pattern", "--kind", kind, "-o", str(out), *size]) == 0
     said = capsys.readouterr().out
     assert "fits on A4" in said
     if kind != "dots":
-        target = Target(kind, 8, 7, 6.0)
+        target = CalibrationTarget(kind, 8, 7, 6.0)
         found = target.detect(iio.imread(out))
         assert found is not None
         assert len(found.ids) == len(target.points)
@@ -102,6 +113,7 @@ def test_the_command_writes_a_page_and_refuses_what_cannot_be(tmp_path):
     assert main(["pattern", "-o", str(tmp_path / "p.pdf"), "--width", "50", "--height", "40"]) == 0
     assert (tmp_path / "p.pdf").stat().st_size > 1000
     assert main(["pattern", "-o", str(tmp_path / "q.pdf"), "--kind", "zebra"]) == 2
+    assert main(["pattern", "-o", str(tmp_path / "q.pdf"), "--kind", "charuco", "--dot", "2"]) == 2  # of backgrounds
     assert main(["pattern", "-o", str(tmp_path / "q.svg")]) == 2
     assert main(["pattern", "-o", str(tmp_path / "q.pdf"), "--width", "9000", "--height", "9000", "--dot", "0.3"]) == 2
     assert main(["pattern", "-o", str(tmp_path / "q.pdf"), "--dpi", "0"]) == 2

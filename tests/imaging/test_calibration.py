@@ -13,10 +13,10 @@ from nerif.conventions import InputError
 from nerif.experiment import background_poses, target_poses, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.bundle import Bundle, Observation, Pose, _Layout, adjust
-from nerif.imaging.calibration import CalibrationSettings, ViewPictures, calibrate
-from nerif.imaging.targets import Detection, Target
+from nerif.imaging.calibration import CalibrationSettings, calibrate
+from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
 
-TARGET = Target("charuco", 9, 7, pitch=12.0)
+TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)
 
 
 def rig() -> tuple[Camera, ...]:
@@ -179,7 +179,7 @@ def test_a_wrong_pitch_shows_in_the_size_of_the_rig_only():
 
 def test_a_wrong_number_of_squares_is_refused():
     with pytest.raises(InputError, match=r"reprojection error|contradict|do not fit|no camera explains"):
-        calibrate(relabelled(Target("charuco", 8, 8, pitch=12.0)), SETTINGS)
+        calibrate(relabelled(CalibrationTarget("charuco", 8, 8, pitch=12.0)), SETTINGS)
 
 
 def test_too_few_poses_and_cameras_without_a_common_one():

@@ -11,9 +11,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from nerif.conventions import InputError
 from nerif.imaging.background import Background
 from nerif.imaging.correlation import normalised_median_outliers, window_correlation
-from nerif.imaging.displacement import DisplacementSettings, border, displacement, measure, remove_shake
-from nerif.imaging.masks import flow_mask, read_mask
-from nerif.imaging.optical_flow import FLOWS, warp
+from nerif.imaging.displacement import DisplacementSettings, displacement, measure
+from nerif.imaging.masks import MaskSettings, flow_mask, read_mask
+from nerif.imaging.optical_flow import FLOWS
+from nerif.imaging.shake import border, remove_shake
+from nerif.imaging.warping import warp
 
 SHAPE = (90, 120)
 FULL = 4095.0
@@ -221,14 +223,14 @@ def test_flow_mask_holds_the_flow_and_little_else(truth):
     sigma = np.full((*SHAPE, 2), 0.05, dtype=np.float32)
     d = (truth + 0.05 * rng.standard_normal(truth.shape)).astype(np.float32)
     d[2, 3] = np.nan
-    mask = flow_mask(d, sigma, threshold=4.0)
+    mask = flow_mask(d, sigma)
     strong = np.linalg.norm(truth, axis=-1)
     assert mask[strong > 0.25].all()
     assert mask[strong < 0.005].mean() < 0.02
-    assert flow_mask(d, sigma, threshold=4.0, grow=8).sum() > mask.sum()
-    assert not flow_mask(0 * d, sigma).any()
+    assert flow_mask(d, sigma, MaskSettings(grow=8)).sum() > mask.sum()
+    assert flow_mask(0 * d, sigma).sum() == np.isnan(d).any(-1).sum()
     with pytest.raises(InputError, match="threshold"):
-        flow_mask(d, sigma, threshold=-1.0)
+        MaskSettings(threshold=-1.0)
 
 
 def test_drawn_masks_are_read(tmp_path):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from nerif.conventions import InputError
 from nerif.geometry import Camera, Plane
 from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
-from nerif.imaging.importers import import_cameras
+from nerif.imaging.importers import ImportSettings, import_cameras
 
 PLANE = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -900.0)
 
@@ -76,7 +76,7 @@ def test_own_file_keeps_every_bit(tmp_path):
     [
         (("rotation", "rotatoin"), "camera 'one': unknown key 'rotatoin'; the nearest known one is 'rotation'"),
         (('name = "one"', ""), "camera 'camera 0': 'name' is missing"),
-        (("offset = -900.0", 'offset = "far"'), "background offset: expected one numbers"),
+        (("offset = -900.0", 'offset = "far"'), "background: offset: expected a number"),
         (('format = "nerif-calibration-1"', 'format = "other"'), "expected format = 'nerif-calibration-1'"),
         (("[[camera]]", "[[camera"), "not a TOML file"),
     ],
@@ -126,7 +126,7 @@ def test_plain_toml(tmp_path):
             "image_size": [160, 200], "normal": [0.0, 0.0, -2.0], "offset": -180.0,
         }  # fmt: skip
     path.write_text(tomli_w.dumps(table))
-    got = import_cameras(path, scale_mm=10.0)
+    got = import_cameras(path, ImportSettings(scale_mm=10.0))
     assert [c.name for c in got] == ["one", "two"]
     assert all(same(c, camera) for c, camera in zip(got, (ONE, TWO), strict=True))
     assert got[0].background is not None
@@ -264,7 +264,7 @@ def transforms(camera: Camera) -> dict:
 def test_nerf_transforms(tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps({"w": 200, "h": 160, "frames": [transforms(ONE), transforms(TWO)]}))
-    got = import_cameras(path, scale_mm=1000.0)
+    got = import_cameras(path, ImportSettings(scale_mm=1000.0))
     assert [c.name for c in got] == ["one", "two"]
     assert all(same(c, camera) for c, camera in zip(got, (ONE, TWO), strict=True))
     assert got[0].image_size == (160, 200)
@@ -280,9 +280,57 @@ def test_nerf_angle_of_view(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("above", "frame", "words"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE"),
+        ({"camera_model": "OPENCV"}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, {}, "EQUIRECTANGULAR"),
+        ({"is_fisheye": True}, {}, "is_fisheye"),
+        ({"k4": 0.01}, {}, "at most 5 distortion coefficients"),
+    ],
+)
+def test_nerf_cameras_of_other_models_are_refused(tmp_path, above, frame, words):
+    """Their coefficients bear the same names as Brown's, k1 to k4, and bend the rays otherwise."""
+    path = tmp_path / "transforms.json"
+    frames = [transforms(ONE), {**transforms(TWO), **frame}]
+    path.write_text(json.dumps({"w": 200, "h": 160, **above, "frames": frames}))
+    with pytest.raises(InputError, match=words) as error:
+        import_cameras(path)
+    assert f"transforms.json: frame {int(bool(frame))}: expected" in str(error.value)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_RADIAL"])
+def test_nerf_cameras_of_browns_models_are_read(tmp_path, model):
+    path = tmp_path / "transforms.json"
+    more = {"camera_model": model, "is_fisheye": False, "k4": 0.0}
+    path.write_text(json.dumps({"w": 200, "h": 160, **more, "frames": [transforms(ONE)]}))
+    assert same(import_cameras(path, ImportSettings(scale_mm=1000.0))[0], ONE)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("fisheye_model", 1), ("distortion_model", "equidistant"), ("camera_model", "omni"), ("xi", 0.8)]
+)
+def test_opencv_cameras_of_other_models_are_refused(tmp_path, key, value):
+    a, path = arrays(ONE), tmp_path / "fisheye.yml"
+    write_opencv(path, {key: value, "K": a["K"], "D": a["D"][:4], "R": a["R"], "T": a["t"]})
+    with pytest.raises(InputError, match=r"fisheye.yml.*undistort the pictures"):
+        import_cameras(path)
+
+
+def test_opencv_cameras_of_browns_model_are_read(tmp_path):
+    a, path = arrays(ONE), tmp_path / "brown.yml"
+    more = {"fisheye_model": 0, "distortion_model": "plumb_bob"}
+    write_opencv(path, {**more, "K": a["K"], "D": a["D"], "R": a["R"], "T": a["t"]})
+    assert same(import_cameras(path)[0], ONE)
+
+
+@pytest.mark.parametrize(
     ("content", "words"),
     [
         ("{", "not a JSON file"),
+        ('{"frames": [3]}', "a list 'frames'"),
+        ('{"frames": [{"fl_x": "wide", "w": 4, "h": 4}]}', "frame 0: fl_x: expected a number, got 'wide'"),
+        ('{"frames": [{"fl_x": 3, "w": -4, "h": 4}]}', "frame 0: h, w: expected height and width"),
         ('{"frames": []}', "a list 'frames'"),
         ('{"frames": [{"fl_x": 3, "w": 4, "h": 4}]}', "frame 0: transform_matrix: expected 4 x 4 numbers"),
         ('{"frames": [{"w": 4, "h": 4}]}', "no focal length"),
@@ -308,40 +356,141 @@ def bouguet(camera: Camera) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-def parameters(camera: Camera) -> dict[str, np.ndarray]:
-    a = arrays(camera)
-    k = a["K"].copy()
-    k[:2, 2] += 1  # MATLAB's pixels start at 1
-    d = a["D"]
+def rotation_vector_to_matrix(vector: np.ndarray) -> np.ndarray:
+    """As documented for MATLAB's rotationVectorToMatrix: pi/2 about z is [0 1 0; -1 0 0; 0 0 1], for row vectors."""
+    x, y, z = vector / np.linalg.norm(vector)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.linalg.norm(vector)
+    return (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross).T
+
+
+def world_to_image(struct: dict[str, np.ndarray], pose: int, points: np.ndarray) -> np.ndarray:
+    """As documented for MATLAB's worldToImage: w [x y 1] = [X Y Z 1] [R; t] K with K its transposed, from pixel 1."""
+    seen = points @ rotation_vector_to_matrix(struct["RotationVectors"][pose - 1])
+    seen = seen + struct["TranslationVectors"][pose - 1]
+    x, y = (seen[:, :2] / seen[:, 2:]).T
+    r2 = x**2 + y**2
+    k, (p1, p2) = [*struct["RadialDistortion"], 0][:3], struct["TangentialDistortion"]
+    radial = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    intrinsics = struct["IntrinsicMatrix"] if "IntrinsicMatrix" in struct else struct["K"].T
+    return (np.stack([u, v, np.ones_like(u)], axis=1) @ intrinsics)[:, :2]
+
+
+def camera_parameters(seed: int, release: str, radial: int = 3) -> dict:
+    """What toStruct gives of a cameraParameters object: the fields that MathWorks documents, and no others."""
+    rng = np.random.default_rng(seed)
+    k = np.array([[1500.0 + seed, 0.7, 101.25], [0, 1480.0, 77.5], [0, 0, 1]])
     return {
-        "IntrinsicMatrix": k.T, "RadialDistortion": d[[0, 1, 4]], "TangentialDistortion": d[2:4],
-        "ImageSize": np.array([160.0, 200.0]), "RotationMatrices": np.stack([np.eye(3), a["R"].T], axis=-1),
-        "TranslationVectors": np.stack([np.zeros(3), a["t"]]),
+        **({"K": k} if release == "R2022b" else {"IntrinsicMatrix": k.T}),
+        "RadialDistortion": np.array([-0.1, 0.05, 0.01])[:radial], "TangentialDistortion": np.array([0.001, -0.002]),
+        "ImageSize": np.array([160.0, 200.0]), "RotationVectors": rng.normal(0, 0.8, (3, 3)),
+        "TranslationVectors": np.array([[0, 0, 600.0], [3, -4, 700.0], [5, 6, 800.0]]),
+        "WorldPoints": rng.uniform(0, 50, (54, 2)), "WorldUnits": "millimeters", "EstimateSkew": True,
+        "NumRadialDistortionCoefficients": float(radial), "EstimateTangentialDistortion": True,
+        "ReprojectionErrors": rng.normal(0, 0.1, (54, 2, 3)),
+        "Version": {"Name": "Computer Vision Toolbox", "Version": "10.3", "Release": f"({release})", "Date": ""},
+        **({"DetectedKeypoints": np.ones((54, 3), dtype=bool)} if release == "R2022b" else {}),
     }  # fmt: skip
+
+
+def sees(got: CalibratedCamera, struct: dict, pose: int) -> bool:
+    """Whether a camera projects as MATLAB does, pixel 1 of which is ours of number 0."""
+    points = np.random.default_rng(0).uniform(-25, 25, (20, 3))
+    ours = got.camera(background=PLANE).project(torch.from_numpy(points)).numpy()
+    return float(np.abs(ours - (world_to_image(struct, pose, points) - 1)).max()) < 1e-6
+
+
+def test_the_rotations_here_are_those_of_matlabs_example():
+    assert np.allclose(rotation_vector_to_matrix(np.array([0, 0, np.pi / 2])), [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("release", ["R2021a", "R2022b"])
+@pytest.mark.parametrize("radial", [2, 3])
+@pytest.mark.parametrize("pose", [1, 2])
+def test_camera_parameters_by_to_struct(tmp_path, release, radial, pose):
+    path = tmp_path / "plain.mat"
+    struct = camera_parameters(1, release, radial)
+    scipy.io.savemat(path, struct)
+    (got,) = import_cameras(path, ImportSettings(pose=pose))
+    assert sees(got, struct, pose)
+    assert got.image_size == (160, 200)
+    with pytest.raises(InputError, match=r"pose of picture 7.* got 3 and 3 poses"):
+        import_cameras(path, ImportSettings(pose=7))
+
+
+def test_camera_parameters_of_several_cameras_or_one_pose(tmp_path):
+    path = tmp_path / "rig.mat"
+    left, right = camera_parameters(1, "R2022b"), camera_parameters(2, "R2021a")
+    single = {k: v[:1] if k in ("RotationVectors", "TranslationVectors") else v for k, v in left.items()}
+    scipy.io.savemat(path, {"left": left, "right": right, "single": single})
+    got = import_cameras(path)
+    assert [c.name for c in got] == ["left", "right", "single"]
+    assert all(sees(c, struct, 1) for c, struct in zip(got, (left, right, left), strict=True))
+
+
+def test_camera_parameters_without_target_pictures(tmp_path):
+    path = tmp_path / "plain.mat"
+    scipy.io.savemat(path, {**camera_parameters(1, "R2022b"), "RotationVectors": np.zeros((0, 3))})
+    with pytest.raises(InputError, match=r"pose of picture 1 in RotationVectors.* got 0 and 3 poses"):
+        import_cameras(path)
+
+
+def test_rotation_matrices_of_the_toolbox_multiply_row_vectors(tmp_path):
+    path = tmp_path / "plain.mat"
+    struct = camera_parameters(1, "R2021a")
+    vectors = struct.pop("RotationVectors")
+    matrices = np.stack([rotation_vector_to_matrix(v) for v in vectors], axis=-1)
+    scipy.io.savemat(path, {**struct, "RotationMatrices": matrices})
+    (got,) = import_cameras(path, ImportSettings(pose=2))
+    assert sees(got, {**struct, "RotationVectors": vectors}, 2)
+
+
+@pytest.mark.parametrize("pictures", [True, False])
+def test_stereo_parameters_by_to_struct(tmp_path, pictures):
+    """x_2 = x_1 RotationOfCamera2 + TranslationOfCamera2; the poses of camera 2 are those of camera 1, so moved."""
+    path = tmp_path / "stereo.mat"
+    one, two = camera_parameters(1, "R2021a"), camera_parameters(2, "R2021a")
+    turn, shift = rotation_vector_to_matrix(np.array([0.1, -0.3, 0.05])), np.array([-120.0, 5.0, 8.0])
+    for i in range(3):
+        matrix = rotation_vector_to_matrix(one["RotationVectors"][i]) @ turn
+        two["RotationVectors"][i] = cv2.Rodrigues(matrix.T)[0].ravel()
+        two["TranslationVectors"][i] = one["TranslationVectors"][i] @ turn + shift
+    stereo = {"CameraParameters1": one, "CameraParameters2": two, "RotationOfCamera2": turn,
+              "TranslationOfCamera2": shift, "Version": one["Version"]}  # fmt: skip
+    none = {"RotationVectors": np.zeros((0, 3)), "TranslationVectors": np.zeros((0, 3))}
+    if not pictures:
+        stereo |= {"CameraParameters1": one | none, "CameraParameters2": two | none}
+    scipy.io.savemat(path, stereo)
+    first, second = import_cameras(path, ImportSettings(pose=2 if pictures else 1))
+    if pictures:
+        assert sees(first, one, 2)
+        assert sees(second, two, 2)
+        return
+    points = np.random.default_rng(0).uniform(-25, 25, (20, 3))
+    seen = points @ rotation_vector_to_matrix(one["RotationVectors"][1]) + one["TranslationVectors"][1]
+    for got, struct in ((first, one), (second, two)):
+        ours = got.camera(background=PLANE).project(torch.from_numpy(seen)).numpy()  # camera 1 is the world
+        assert np.abs(ours - (world_to_image(struct, 2, points) - 1)).max() < 1e-6
+
+
+def test_fisheye_parameters_are_refused(tmp_path):
+    path = tmp_path / "fisheye.mat"
+    intrinsics = {"MappingCoefficients": np.array([880.0, -3e-4, 0, 0]), "DistortionCenter": np.array([100.0, 80.0])}
+    scipy.io.savemat(path, {"Intrinsics": intrinsics, "RotationVectors": np.eye(3), "TranslationVectors": np.eye(3)})
+    with pytest.raises(InputError, match=r"fisheye.mat.*got 'fisheyeParameters'"):
+        import_cameras(path)
 
 
 def test_bouguets_toolbox(tmp_path):
     path = tmp_path / "Calib_Results.mat"
     scipy.io.savemat(path, bouguet(ONE))
-    (got,) = import_cameras(path, pose=2)
+    (got,) = import_cameras(path, ImportSettings(pose=2))
     assert same(got, ONE)
     assert got.image_size == (160, 200)
     with pytest.raises(InputError, match=r"pose of picture 1 .* got Rc_2"):
         import_cameras(path)
-
-
-def test_camera_parameters_as_structs(tmp_path):
-    path = tmp_path / "plain.mat"
-    scipy.io.savemat(path, parameters(ONE))
-    (got,) = import_cameras(path, pose=2)
-    assert same(got, ONE)
-    assert got.image_size == (160, 200)
-    scipy.io.savemat(path, {"left": parameters(ONE), "right": parameters(TWO)})
-    got = import_cameras(path, pose=2)
-    assert [c.name for c in got] == ["left", "right"]
-    assert same(got[1], TWO)
-    with pytest.raises(InputError, match="pose of picture 7"):
-        import_cameras(path, pose=7)
 
 
 def test_plain_arrays_one_and_stacked(tmp_path):
@@ -417,4 +566,4 @@ def test_other_errors(tmp_path):
     with pytest.raises(InputError, match=r"ending in .toml .csv"):
         import_cameras(odd)
     with pytest.raises(InputError, match="scale_mm"):
-        import_cameras(odd, scale_mm=0.0)
+        ImportSettings(scale_mm=0.0)

@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
 from nerif.conventions import InputError
 from nerif.imaging.crop import Crop
-from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames, overexposed
+from nerif.imaging.frames import Frames, good_frames
+from nerif.imaging.readers import open_frames
 from nerif.imaging.views import View
 
 N, H, W = 4, 7, 10
@@ -42,75 +44,6 @@ def same(frames: Frames, stack: np.ndarray) -> None:
     for i, expected in enumerate(stack):
         assert frames[i].dtype == expected.dtype
         np.testing.assert_array_equal(frames[i], expected)
-
-
-def write_tiff(path: Path, image: np.ndarray, **options) -> None:
-    import tifffile
-
-    tifffile.imwrite(path, image, **options)
-
-
-def write_cv(path: Path, image: np.ndarray) -> None:
-    import cv2
-
-    assert cv2.imwrite(str(path), image)
-
-
-def write_images(folder: Path, stack: np.ndarray, suffix: str = ".png", stem: str = "ref_") -> None:
-    folder.mkdir(exist_ok=True)
-    for i, image in enumerate(stack):
-        write_cv(folder / f"{stem}{i:03d}{suffix}", image)
-
-
-def packed(values: np.ndarray, bits: int = 12) -> bytes:
-    """Values of `bits` each, one after the other, the highest bit first, filled up to whole bytes."""
-    text = "".join(f"{v:0{bits}b}" for v in values.ravel())
-    return bytes(int(text[i : i + 8].ljust(8, "0"), 2) for i in range(0, len(text), 8))
-
-
-CIH = """#Camera Information Header
-Date : 2024/5/3
-Camera Type : FASTCAM SA-Z
-Record Rate(fps) : {rate}
-Shutter Speed(s) : 1/40000
-Total Frame : {n}
-Original Total Frame : {n}
-Image Width : {w}
-Image Height : {h}
-Color Type : Mono
-Color Bit : {bit}
-File Format : {kind}
-EffectiveBit Depth : {depth}
-EffectiveBit Side : {side}
-Comment Text :
-"""
-
-CIHX = """<?xml version="1.0" encoding="utf-8"?>
-<cih>
- <fileInfo><date>2024/5/3</date></fileInfo>
- <basicInfo><comment>x</comment></basicInfo>
- <deviceInfo><deviceName>FASTCAM Nova</deviceName></deviceInfo>
- <recordInfo><recordRate>{rate}</recordRate><shutterSpeed>40000</shutterSpeed></recordInfo>
- <frameInfo><totalFrame>{n}</totalFrame><recordedFrame>{n}</recordedFrame></frameInfo>
- <imageFileInfo><fileFormat>{kind}</fileFormat></imageFileInfo>
- <imageDataInfo>
-  <resolution><width>{w}</width><height>{h}</height></resolution>
-  <colorInfo><bit>{bit}</bit></colorInfo>
-  <effectiveBit><depth>{depth}</depth><side>{side}</side></effectiveBit>
- </imageDataInfo>
-</cih>
-"""
-
-
-def write_photron(
-    folder, data: bytes, n=N, h=H, w=W, bit=12, depth=12, side="Lower", rate=20000, kind="MRaw", xml=False
-):
-    (folder / "rec.mraw").write_bytes(data)
-    header = folder / ("rec.cihx" if xml else "rec.cih")
-    text = (CIHX if xml else CIH).format(rate=rate, n=n, h=h, w=w, bit=bit, depth=depth, side=side, kind=kind)
-    # what precedes the XML in real files is not text
-    header.write_bytes((b"\xff\xfe\x00head\n" if xml else b"") + text.encode())
-    return header
 
 
 # --- images
@@ -524,12 +457,12 @@ def test_frames_are_a_sequence(tmp_path, stack8):
 
 
 def test_files_are_read_when_asked_for(tmp_path, rng, monkeypatch):
-    from nerif.imaging import recordings
+    from nerif.imaging import image_files
 
     write_images(tmp_path / "cam1", rng.integers(0, 256, (30, H, W)).astype(np.uint8))
     read = []
-    real = recordings.FileFrames.load
-    monkeypatch.setattr(recordings.FileFrames, "load", lambda self, i: (read.append(i), real(self, i))[1])
+    real = image_files.FileFrames.load
+    monkeypatch.setattr(image_files.FileFrames, "load", lambda self, i: (read.append(i), real(self, i))[1])
     frames = open_frames(tmp_path / "cam1")
     assert len(frames) == 30
     assert read == []
@@ -728,50 +661,3 @@ def test_not_a_number(tmp_path, rng, value):
     good, lines = good_frames(open_frames("a.npy", tmp_path))
     assert good == [0, 2, 3]
     assert lines == ["a.npy frame 1: expected numbers in all pixels, got NaN or infinity in 2 of 70"]
-
-
-# --- exposure
-
-
-@pytest.mark.parametrize(("peak", "bits"), [(200, 10), (1023, 10), (1024, 12), (4095, 12), (16383, 14), (16384, 16)])
-def test_effective_bits_of_unknown_ones(tmp_path, peak, bits):
-    stack = np.zeros((N, H, W), np.uint16)
-    stack[0, 3, 4] = peak
-    np.save(tmp_path / "a.npy", stack)
-    frames = open_frames(tmp_path / "a.npy")
-    assert effective_bits(frames) == bits
-    assert frames.bits == 16
-
-
-def test_effective_bits_of_known_ones(tmp_path, stack8, stack12):
-    np.save(tmp_path / "a.npy", stack8)
-    assert effective_bits(open_frames(tmp_path / "a.npy")) == 8
-    np.save(tmp_path / "f.npy", stack8 / 255)
-    assert effective_bits(open_frames(tmp_path / "f.npy")) == 1
-    assert effective_bits(open_frames(write_photron(tmp_path, packed(stack12 // 8)))) == 12
-
-
-@pytest.mark.parametrize(
-    ("full", "bits", "dtype"),
-    [(255, 8, np.uint8), (4095, 12, np.uint16), (65535, 16, np.uint16), (65520, 16, np.uint16), (1.0, 1, np.float32)],
-)
-def test_overexposed(full, bits, dtype):
-    image = np.full((10, 20), full // 2 // 16 * 16, dtype)
-    assert overexposed(image, bits) == 0
-    image[:3, :5] = full
-    assert overexposed(image, bits) == pytest.approx(15 / 200)
-
-
-def test_exposure_lines():
-    image = np.full((20, 50), 1000, np.uint16)
-    assert check_exposure(image, 12, "cam1/ref_001.tif") is None
-    image.flat[:42] = 4095
-    line = "cam1/ref_001.tif: 4.2% of the pixels are over-exposed (4095 of 12 bit); lower the exposure"
-    assert check_exposure(image, 12, "cam1/ref_001.tif") == line
-    assert check_exposure(image, 12, "x", limit=0.05) is None
-    dark = np.full((40, 50), 41, np.uint16)
-    dark[3, 4] = 4095  # a hot pixel
-    assert check_exposure(dark, 12, "x") == (
-        "x: nearly black, 1.0% of the range is used (4095 of 12 bit); raise the exposure"
-    )
-    assert check_exposure(dark, 10, "x") is None

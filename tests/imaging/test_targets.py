@@ -11,13 +11,13 @@ from nerif.conventions import InputError
 from nerif.experiment import place
 from nerif.geometry import Camera, Plane
 from nerif.imaging.bundle import Pose
-from nerif.imaging.targets import Target
+from nerif.imaging.targets import CalibrationTarget
 from nerif.rendering import Sensor, render
 
 TARGETS = {
-    "chessboard": Target("chessboard", 10, 7, pitch=6.0),
-    "charuco": Target("charuco", 9, 7, pitch=7.0),
-    "circles": Target("circles", 9, 6, pitch=7.0),
+    "chessboard": CalibrationTarget("chessboard", 10, 7, pitch=6.0),
+    "charuco": CalibrationTarget("charuco", 9, 7, pitch=7.0),
+    "circles": CalibrationTarget("circles", 9, 6, pitch=7.0),
 }
 
 
@@ -34,7 +34,7 @@ def camera() -> Camera:
     )
 
 
-def seen(target: Target, camera: Camera, angles: tuple[float, float, float], bits: int = 12) -> tuple:
+def seen(target: CalibrationTarget, camera: Camera, angles: tuple[float, float, float], bits: int = 12) -> tuple:
     """A picture of the target 360 mm before the camera, and where its points are."""
     pose = Pose(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), np.array([-2.0, 1.5, 360.0]))
     picture = Sensor(bits=bits).expose(render(camera, place(target, pose, camera)), seed=1)
@@ -57,7 +57,7 @@ def test_points_are_found_where_they_are(camera, kind, angles):
 @pytest.mark.parametrize("kind", ["chessboard", "charuco"])
 @pytest.mark.parametrize("turn", [180.0, 90.0])
 def test_a_turned_target_keeps_its_numbers(camera, kind, turn):
-    target = Target(kind, 8, 7, pitch=6.0)
+    target = CalibrationTarget(kind, 8, 7, pitch=6.0)
     picture, truth = seen(target, camera, (10, 5, turn))
     found = target.detect(picture)
     assert found is not None
@@ -109,9 +109,9 @@ def test_points_are_centred_and_a_pitch_apart(kind):
 )
 def test_targets_that_cannot_be(values, words):
     with pytest.raises(InputError, match=words):
-        Target(*values)
+        CalibrationTarget(*values)
 
 
 def test_too_few_markers_in_the_dictionary():
     with pytest.raises(InputError, match="at least 60 markers"):
-        Target("charuco", 12, 10, 5.0, dictionary="DICT_4X4_50").raster(0.5)
+        CalibrationTarget("charuco", 12, 10, 5.0, dictionary="DICT_4X4_50").raster(0.5)

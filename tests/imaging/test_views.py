@@ -7,7 +7,7 @@ import pytest
 import tifffile
 
 from nerif.conventions import InputError
-from nerif.imaging.targets import Target
+from nerif.imaging.targets import CalibrationTarget
 from nerif.imaging.views import _pose_keys, find_targets, find_views, good_pictures
 
 
@@ -119,7 +119,8 @@ def test_pictures_without_a_target_are_named(folder):
         save(folder / "cam2" / "target" / f"t{i}.tif", rng.integers(0, 4000, (120, 160)).astype(np.uint16))
     said: list[str] = []
     seen: list[int] = []
-    found = find_targets(find_views(folder)[0], Target("charuco", 8, 6, 5.0), said.append, lambda: seen.append(1))
+    target = CalibrationTarget("charuco", 8, 6, 5.0)
+    found = find_targets(find_views(folder)[0], target, said.append, lambda: seen.append(1))
     assert not found.poses
     assert found.size == (120, 160)
     assert len(seen) == 2

@@ -13,11 +13,11 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
-from nerif.physics.design import Plan, expect
+from nerif.physics.design import DesignSettings, expect
 from nerif.simulation import view_displacement
 
 RING = Ring(views=5, image_size=(160, 200))
-PLAN = Plan()
+SETTINGS = DesignSettings()
 
 
 def test_expected_displacement_is_that_of_a_ball():
@@ -26,12 +26,12 @@ def test_expected_displacement_is_that_of_a_ball():
         torch.tensor([-2e-4], dtype=torch.float64),
     )  # fmt: skip
     d = view_displacement(ball, RING.cameras()[0], Box.cube(50.0), 1.00027)
-    expected = expect(RING, replace(PLAN, index_contrast=2e-4))
+    expected = expect(RING, replace(SETTINGS, index_contrast=2e-4))
     assert float(d.norm(dim=-1).max()) == pytest.approx(expected.displacement, rel=0.01)
 
 
 def test_lengths_are_those_of_similar_triangles():
-    e = expect(RING, PLAN)
+    e = expect(RING, SETTINGS)
     focal = 50.0 / 0.02
     assert e.pixel_at_flow == pytest.approx(700 / focal)
     assert e.pixel_at_background == pytest.approx(1200 / focal)
@@ -39,43 +39,43 @@ def test_lengths_are_those_of_similar_triangles():
     assert e.sensitivity == pytest.approx(focal * 500 / 1200 / 1000)
     assert e.cone == pytest.approx(50 / 16 * 500 / 1200)
     assert e.resolution == pytest.approx(np.sqrt(e.cone**2 + e.window**2 + e.diffraction**2))
-    assert e.smallest_contrast * e.displacement == pytest.approx(PLAN.index_contrast * PLAN.displacement_noise)
+    assert e.smallest_contrast * e.displacement == pytest.approx(SETTINGS.index_contrast * SETTINGS.displacement_noise)
     assert e.dot == pytest.approx(3 * e.pixel_at_background)
 
 
 def test_trade_offs_go_the_right_way():
-    near, far = (expect(replace(RING, background_distance=d), PLAN) for d in (200.0, 1000.0))
+    near, far = (expect(replace(RING, background_distance=d), SETTINGS) for d in (200.0, 1000.0))
     assert far.displacement > near.displacement
     assert far.cone > near.cone
-    wide, small = (expect(RING, replace(PLAN, f_number=n)) for n in (4.0, 32.0))
+    wide, small = (expect(RING, replace(SETTINGS, f_number=n)) for n in (4.0, 32.0))
     assert wide.cone > small.cone
     assert wide.diffraction < small.diffraction
 
 
 @pytest.mark.parametrize(
-    ("ring", "plan", "words"),
+    ("ring", "settings", "words"),
     [
-        (RING, replace(PLAN, index_contrast=1e-6), "hardly above the noise"),
-        (RING, replace(PLAN, index_contrast=2e-2), "more than half a window"),
-        (RING, replace(PLAN, f_number=1.4), "stop the lens down"),
-        (RING, replace(PLAN, flow_size=90.0), "larger than the picture"),
-        (replace(RING, pixel_pitch=0.002), replace(PLAN, flow_size=1.0), "finer than most printers"),
-        (replace(RING, background_distance=20.0), PLAN, "inside or next to the flow"),
-        (replace(RING, arc=(0.0, 60.0)), PLAN, "a gap of 120 degrees"),
-        (replace(RING, views=1), PLAN, "one view alone"),
+        (RING, replace(SETTINGS, index_contrast=1e-6), "hardly above the noise"),
+        (RING, replace(SETTINGS, index_contrast=2e-2), "more than half a window"),
+        (RING, replace(SETTINGS, f_number=1.4), "stop the lens down"),
+        (RING, replace(SETTINGS, flow_size=90.0), "larger than the picture"),
+        (replace(RING, pixel_pitch=0.002), replace(SETTINGS, flow_size=1.0), "finer than most printers"),
+        (replace(RING, background_distance=20.0), SETTINGS, "inside or next to the flow"),
+        (replace(RING, arc=(0.0, 60.0)), SETTINGS, "a gap of 120 degrees"),
+        (replace(RING, views=1), SETTINGS, "one view alone"),
     ],
 )
-def test_what_looks_wrong_is_said(ring, plan, words):
-    assert any(words in note for note in expect(ring, plan).notes)
+def test_what_looks_wrong_is_said(ring, settings, words):
+    assert any(words in note for note in expect(ring, settings).notes)
 
 
 def test_a_good_rig_is_left_in_peace():
-    assert expect(Ring(pixel_pitch=0.025), replace(PLAN, feature_size=6.0)).notes == ()
+    assert expect(Ring(pixel_pitch=0.025), replace(SETTINGS, feature_size=6.0)).notes == ()
 
 
 def test_numbers_that_cannot_be():
     with pytest.raises(InputError, match="f_number"):
-        Plan(f_number=0.0)
+        DesignSettings(f_number=0.0)
 
 
 def test_the_command_prints_and_draws(tmp_path, capsys):

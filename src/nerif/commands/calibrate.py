@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import datetime
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.commands.output import check_file, counting_bar, say
+from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
-from nerif.geometry import Box, Camera, Plane
+from nerif.geometry import Box, Camera
+from nerif.imaging.calibration import CalibrationSettings, calibrate_views, target_pictures
+from nerif.imaging.calibration_result import Calibration
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
-from nerif.imaging.targets import Target
+from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
+from nerif.imaging.targets import CalibrationTarget
+from nerif.imaging.views import find_views
 from nerif.measurement import Measurement
-
-if TYPE_CHECKING:
-    from nerif.imaging.calibration import Calibration
 
 __all__ = ["Calibrate", "main", "run"]
 
@@ -39,27 +40,13 @@ class Calibrate(Settings):
     """Calibration to write, NAME.toml; NAME.rig.png and NAME.errors.png come with it."""
     check: bool = False
     """Only draw cameras, box and background planes of SOURCE to NAME.rig.png: mirrored axes show there."""
-    target: Target = field(default_factory=Target)
+    target: CalibrationTarget = field(default_factory=CalibrationTarget)
     background_scale: float = 1.0
     """The target laid on the backgrounds is the same one printed this many times larger."""
     views: tuple[str, ...] = ()
     """Only these views."""
-    distortion: tuple[str, ...] = ("k1", "k2", "p1", "p2")
-    """Coefficients to find, out of k1 k2 p1 p2 k3."""
-    world: str = ""
-    """Number of the target pose that is the world frame; the one that most cameras see if not given."""
-    axes: tuple[str, str, str] = ("x+", "z+", "y-")
-    """World x, y, z along axes of the target there (x right, y down, z into the page): z is up by default."""
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Middle of the target there, in world coordinates, mm."""
-    max_error: float = 1.0
-    """Largest rms reprojection error to accept, px."""
-    scale_mm: float = 1.0
-    """Millimetres in a unit of length of the file that is taken over."""
-    background_distance: float | None = None
-    """Where planes are not known: background across the optical axis, this far behind the origin, mm."""
-    image_size: tuple[int, int] | None = None
-    """Height and width of the pictures where the file does not say, px."""
+    method: Annotated[CalibrationSettings, Flat] = field(default_factory=CalibrationSettings)
+    taken_over: Annotated[ImportSettings, Flat] = field(default_factory=ImportSettings)
     lower: tuple[float, float, float] | None = None
     """Lower corner of the box to draw, mm."""
     upper: tuple[float, float, float] | None = None
@@ -73,28 +60,27 @@ def run(settings: Calibrate) -> None:
     if settings.out.suffix != ".toml":
         raise InputError(f"out: expected a name ending in .toml, got '{settings.out.name}'")
     box = _box(settings)
-    rig = settings.out.with_suffix(".rig.png")
+    rig, errors = settings.out.with_suffix(".rig.png"), settings.out.with_suffix(".errors.png")
     if settings.check:
         check_file(rig, settings.force)
         cameras, found = _existing(settings)
         _draw(rig, cameras, box or found)
         return
-    errors = settings.out.with_suffix(".errors.png")
-    if settings.source.is_dir() and _has_pictures(settings.source):
+    if is_calibration(settings.source):
+        check_file(settings.out, settings.force, rig)
+        cameras = import_cameras(settings.source, settings.taken_over, settings.views)
+        write_cameras(settings.out, cameras, {"source": str(settings.source)})
+        say(f"{settings.out}: {len(cameras)} cameras taken over from {settings.source}")
+    else:
         check_file(settings.out, settings.force, rig, errors)
         calibration = _calibrate(settings)
-        cameras = _cameras(calibration)
-        write_cameras(settings.out, cameras, _about(calibration))
+        cameras = calibration.cameras
+        calibration.write(settings.out)
         _tell(calibration)
         from nerif.report.calibration_figure import save_errors
 
         save_errors(errors, calibration)
         say(f"{settings.out}: {len(cameras)} cameras; {errors}: reprojection errors")
-    else:
-        check_file(settings.out, settings.force, rig)
-        cameras = _imported(settings)
-        write_cameras(settings.out, cameras, {"source": str(settings.source)})
-        say(f"{settings.out}: {len(cameras)} cameras taken over from {settings.source}")
     _draw(rig, cameras, box)
 
 
@@ -104,73 +90,12 @@ def _box(settings: Calibrate) -> Box | None:
     return None if settings.lower is None or settings.upper is None else Box(settings.lower, settings.upper)
 
 
-def _has_pictures(folder: Path) -> bool:
-    from nerif.imaging.views import find_views
-
-    try:
-        return bool(find_views(folder))
-    except InputError as error:
-        if "no view found" not in str(error):
-            raise
-        if not any(p.suffix in (".yml", ".yaml", ".xml") for p in folder.iterdir()):
-            raise
-        return False
-
-
 def _calibrate(settings: Calibrate) -> Calibration:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from nerif.imaging.calibration import CalibrationSettings, calibrate
-    from nerif.imaging.views import find_targets, find_views
-
-    chosen = CalibrationSettings(
-        settings.distortion, settings.world, settings.axes, settings.origin, settings.max_error
-    )
-    laid = settings.target.scaled(settings.background_scale)
-    views = find_views(settings.source, settings.views)
-    for view in views:
-        view.open("target")  # what is missing is said before the long work
-    pictures = sum(len(view.open(s)) for view in views for s in ("target", "background") if s in view.sources)
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("looking for targets", total=pictures)
-        found = [find_targets(view, settings.target, say, lambda: bar.advance(task), laid) for view in views]
-        bar.update(task, description="adjusting", total=None)
-        return calibrate(found, chosen)
-
-
-def _cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
-    import torch
-
-    cameras = []
-    for i, name in enumerate(calibration.names):
-        fx, fy, cx, cy = (float(v) for v in calibration.intrinsics[i, :4])
-        plane = calibration.backgrounds[i]
-        cameras.append(
-            CalibratedCamera(
-                name=name,
-                intrinsics=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
-                rotation=torch.from_numpy(calibration.poses[i].rotation.copy()),
-                translation=torch.from_numpy(calibration.poses[i].translation.copy()),
-                distortion=torch.from_numpy(calibration.intrinsics[i, 4:].copy()),
-                image_size=calibration.sizes[i],
-                background=None
-                if plane is None
-                else Plane(torch.tensor(plane.normal, dtype=torch.float64), plane.offset),
-            )
+    views, count = find_views(settings.source, settings.views), itertools.count(1)
+    with counting_bar("looking for targets", target_pictures(views)) as bar:
+        return calibrate_views(
+            views, settings.target, settings.method, settings.background_scale, say, lambda: bar(next(count))
         )
-    return tuple(cameras)
-
-
-def _about(calibration: Calibration) -> dict[str, Any]:
-    return {
-        "date": datetime.date.today().isoformat(),
-        "rms_px": calibration.rms(),
-        "camera_rms_px": {name: calibration.rms(name) for name in calibration.names},
-        "sigma_rotation_deg": dict(zip(calibration.names, calibration.sigma_rotation.tolist(), strict=True)),
-        "sigma_translation_mm": dict(zip(calibration.names, calibration.sigma_translation.tolist(), strict=True)),
-        "notes": list(calibration.notes),
-    }
 
 
 def _tell(calibration: Calibration) -> None:
@@ -191,31 +116,11 @@ def _tell(calibration: Calibration) -> None:
         say(f"note: {note}")
 
 
-def _imported(settings: Calibrate) -> tuple[CalibratedCamera, ...]:
-    from nerif.imaging.importers import import_cameras
-
-    cameras = import_cameras(settings.source, scale_mm=settings.scale_mm)
-    for name in settings.views:
-        if name not in [c.name for c in cameras]:
-            raise InputError(f"views: expected some of {', '.join(c.name for c in cameras)}, got '{name}'")
-    return tuple(_completed(c, settings) for c in cameras if not settings.views or c.name in settings.views)
-
-
-def _completed(camera: CalibratedCamera, settings: Calibrate) -> CalibratedCamera:
-    """Put in what the file does not say."""
-    if camera.image_size is None and settings.image_size is not None:
-        camera = replace(camera, image_size=settings.image_size)
-    if camera.background is None and settings.background_distance is not None:
-        towards = -camera.rotation[2]  # from the background to the camera
-        camera = replace(camera, background=Plane(towards, -settings.background_distance))
-    return camera
-
-
 def _existing(settings: Calibrate) -> tuple[Sequence[CalibratedCamera] | Sequence[Camera], Box | None]:
     if settings.source.suffix == ".nc":
         measurement = Measurement.read(settings.source)
         return measurement.cameras, measurement.box
-    return _imported(settings), None
+    return import_cameras(settings.source, settings.taken_over, settings.views), None
 
 
 def _draw(path: Path, cameras: Sequence[CalibratedCamera] | Sequence[Camera], box: Box | None) -> None:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.recording import FrameJob, RestingView, frame_numbers, instants_of, measure_frames
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
-from nerif.geometry import Box, Camera
-from nerif.imaging.assembly import World, join_views
-from nerif.imaging.cameras_file import CalibratedCamera
-from nerif.imaging.displacement import AtRest, DisplacementMap, DisplacementSettings, measure
-from nerif.imaging.masks import flow_mask, read_mask
-from nerif.imaging.views import View, find_views, good_pictures
+from nerif.geometry import Box
+from nerif.imaging.assembly import World
+from nerif.imaging.displacement import DisplacementSettings
+from nerif.imaging.masks import MaskSettings
+from nerif.imaging.measuring import Recording, measure_instant
+from nerif.imaging.over_time import frame_numbers, instants_of, measure_recording
+from nerif.imaging.views import find_views
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 
@@ -69,9 +68,15 @@ class Displacement(Settings):
     """Overwrite existing files."""
     method: Annotated[DisplacementSettings, tyro.conf.arg(name="")] = field(default_factory=DisplacementSettings)
 
-    def world(self, box: Box) -> World:
-        """What the measurement holds beside its views."""
-        return World(box, self.n_ambient, self.wavelength_nm, self.ambient_faces)
+    def recording(self) -> Recording:
+        """Find the pictures and the cameras."""
+        from nerif.imaging.importers import import_cameras
+
+        world = World(Box(self.lower, self.upper), self.n_ambient, self.wavelength_nm, self.ambient_faces)
+        masks = MaskSettings(self.mask) if self.mask else None
+        views = find_views(self.folder, self.views)
+        cameras = {c.name: c for c in import_cameras(self.calibration)}
+        return Recording(views, cameras, world, self.method, masks, self.references)
 
 
 def run(settings: Displacement) -> Measurement:
@@ -82,163 +87,44 @@ def run(settings: Displacement) -> Measurement:
     for name, least in (("frame", 0), ("average", 1), ("references", 0), ("mask", 0)):
         if not getattr(settings, name) >= least:
             raise InputError(f"{name}: expected {least} or more, got {getattr(settings, name)}")
-    box = Box(settings.lower, settings.upper)
-    views = find_views(settings.folder, settings.views)
+    recording = settings.recording()
     if settings.frames:
-        return run_over_time(settings, box, views).first_good()
+        return run_over_time(settings, recording).first_good()
     picture = settings.out.with_suffix(".png")
     check_file(settings.out, settings.force, picture)
-    cameras = _calibrated(settings.calibration, views)
-    maps, kept = _measure(views, cameras, settings)
-    measurement = join_views([camera for camera, _ in kept], maps, [mask for _, mask in kept], settings.world(box))
+    with counting_bar("finding displacements", len(recording.views)) as bar:
+        numbers = range(settings.frame, settings.frame + settings.average)
+        measurement, noise = measure_instant(recording, numbers, say, bar)
     measurement.write(settings.out)
-    _tell(measurement, maps)
+    _tell(measurement, noise)
     from nerif.report.displacement_figure import save_displacements
 
     save_displacements(picture, measurement)
-    say(f"{settings.out}: measurement of {len(kept)} views; {picture}: its displacements")
+    say(f"{settings.out}: measurement of {len(measurement.names)} views; {picture}: its displacements")
     return measurement
 
 
-def run_over_time(settings: Displacement, box: Box, views: Sequence[View]) -> MeasurementSequence:
+def run_over_time(settings: Displacement, recording: Recording) -> MeasurementSequence:
     """Write a measurement of every flow picture asked for."""
     if settings.average != 1 or settings.frame != 0:
         raise InputError("frame, average: expected neither with --frames, which takes every flow picture by itself")
-    cameras = _calibrated(settings.calibration, views)
-    numbers = frame_numbers(settings.frames, views)
-    times = instants_of(numbers, views[0], settings.frame_rate)
-    resting = []
-    with counting_bar("looking at references", len(views)) as bar:
-        for view in views:
-            view.check_alike()
-            reference = good_pictures(view, "reference", say, settings.references)
-            shape = (reference[0].shape[0], reference[0].shape[1])
-            region, mask = (_drawn(view, source, shape) for source in ("region", "mask"))
-            rest = AtRest.of(reference, settings.method, _full_scale(view))
-            resting.append(RestingView(view, _camera(view, cameras[view.name], shape), rest, region, mask))
-            bar(len(resting))
-    job = FrameJob(resting, settings.world(box), settings.mask)
+    numbers = frame_numbers(settings.frames, recording.views)
+    times = instants_of(numbers, recording.views[0], settings.frame_rate)
     kept = {name: value for name, value in asdict(settings).items() if name not in ("out", "force", "config", "frames")}
-    return measure_frames(job, numbers, times, settings.out, kept, settings.force)
+    with counting_bar("references, then frames", len(recording.views) + len(numbers)) as bar:
+        return measure_recording(recording, numbers, times, settings.out, kept, settings.force, say, bar)
 
 
-def _drawn(view: View, source: str, shape: tuple[int, int]) -> np.ndarray | None:
-    """A drawn mask of a view, if there is one."""
-    return read_mask(view.folder / view.sources[source], shape) if source in view.sources else None
-
-
-def _full_scale(view: View) -> float | None:
-    """Grey value at which the sensor is full, if that can be told."""
-    bits = _bits(view)
-    return 2**bits - 1 if bits > 1 else None
-
-
-def _calibrated(path: Path, views: Sequence[View]) -> dict[str, CalibratedCamera]:
-    """The camera of every view."""
-    from nerif.imaging.importers import import_cameras
-
-    cameras = {c.name: c for c in import_cameras(path)}
-    for view in views:
-        if view.name not in cameras:
-            raise InputError(
-                f"{path}: no camera named '{view.name}' as the view, only {', '.join(cameras)}; rename one of them, or "
-                "choose --views"
-            )
-    return cameras
-
-
-def _measure(
-    views: Sequence[View], cameras: dict[str, CalibratedCamera], settings: Displacement
-) -> tuple[list[DisplacementMap], list[tuple[Camera, np.ndarray | None]]]:
-    """Displacement of every view that has good pictures, its camera, and its flow mask if one is drawn."""
-    from rich.console import Console
-    from rich.progress import track
-
-    maps, kept, lost = [], [], []
-    for view in track(views, "finding displacements", console=Console(stderr=True), transient=True):
-        try:
-            found, camera, mask = _measure_view(view, cameras[view.name], settings)
-        except InputError as error:
-            lost.append(str(error))
-            say(f"view '{view.name}' left out: {error}")
-            continue
-        maps.append(found)
-        kept.append((camera, mask))
-    if not kept:
-        raise InputError(f"displacement: no view could be used; the first: {lost[0]}")
-    return maps, kept
-
-
-def _measure_view(
-    view: View, calibrated: CalibratedCamera, settings: Displacement
-) -> tuple[DisplacementMap, Camera, np.ndarray | None]:
-    view.check_alike()
-    reference = good_pictures(view, "reference", say, settings.references)
-    flow = _flow(view, settings)
-    shape = (flow[0].shape[0], flow[0].shape[1])
-    camera = _camera(view, calibrated, shape)
-    found = measure(reference, flow, settings.method, _full_scale(view), _drawn(view, "region", shape))
-    if not found.valid.any():
-        raise InputError(
-            f"view '{view.name}': no pixel holds (noise above {settings.method.max_sigma:g} px or correlation below "
-            f"{settings.method.min_correlation:g} everywhere); do the pictures show the same pattern, in focus?"
-        )
-    mask = _drawn(view, "mask", shape)
-    if mask is None and settings.mask:
-        mask = flow_mask(found.displacement, found.sigma, settings.mask)
-    return found, camera, mask
-
-
-def _flow(view: View, settings: Displacement) -> list[np.ndarray]:
-    """The flow pictures that were asked for."""
-    pictures = good_pictures(view, "flow", say) if len(view.open("flow")) == 1 else None
-    frames = view.open("flow")
-    last = settings.frame + settings.average
-    if last > len(frames):
-        raise InputError(
-            f"frame, average: expected numbers within the {len(frames)} flow pictures of view '{view.name}', got "
-            f"{settings.frame} and {settings.average}"
-        )
-    if pictures is not None:
-        return pictures
-    from nerif.imaging.readers import check_exposure, effective_bits
-
-    bits, pictures = effective_bits(frames), []
-    for i in range(settings.frame, last):
-        pictures.append(view.cropped(frames[i], frames.name(i)))
-        exposure = check_exposure(pictures[-1], bits, frames.name(i))
-        if exposure:
-            say(f"note: {exposure}")
-    return pictures
-
-
-def _bits(view: View) -> int:
-    from nerif.imaging.readers import effective_bits
-
-    return max(effective_bits(view.open("flow")), effective_bits(view.open("reference")))
-
-
-def _camera(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) -> Camera:
-    """The camera of the view's pictures, which may be a crop of those it was calibrated with."""
-    if calibrated.image_size in (None, shape):
-        return calibrated.camera(image_size=shape)
-    crop = view.crop
-    frames = view.open("flow")
-    if crop is not None and calibrated.image_size == frames.shape and not crop.flip and not crop.rotate:
-        return calibrated.camera().view(crop.row, crop.column, *shape)
-    raise InputError(
-        f"view '{view.name}': its pictures have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
-        f"with {calibrated.image_size}; calibrate with the same crop, or with the whole frame and no flip"
-    )
-
-
-def _tell(measurement: Measurement, maps: Sequence[DisplacementMap]) -> None:
+def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
     say(f"{'view':<12}{'valid':>8}{'rms d [px]':>12}{'max |d| [px]':>14}{'sigma [px]':>12}  noise from")
-    for name, found in zip(measurement.names, maps, strict=True):
-        d, sigma = found.displacement[found.valid], found.sigma[found.valid]
+    assert measurement.sigma is not None
+    usable = measurement.usable
+    for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
+        d, sigma = measurement.displacement[i][usable[i]], measurement.sigma[i][usable[i]]
+        share = len(d) / (camera.image_size[0] * camera.image_size[1])
         say(
-            f"{name:<12}{found.valid.mean():>8.1%}{np.sqrt((d**2).mean()):>12.3f}"
-            f"{np.linalg.norm(d, axis=-1).max():>14.3f}{np.median(sigma):>12.4f}  {found.noise_from}"
+            f"{name:<12}{share:>8.1%}{float(d.square().mean().sqrt()):>12.3f}"
+            f"{float(d.norm(dim=-1).max()):>14.3f}{float(sigma.median()):>12.4f}  {noise[name]}"
         )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.settings import Settings
+from nerif.commands.settings import Flat, Settings
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.landweber import Landweber
@@ -18,9 +18,6 @@ from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.voxels import VoxelReconstructor
 
 __all__ = ["METHODS", "Reconstruct", "ReconstructNeRIF"]
-
-Flat = tyro.conf.arg(name="")
-"""The settings of the method stand beside the others, without a prefix."""
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import tyro
+
 from nerif.conventions import InputError
 
-__all__ = ["Settings", "flag_value", "merge", "parse", "read_settings", "read_toml", "to_toml", "value_given"]
+__all__ = ["Flat", "Settings", "flag_value", "merge", "parse", "read_settings", "read_toml", "to_toml", "value_given"]
 
 T = TypeVar("T")
+
+Flat = tyro.conf.arg(name="")
+"""Marks a field whose record stands among the other settings, without a prefix."""
 
 IGNORED = ("about",)  # the table of run.toml that tells what came out
 
@@ -168,8 +173,6 @@ def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
     InputError
         In one line, where the library would draw a box.
     """
-    import tyro
-
     arguments = [re.sub(r"^(--[\w.-]+)", lambda m: m[1].replace("_", "-"), a) for a in arguments]
     said = io.StringIO()
     try:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from nerif.conventions import DEFAULT_AMBIENT_FACES
 from nerif.geometry import Box, Camera
@@ -14,6 +15,8 @@ from nerif.imaging.displacement import DisplacementMap
 from nerif.measurement import Measurement
 
 __all__ = ["World", "join_views"]
+
+Mask = Bool[np.ndarray, "row column"]
 
 
 @dataclass(frozen=True)
@@ -26,40 +29,43 @@ class World:
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
 
 
-def join_views(
-    cameras: Sequence[Camera], maps: Sequence[DisplacementMap], masks: Sequence[np.ndarray | None], world: World
-) -> Measurement:
+def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], world: World) -> Measurement:
     """Return one measurement of all views; smaller pictures are padded.
 
     Parameters
     ----------
-    cameras, maps : of the views
-    masks : (row, column) where the flow is, or None where a view has no mask
+    views : camera, displacement and flow mask (or None) of each, held one at a time
+    world : box and surroundings
     """
-    sizes = [m.valid.shape for m in maps]
-    height, width = max(s[0] for s in sizes), max(s[1] for s in sizes)
+    cameras: list[Camera] = []
+    maps: dict[str, list[np.ndarray]] = {"displacement": [], "sigma": [], "valid": [], "flow_mask": []}
+    masked = False
+    for camera, found, mask in views:
+        cameras.append(camera)
+        everywhere = np.ones(found.valid.shape, dtype=bool)  # no mask says nothing about where the flow is
+        masked |= mask is not None
+        own = (found.displacement, found.sigma, found.valid, everywhere if mask is None else mask)
+        for arrays, array in zip(maps.values(), own, strict=True):
+            arrays.append(array)
+    size = tuple(max(v.shape[k] for v in maps["valid"]) for k in range(2))
 
-    def stack(arrays: Sequence[np.ndarray], fill: float | bool) -> torch.Tensor:
-        whole = [
-            np.pad(
-                a,
-                [(0, height - a.shape[0]), (0, width - a.shape[1])] + [(0, 0)] * (a.ndim - 2),
-                constant_values=fill,
-            )
-            for a in arrays
-        ]
-        return torch.from_numpy(np.stack(whole))
+    def stack(name: str) -> torch.Tensor:
+        arrays = maps[name]
+        kind = arrays[0].dtype
+        whole = np.full((len(arrays), *size, *arrays[0].shape[2:]), np.nan if kind.kind == "f" else 0, dtype=kind)
+        for own in whole:
+            array = arrays.pop(0)  # not kept beside its copy
+            own[: array.shape[0], : array.shape[1]] = array
+        return torch.from_numpy(whole)
 
-    everywhere = [np.ones(m.valid.shape, dtype=bool) for m in maps]  # no mask says nothing about where the flow is
-    filled = [e if mask is None else mask for mask, e in zip(masks, everywhere, strict=True)]
     return Measurement(
         cameras=tuple(cameras),
-        displacement=stack([m.displacement for m in maps], np.nan),
+        displacement=stack("displacement"),
         box=world.box,
         n_ambient=world.n_ambient,
-        sigma=stack([m.sigma for m in maps], np.nan),
-        valid=stack([m.valid for m in maps], False),
-        flow_mask=stack(filled, False) if any(mask is not None for mask in masks) else None,
+        sigma=stack("sigma"),
+        valid=stack("valid"),
+        flow_mask=stack("flow_mask") if masked else None,
         wavelength_nm=world.wavelength_nm,
         ambient_faces=world.ambient_faces,
     )

@@ -1,4 +1,4 @@
-"""Backgrounds to print: random dots, wavelet noise, multi-scale noise, as an array, PNG or PDF at true size.
+"""Backgrounds to print: random dots, wavelet noise, multi-scale noise.
 
 A pattern is a raster of reflectance, 0 black to 1 white. The dot size is the length of its smallest features on paper;
 seen by the camera it should cover 2 to 5 px (Raffel, Background-oriented schlieren techniques, Exp. Fluids 56 (2015)).
@@ -6,35 +6,21 @@ seen by the camera it should cover 2 to 5 px (Raffel, Background-oriented schlie
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nerif.conventions import InputError
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ["KINDS", "Background", "write_pattern"]
+__all__ = ["KINDS", "Background"]
 
 KINDS = ("dots", "wavelet", "multiscale")
-MARGIN = 8.0  # mm of paper around a printed pattern, for its scale bar
+FINEST = 12  # pixels over a dot: more would not show
 
 
 @dataclass(frozen=True)
 class Background:
     """A printed background.
-
-    Parameters
-    ----------
-    kind : dots (random, not overlapping much), wavelet (band-limited noise), multiscale (noise on all scales)
-    width, height : of the pattern, mm
-    dot : diameter of a dot, or the smallest feature of a noise, mm
-    fill : share of the paper that dots cover
-    seed : of the pattern
 
     Raises
     ------
@@ -45,12 +31,18 @@ class Background:
     Exp. Fluids 46 (2009) 467, from where the idea of features on all scales comes too.
     """
 
-    kind: str = "multiscale"
+    kind: str = "dots"
+    """dots (random, hardly overlapping), wavelet (band-limited noise) or multiscale (noise on all scales)."""
     width: float = 200.0
+    """Width of the pattern, mm."""
     height: float = 200.0
+    """Height of the pattern, mm."""
     dot: float = 1.0
+    """Diameter of a dot, or the smallest feature of a noise, mm: 2 to 5 px in the picture (nerif design)."""
     fill: float = 0.35
+    """Share of the paper that dots cover."""
     seed: int = 0
+    """Of the pattern: give each camera another one."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -64,6 +56,20 @@ class Background:
             raise InputError(
                 f"dot: expected a quarter of the pattern ({min(self.width, self.height):g} mm) or less, got {self.dot}"
             )
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height, mm."""
+        return self.width, self.height
+
+    @property
+    def label(self) -> str:
+        """What it is, in a line."""
+        return f"{self.kind}, {self.dot:g} mm, seed {self.seed}"
+
+    def raster_pixel(self, pixel: float) -> float:
+        """Edge of a pixel fine enough for the pattern and not finer than `pixel`, mm."""
+        return max(pixel, self.dot / FINEST)
 
     def raster(self, pixel: float) -> np.ndarray:
         """Return the pattern as reflectance (row, column) from 0 to 1 on pixels of `pixel` mm.
@@ -144,51 +150,3 @@ def _spread(cells: np.ndarray, shape: tuple[int, int], spacing: float) -> np.nda
 
     rows, columns = ((np.arange(n) + 0.5) / spacing + 3 for n in shape)
     return np.asarray(map_coordinates(cells, np.meshgrid(rows, columns, indexing="ij"), order=3, mode="nearest"))
-
-
-def write_pattern(path: str | os.PathLike[str], raster: np.ndarray, pixel: float, label: str) -> None:
-    """Write a pattern at true size: PNG (with its resolution in the file) or PDF (with a scale bar to check the print).
-
-    Parameters
-    ----------
-    raster : (row, column) reflectance, 0 to 1
-    pixel : mm
-    label : printed below a PDF
-
-    Raises
-    ------
-    InputError
-        If the name ends in neither .png nor .pdf.
-    """
-    path = Path(path)
-    if path.suffix == ".png":
-        import imageio.v3 as iio
-
-        dots_per_inch = 25.4 / pixel
-        iio.imwrite(path, np.round(raster * 255).astype(np.uint8), dpi=(dots_per_inch, dots_per_inch))
-    elif path.suffix == ".pdf":
-        import matplotlib.pyplot as plt
-
-        figure = _page(raster, pixel, label)
-        figure.savefig(path)
-        plt.close(figure)
-    else:
-        raise InputError(f"{path}: expected a name ending in .png or .pdf")
-
-
-def _page(raster: np.ndarray, pixel: float, label: str) -> Figure:
-    """A page of the pattern's own size with a margin, one millimetre of data to a millimetre of paper."""
-    import matplotlib.pyplot as plt
-
-    height, width = (n * pixel for n in raster.shape)
-    page = width + 2 * MARGIN, height + 2 * MARGIN
-    figure = plt.figure(figsize=(page[0] / 25.4, page[1] / 25.4), dpi=25.4 / pixel)
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, page[0]), ylim=(page[1], 0), autoscale_on=False)
-    axes.axis("off")
-    extent = (MARGIN, MARGIN + width, MARGIN + height, MARGIN)
-    axes.imshow(raster, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="none", aspect="auto")
-    bar = next((b for b in (100.0, 50.0, 20.0, 10.0) if b <= width), width)
-    y = page[1] - 0.6 * MARGIN
-    axes.plot([MARGIN, MARGIN + bar], [y, y], color="black", linewidth=1, solid_capstyle="butt")
-    axes.text(MARGIN, y + 0.45 * MARGIN, f"{bar:g} mm   {label}", fontsize=6)
-    return figure

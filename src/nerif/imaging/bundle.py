@@ -5,9 +5,8 @@
 over cameras i and target poses j; one pose is the world and stays. Weak priors keep what a narrow lens cannot tell from
 a turn: the principal point near the middle of the picture, distortion near none.
 
-The normal equations are put together block by block and solved by Levenberg and Marquardt's method. SciPy's
-least_squares was tried first: its exact solver decomposes the whole Jacobian each time, and with its sparse one
-(LSMR) what a narrow lens can hardly tell apart did not converge.
+The normal equations are put together block by block and solved exactly in each step of Levenberg and Marquardt's
+method, which settles what a narrow lens can hardly tell apart too.
 
 Source: Triggs et al., Bundle adjustment - a modern synthesis, 2000; projection and its derivatives by OpenCV.
 """
@@ -22,11 +21,12 @@ from jaxtyping import Float
 
 from nerif.imaging.targets import Detection
 
-__all__ = ["Bundle", "Observation", "Pose", "adjust"]
+__all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust"]
 
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 HUBER = 5  # times the noise of a point: where the loss turns linear
 PRINCIPAL = 0.03  # of the picture's width: how far the principal point may well be from its middle
-DISTORTION = (0.5, 5.0, 0.005, 0.005, 5.0)  # k1, k2, p1, p2, k3
+DISTORTION = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS: how large they may well be
 INTRINSIC, POSE = 9, 6  # parameters: fx, fy, cx, cy and five of distortion; rotation vector, translation
 
 
@@ -52,6 +52,10 @@ class Pose:
         """The motion back."""
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
 
+    def moved(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Where the motion takes points, mm."""
+        return points @ self.rotation.T + self.translation
+
     @property
     def vector(self) -> Float[np.ndarray, 6]:
         """Rotation vector and translation."""
@@ -69,11 +73,21 @@ class Pose:
 
 @dataclass(frozen=True)
 class Observation:
-    """The target in pose `pose` as camera `camera` sees it."""
+    """The target in pose `pose` as camera `camera` sees it.
+
+    Parameters
+    ----------
+    camera, pose : numbers of the camera and the pose in the bundle
+    detection : what was found
+    picture : name of the picture in which it was found
+    on_background : whether the target lay on the camera's background
+    """
 
     camera: int
     pose: int
     detection: Detection
+    picture: str = ""
+    on_background: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,6 +120,10 @@ class Bundle:
     def residual(self, seen: Observation) -> Float[np.ndarray, "n 2"]:
         """Found less expected, px."""
         return seen.detection.pixels - self.project(seen)
+
+    def rms(self, seen: Observation) -> float:
+        """Root mean square of the distances of an observation's points from where they should be, px."""
+        return float(np.sqrt((self.residual(seen) ** 2).sum(axis=1).mean()))
 
 
 def _project(

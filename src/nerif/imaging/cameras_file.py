@@ -32,10 +32,15 @@ from nerif.atomic import atomic
 from nerif.conventions import InputError, Matrix3
 from nerif.geometry import Camera, Plane
 
-__all__ = ["FORMAT", "CalibratedCamera", "checked", "five", "numbers", "read_cameras", "upright", "write_cameras"]
+__all__ = [
+    "FORMAT", "CalibratedCamera", "check_model", "checked", "five", "image_size", "numbers", "plane", "read_cameras",
+    "upright", "write_cameras",
+]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
 KEYS = ("name", "image_size", "intrinsics", "distortion", "rotation", "translation", "background")
+BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
+"""Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
 ANYWHERE = Plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.0)
 
 
@@ -108,21 +113,65 @@ def numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
     InputError
         If it is none; the message says what it should be.
     """
+    expected = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
     try:
         array = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"{what}: expected {' x '.join(map(str, shape)) or 'one'} numbers, got {value!r}") from None
+        raise InputError(f"{what}: expected {expected}, got {value!r}") from None
     if tuple(array.shape) != shape:
         got = " x ".join(map(str, array.shape)) or "a single number"
-        raise InputError(f"{what}: expected {' x '.join(map(str, shape)) or 'one'} numbers, got {got}")
+        raise InputError(f"{what}: expected {expected}, got {got}")
     if not bool(torch.isfinite(array).all()):
         raise InputError(f"{what}: expected finite numbers, got {value!r}")
     return array
 
 
+def image_size(value: Any, what: str) -> tuple[int, int]:
+    """Return (height, width), px; InputError if they are not two positive whole numbers."""
+    size = numbers(value, (2,), what)
+    if not bool((size > 0).all()) or bool((size % 1 != 0).any()):
+        raise InputError(f"{what}: expected height and width, whole numbers of px, got {value}")
+    return int(size[0]), int(size[1])
+
+
+def plane(normal: Any, offset: Any, where: str) -> Plane:
+    """Return the plane normal . x = offset (mm), its normal brought to length one.
+
+    Raises
+    ------
+    InputError
+        If they are no numbers, or the normal is no direction.
+    """
+    direction = numbers(normal, (3,), f"{where}: normal")
+    length = float(direction.norm())
+    if not length > 0:
+        raise InputError(f"{where}: normal: expected a direction, got {normal}")
+    return Plane(direction / length, float(numbers(offset, (), f"{where}: offset")) / length)
+
+
+def check_model(model: Any, where: str) -> None:
+    """Refuse a camera model by its name in another program, unless Brown's distortion describes it.
+
+    Raises
+    ------
+    InputError
+        If it is another model: its coefficients would bend the rays wrongly.
+    """
+    if str(model).lower() not in BROWN:
+        raise InputError(
+            f"{where}: expected a perspective camera with Brown's distortion ({', '.join(BROWN)}), got '{model}'; "
+            "calibrate again with one of those models, or undistort the pictures first"
+        )
+
+
 def five(values: Any, where: str) -> Tensor:
-    """Return OpenCV's five coefficients of 4 to 14; InputError if those beyond are not 0."""
-    given = np.asarray(values, dtype=np.float64).ravel()
+    """Return OpenCV's five coefficients of 4 to 14; InputError if those beyond are not 0, or one is no number."""
+    try:
+        given = np.asarray(values, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        given = np.array([np.nan])
+    if not np.isfinite(given).all():
+        raise InputError(f"{where}: expected finite numbers as distortion coefficients, got {values!r}")
     if np.any(given[5:] != 0):
         raise InputError(
             f"{where}: expected at most 5 distortion coefficients (k1 k2 p1 p2 k3), got {len(given)}; calibrate again "
@@ -196,24 +245,16 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
     for key in ("name", "intrinsics", "rotation", "translation"):
         if key not in table:
             raise InputError(f"{where}: '{key}' is missing")
-    size = numbers(table["image_size"], (2,), f"{where}: image_size") if "image_size" in table else None
-    plane = None
-    if "background" in table:
-        given = table["background"]
-        if not isinstance(given, dict) or set(given) != {"normal", "offset"}:
-            raise InputError(f"{where}: background: expected normal = [x, y, z] and offset = mm, got {given!r}")
-        normal = numbers(given["normal"], (3,), f"{where}: background normal")
-        length = float(normal.norm())
-        if not length > 0:
-            raise InputError(f"{where}: background normal: expected a direction, got {given['normal']}")
-        plane = Plane(normal / length, float(numbers(given["offset"], (), f"{where}: background offset")) / length)
+    given = table.get("background")
+    if given is not None and (not isinstance(given, dict) or set(given) != {"normal", "offset"}):
+        raise InputError(f"{where}: background: expected normal = [x, y, z] and offset = mm, got {given!r}")
     camera = CalibratedCamera(
         name=name,
         intrinsics=numbers(table["intrinsics"], (3, 3), f"{where}: intrinsics"),
         rotation=numbers(table["rotation"], (3, 3), f"{where}: rotation"),
         translation=numbers(table["translation"], (3,), f"{where}: translation"),
         distortion=numbers(table.get("distortion", [0.0] * 5), (5,), f"{where}: distortion"),
-        image_size=None if size is None else (int(size[0]), int(size[1])),
-        background=plane,
+        image_size=image_size(table["image_size"], f"{where}: image_size") if "image_size" in table else None,
+        background=None if given is None else plane(given["normal"], given["offset"], f"{where}: background"),
     )
     return checked(camera, path)

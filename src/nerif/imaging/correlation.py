@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.imaging.optical_flow import warp
+from nerif.imaging.warping import warp
 
 __all__ = ["normalised_median_outliers", "window_correlation"]
 
@@ -63,7 +63,7 @@ def _correlate(
     axis = (np.arange(size) - (size - 1) / 2) / size
     weight = np.exp(-0.5 * (axis / 0.3) ** 2)
     weight = weight[:, None] * weight[None, :]
-    weight /= weight.sum()
+    weight = (weight / weight.sum()).astype(np.float32)
     shifts, heights = [], []
     for row in rows:  # one row of windows at a time bounds the memory
         strips = [
@@ -110,10 +110,18 @@ def normalised_median_outliers(vectors: np.ndarray, threshold: float = 2.0, nois
     around = np.stack(
         [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
     )  # fmt: skip
-    median = np.nanmedian(around, axis=0)
-    spread = np.nanmedian(np.abs(around - median), axis=0)
+    median = _nanmedian(around)
+    spread = _nanmedian(np.abs(around - median))
     ratio = np.abs(vectors - median) / (spread + noise)
     return np.asarray(np.hypot(ratio[..., 0], ratio[..., 1]) > threshold)
+
+
+def _nanmedian(values: np.ndarray) -> np.ndarray:
+    """Median along the first axis without NaN; NumPy's own takes several times as long."""
+    ordered = np.sort(values, axis=0)  # NaN last
+    count = np.isfinite(values).sum(axis=0)[None]
+    low, high = (np.take_along_axis(ordered, k, axis=0)[0] for k in ((count - 1) // 2, count // 2))
+    return np.asarray((low + high) / 2)
 
 
 def _replace(vectors: np.ndarray, bad: np.ndarray) -> np.ndarray:

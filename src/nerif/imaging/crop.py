@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.imaging.readers import size_in_words
+from nerif.imaging.frames import size_in_words
 
 __all__ = ["Crop"]
 

@@ -11,14 +11,18 @@ a window of that reach would smooth away of d once more.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from nerif.conventions import InputError
-from nerif.imaging.optical_flow import FLOWS, warp
+from nerif.imaging.exposure import saturated
+from nerif.imaging.noise import FLOOR, local_correlation, smoothed_away, structure_variance
+from nerif.imaging.optical_flow import FLOWS
+from nerif.imaging.shake import border, remove_shake
+from nerif.imaging.warping import warp
 
 __all__ = [
     "AtRest",
@@ -27,14 +31,14 @@ __all__ = [
     "displacement",
     "measure",
     "measure_against",
-    "remove_shake",
 ]
 
 Image = Float[np.ndarray, "row column"]
 REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.8}
 """Standard deviation (px) of the window over which each method averages, smoothness 1 (benchmarks/displacement.py)."""
 
-FLOOR = 1e-3  # px: no optical flow is better than that
+MOST_REPEATS = 12  # of the reference that are compared with the mean of the others,
+MEGAPIXEL = 2**20  # in pictures up to this many pixels
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ class AtRest:
     mean : of the frames
     settings : of the method
     full : (row, column) where the sensor was full in one of them
-    full_scale : grey value at which it is, if known
+    full_scale : grey value at which it is; infinite if not known
     averaged : number of flow frames whose displacements are averaged
     noise : (row, column, 2) of repeats: as seen, and by the gradients, px; None with fewer than three frames
     """
@@ -124,7 +128,7 @@ class AtRest:
     mean: Image
     settings: DisplacementSettings
     full: Bool[np.ndarray, "row column"]
-    full_scale: float | None
+    full_scale: float
     averaged: int
     noise: tuple[Float[np.ndarray, "row column 2"], Float[np.ndarray, "row column 2"]] | None
 
@@ -133,23 +137,25 @@ class AtRest:
         cls,
         reference: Sequence[np.ndarray],
         settings: DisplacementSettings,
-        full_scale: float | None = None,
+        full_scale: float = np.inf,
         averaged: int = 1,
     ) -> AtRest:
-        """Average the frames and take the noise from their differences."""
+        """Average the frames and take the noise from their differences; frames are read when they are needed."""
         if not len(reference):
             raise InputError("pictures: expected at least one reference picture, got none")
-        frames = [np.asarray(f, dtype=np.float32) for f in reference]
-        full = np.any([np.asarray(p) >= (np.inf if full_scale is None else full_scale) for p in reference], axis=0)
-        noise = _repeat_sigma(frames, averaged, settings) if len(frames) >= 3 else None
-        return cls(np.stack(frames).mean(axis=0), settings, full, full_scale, averaged, noise)
+        total, full = np.zeros(reference[0].shape), np.zeros(reference[0].shape, dtype=bool)
+        for picture in reference:
+            total += picture
+            full |= saturated(picture, full_scale)
+        noise = _repeat_sigma(reference, total, averaged, settings) if len(reference) >= 3 else None
+        return cls((total / len(reference)).astype(np.float32), settings, full, full_scale, averaged, noise)
 
 
 def measure(
     reference: Sequence[np.ndarray],
     flow: Sequence[np.ndarray],
     settings: DisplacementSettings,
-    full_scale: float | None = None,
+    full_scale: float = np.inf,
     region: Bool[np.ndarray, "row column"] | None = None,
 ) -> DisplacementMap:
     """Return displacement, noise and validity of a view.
@@ -159,7 +165,7 @@ def measure(
     reference : frames without flow; they are averaged
     flow : frames with flow; the displacements of several are averaged
     settings : of the method
-    full_scale : grey value at which the sensor is full, if known: such pixels are not valid
+    full_scale : grey value of a full sensor, infinite if not known; full pixels are not valid (exposure.saturated)
     region : where the background is seen at all, or None
     """
     if not len(reference) or not len(flow):
@@ -171,75 +177,44 @@ def measure_against(
     rest: AtRest, flow: Sequence[np.ndarray], region: Bool[np.ndarray, "row column"] | None = None
 ) -> DisplacementMap:
     """Return displacement, noise and validity of a view whose reference is known already; see measure."""
-    mean, settings = rest.mean, rest.settings
-    maps, rests = [], []
-    for picture in (np.asarray(p, dtype=np.float32) for p in flow):
-        seen = displacement(mean, picture, settings)
-        rests.append(_even_out(picture, warp(mean, -seen), 0))
-        maps.append(_still(seen, settings))
-    d = np.stack(maps).mean(axis=0)
-    agreement = np.mean([_local_correlation(a, b, max(3.0, settings.reach)) for a, b in rests], axis=0)
-    sigma, source = _structure_sigma(rests, settings.reach), "structure tensor"
+    settings, reach = rest.settings, rest.settings.reach
+    full = rest.full.copy()
+
+    def one(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        nonlocal full
+        grey = np.asarray(picture, dtype=np.float32)
+        seen = displacement(rest.mean, grey, settings)
+        full |= saturated(picture, rest.full_scale)
+        pair = _even_out(grey, warp(rest.mean, -seen), 0)
+        return _still(seen, settings), local_correlation(*pair, max(3.0, reach)), structure_variance(*pair, reach)
+
+    d, agreement, variance = _means(map(one, flow))
+    sigma, source = np.sqrt(variance / len(flow)) + FLOOR, "structure tensor"
     if rest.noise is not None:
         repeats, without = rest.noise
         sigma, source = np.sqrt(repeats**2 + np.maximum(sigma**2 - without**2, 0)), "repeats"
-    sigma = np.sqrt(sigma**2 + _smoothed_away(d, settings.reach) ** 2).astype(np.float32)
-    rows, columns = np.mgrid[: d.shape[0], : d.shape[1]]
-    at_row, at_column = rows - d[..., 1], columns - d[..., 0]
-    valid = (at_row >= 0) & (at_row <= d.shape[0] - 1) & (at_column >= 0) & (at_column <= d.shape[1] - 1)
+    sigma = np.sqrt(sigma**2 + smoothed_away(d, reach) ** 2).astype(np.float32)
+    height, width = d.shape[:2]
+    at_row, at_column = np.arange(height)[:, None] - d[..., 1], np.arange(width) - d[..., 0]
+    valid = (at_row >= 0) & (at_row <= height - 1) & (at_column >= 0) & (at_column <= width - 1)
     valid &= (agreement >= settings.min_correlation) & (sigma.max(-1) <= settings.max_sigma)
-    if rest.full_scale is not None:
-        full = np.any([rest.full, *(np.asarray(p) >= rest.full_scale for p in flow)], axis=0)
-        valid &= ~_grown(full, 2)
+    valid &= ~_grown(full, 2)
     if region is not None:
         valid &= region
     return DisplacementMap(d, sigma, valid, source)
 
 
-def remove_shake(
-    d: Float[np.ndarray, "row column 2"], still: Bool[np.ndarray, "row column"]
-) -> Float[np.ndarray, "row column 2"]:
-    """Take away the similarity d = t + [[a, -b], [b, a]] p that fits best where nothing flows.
-
-    Parameters
-    ----------
-    d : px
-    still : pixels without flow; outliers among them count little (Cauchy's loss)
-    """
-    if still.sum() < 8:
-        raise InputError(f"shake: expected at least 8 pixels without flow, got {int(still.sum())}; widen the border")
-    from scipy.optimize import least_squares
-
-    rows, columns = np.mgrid[: d.shape[0], : d.shape[1]].astype(np.float64)
-    scale = max(d.shape[:2]) / 2
-    x, y = (columns - columns.mean()) / scale, (rows - rows.mean()) / scale
-
-    def design(at: np.ndarray | slice) -> np.ndarray:
-        one, zero = np.ones_like(x[at]), np.zeros_like(x[at])
-        u = np.stack([one, zero, x[at], -y[at]], axis=-1)
-        v = np.stack([zero, one, y[at], x[at]], axis=-1)
-        return np.stack([u, v], axis=-2)
-
-    a, b = design(still).reshape(-1, 4), d[still].reshape(-1).astype(np.float64)
-    start = np.linalg.lstsq(a, b, rcond=None)[0]
-    noise = 1.4826 * np.median(np.abs(a @ start - b)) + 1e-6
-    fit = least_squares(lambda p: a @ p - b, start, jac=lambda p: a, loss="cauchy", f_scale=2 * noise)
-    everywhere = design(slice(None)).reshape(-1, 4) @ fit.x
-    return (d - everywhere.reshape(d.shape)).astype(np.float32)
+def _means(samples: Iterator[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
+    """Mean over the samples of each of their arrays."""
+    sums, count = list(next(samples)), 1
+    for sample in samples:
+        sums, count = [a + b for a, b in zip(sums, sample, strict=True)], count + 1
+    return tuple(a / count for a in sums)
 
 
 def _still(d: Float[np.ndarray, "row column 2"], settings: DisplacementSettings) -> Float[np.ndarray, "row column 2"]:
     """Displacement without camera shake, if that is to be removed."""
     return remove_shake(d, border(d.shape[:2], settings.shake_border)) if settings.shake_border else d
-
-
-def border(shape: tuple[int, ...], width: int) -> Bool[np.ndarray, "row column"]:
-    """Return the outer `width` px of a picture."""
-    if 2 * width >= min(shape):
-        raise InputError(f"shake_border: expected less than half the picture ({min(shape) // 2} px), got {width}")
-    mask = np.ones(shape, dtype=bool)
-    mask[width:-width, width:-width] = False
-    return mask
 
 
 def _even_out(flow: Image, reference: Image, window: int) -> tuple[Image, Image]:
@@ -263,61 +238,32 @@ def _even_out(flow: Image, reference: Image, window: int) -> tuple[Image, Image]
     return pictures[0], pictures[1]
 
 
-def _structure_sigma(pairs: Sequence[tuple[Image, Image]], reach: float) -> Float[np.ndarray, "row column 2"]:
-    """Standard deviation of a shift from the gradients of the picture and what is left of the difference."""
-    from scipy.ndimage import gaussian_filter
-
-    pixels = 4 * np.pi * reach**2  # effective number in a Gaussian window
-    variances = []
-    for flow, moved in pairs:
-        gv, gu = np.gradient(moved.astype(np.float64))
-        uu, vv, uv = (gaussian_filter(g, reach) * pixels for g in (gu * gu, gv * gv, gu * gv))
-        left = gaussian_filter((flow - moved).astype(np.float64) ** 2, max(4.0, 2 * reach))
-        determinant = np.maximum(uu * vv - uv**2, 1e-9 * (uu + vv) ** 2 + 1e-12)
-        variances.append(np.stack([left * vv / determinant, left * uu / determinant], axis=-1))
-    return (np.sqrt(np.mean(variances, axis=0) / len(variances)) + FLOOR).astype(np.float32)
-
-
 def _repeat_sigma(
-    frames: Sequence[np.ndarray], averaged: int, settings: DisplacementSettings
+    reference: Sequence[np.ndarray], total: np.ndarray, averaged: int, settings: DisplacementSettings
 ) -> tuple[Float[np.ndarray, "row column 2"], Float[np.ndarray, "row column 2"]]:
     """Standard deviation of d between reference frames and the mean of the others: as seen, and by the gradients.
 
     A repeat has the variance s^2 (1 + 1/(count - 1)) if one frame has s^2, the measurement s^2 (1/averaged + 1/count).
+    Of large pictures fewer repeats do, their squares averaged over wider windows.
     """
     from scipy.ndimage import gaussian_filter
 
-    count, total = len(frames), np.sum(frames, axis=0, dtype=np.float64)
-    chosen = np.linspace(0, count - 1, min(count, 12)).round().astype(int)
-    squares, pairs = [], []
-    for i in chosen:
-        others = ((total - frames[i]) / (count - 1)).astype(np.float32)
-        d = displacement(others, frames[i], settings)
-        squares.append(_still(d, settings).astype(np.float64) ** 2)
-        pairs.append(_even_out(frames[i], warp(others, -d), 0))
-    pooled = np.stack([gaussian_filter(np.mean(squares, axis=0)[..., k], 4.0) for k in range(2)], axis=-1)
+    count, most = len(reference), min(len(reference), MOST_REPEATS)
+    repeats = max(3, min(most, int(MOST_REPEATS * MEGAPIXEL / total.size)))
+    window = 4.0 * np.sqrt(most / repeats)
+
+    def repeat(i: int) -> tuple[np.ndarray, np.ndarray]:
+        frame = np.asarray(reference[i], dtype=np.float32)
+        others = ((total - frame) / (count - 1)).astype(np.float32)
+        d = displacement(others, frame, settings)
+        pair = _even_out(frame, warp(others, -d), 0)
+        return _still(d, settings).astype(np.float64) ** 2, structure_variance(*pair, settings.reach)
+
+    squares, variance = _means(map(repeat, np.linspace(0, count - 1, repeats).round().astype(int).tolist()))
+    pooled = np.stack([gaussian_filter(squares[..., k], window) for k in range(2)], axis=-1)
     factor = (1 / averaged + 1 / count) / (1 + 1 / (count - 1))
-    seen = (np.sqrt(pooled * factor) + FLOOR).astype(np.float32)
-    return seen, _structure_sigma(pairs, settings.reach) * np.sqrt(len(pairs) * factor)
-
-
-def _smoothed_away(d: Float[np.ndarray, "row column 2"], reach: float) -> Float[np.ndarray, "row column 2"]:
-    """Rms over a Gaussian window of what that window takes from d, px."""
-    from scipy.ndimage import gaussian_filter
-
-    parts = [gaussian_filter((d[..., k] - gaussian_filter(d[..., k], reach)) ** 2, reach) for k in range(2)]
-    return np.sqrt(np.stack(parts, axis=-1))
-
-
-def _local_correlation(a: Image, b: Image, reach: float) -> Image:
-    """Correlation coefficient of two pictures over a Gaussian window."""
-    from scipy.ndimage import gaussian_filter
-
-    a, b = a.astype(np.float64), b.astype(np.float64)
-    mean_a, mean_b = gaussian_filter(a, reach), gaussian_filter(b, reach)
-    cross = gaussian_filter(a * b, reach) - mean_a * mean_b
-    variance = (gaussian_filter(a * a, reach) - mean_a**2) * (gaussian_filter(b * b, reach) - mean_b**2)
-    return cross / np.sqrt(np.maximum(variance, 1e-6))
+    gradients = (np.sqrt(variance / repeats) + FLOOR) * np.sqrt(repeats * factor)
+    return (np.sqrt(pooled * factor) + FLOOR).astype(np.float32), gradients.astype(np.float32)
 
 
 def _grown(mask: np.ndarray, by: int) -> np.ndarray:

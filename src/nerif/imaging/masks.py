@@ -1,55 +1,74 @@
-"""Where the flow is in a picture: by threshold, or drawn by hand."""
+"""Where the flow is in a picture, by threshold or drawn by hand; where that is not known, flow may be."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
 from nerif.conventions import InputError
+from nerif.imaging.readers import open_frames
+from nerif.measurement import Measurement
 
-__all__ = ["flow_mask", "read_mask"]
+__all__ = ["MaskSettings", "drawn_masks", "flow_mask", "read_mask", "with_flow_masks"]
+
+
+@dataclass(frozen=True)
+class MaskSettings:
+    """How flow is told from noise."""
+
+    threshold: float = 4.0
+    """Flow is where |d| exceeds this many sigma."""
+    smooth: float = 1.5
+    """Standard deviation of a Gaussian over d / sigma before the threshold, px."""
+    smallest: int = 64
+    """Islands and holes of fewer pixels are removed."""
+    grow: int = 3
+    """Pixels added all around, so that the edge of the flow is inside."""
+
+    def __post_init__(self) -> None:
+        for name in ("threshold", "smooth", "smallest", "grow"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+
+STANDARD = MaskSettings()
 
 
 def flow_mask(
     displacement: Float[np.ndarray, "row column 2"],
     sigma: Float[np.ndarray, "row column 2"],
-    threshold: float = 3.0,
-    smooth: float = 1.5,
-    smallest: int = 64,
-    grow: int = 3,
+    settings: MaskSettings = STANDARD,
 ) -> Bool[np.ndarray, "row column"]:
-    """Return where |d| / sigma exceeds a threshold, cleaned up.
+    """Return where |d| / sigma exceeds a threshold, cleaned up, and where that is not known.
 
     Parameters
     ----------
-    displacement : px; NaN counts as no flow
-    sigma : px
-    threshold : standard deviations
-    smooth : standard deviation of a Gaussian over d / sigma, px
-    smallest : islands and holes of fewer pixels are removed
-    grow : px added all around, so that the edge of the flow is inside
-
-    Raises
-    ------
-    InputError
-        If a number is negative.
+    displacement : px; NaN where not known
+    sigma : px; NaN or not positive where not known
+    settings : of the threshold
     """
     from scipy.ndimage import binary_dilation, gaussian_filter
     from skimage.morphology import remove_small_holes, remove_small_objects
 
-    for name, value in (("threshold", threshold), ("smooth", smooth), ("smallest", smallest), ("grow", grow)):
-        if not value >= 0:
-            raise InputError(f"{name}: expected 0 or more, got {value}")
-    ratio = np.nan_to_num(displacement / sigma, nan=0.0, posinf=0.0, neginf=0.0)
-    if smooth:
-        ratio = np.stack([gaussian_filter(ratio[..., k], smooth) for k in range(2)], axis=-1)
-    mask = np.hypot(ratio[..., 0], ratio[..., 1]) > threshold
-    if smallest:
-        mask = remove_small_objects(mask, max_size=smallest)
-        mask = remove_small_holes(mask, max_size=smallest)
-    return np.asarray(binary_dilation(mask, iterations=grow) if grow else mask)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = displacement / np.where(sigma > 0, sigma, np.nan)
+    known = np.isfinite(ratio).all(axis=-1)
+    ratio[~known] = 0
+    if settings.smooth:
+        share = np.maximum(gaussian_filter(known.astype(np.float32), settings.smooth), 1e-6)
+        ratio = np.stack([gaussian_filter(ratio[..., k], settings.smooth) / share for k in range(2)], axis=-1)
+    flow = (np.hypot(ratio[..., 0], ratio[..., 1]) > settings.threshold) & known
+    if settings.smallest:  # an island may go on where nothing is known
+        flow = known & remove_small_objects(flow | ~known, max_size=settings.smallest)
+        flow = remove_small_holes(flow | ~known, max_size=settings.smallest) & known
+    if settings.grow:
+        flow = binary_dilation(flow, iterations=settings.grow)
+    return np.asarray(flow | ~known)
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"]:
@@ -60,14 +79,77 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
     InputError
         If it cannot be read, is of another size than the view, or of one grey.
     """
-    from nerif.imaging.readers import open_frames
-
-    image = open_frames(path)[0].astype(np.float64)
+    image = open_frames(path)[0]
     if image.shape != shape:
         raise InputError(
             f"{path}: expected a mask of {shape[0]} x {shape[1]} px (height x width) as the view, got "
             f"{image.shape[0]} x {image.shape[1]}"
         )
-    if image.min() == image.max():
-        raise InputError(f"{path}: expected a mask with black and white in it, got one grey of {image.max():g}")
-    return np.asarray(image > (image.min() + image.max()) / 2)
+    low, high = float(image.min()), float(image.max())
+    if low == high:
+        raise InputError(f"{path}: expected a mask with black and white in it, got one grey of {high:g}")
+    return np.asarray(image > (low + high) / 2)
+
+
+def drawn_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Return the pictures of masks in a folder, VIEW.png and the like, by the names of their views.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or none for any view.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected one with VIEW.png for each view")
+    found = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix in (".png", ".tif", ".tiff", ".bmp")}
+    known = {name: found[name] for name in names if name in found}
+    if not known:
+        raise InputError(f"{folder}: expected pictures named as the views, {', '.join(names)}, found none")
+    return known
+
+
+def with_flow_masks(
+    measurement: Measurement,
+    settings: MaskSettings = STANDARD,
+    sigma: float | None = None,
+    drawn: Mapping[str, Path] | None = None,
+    on_view: Callable[[int], None] = lambda done: None,
+) -> Measurement:
+    """Return a measurement with a flow mask for each view: drawn where there is a drawing, else by threshold.
+
+    Parameters
+    ----------
+    measurement : whose displacements are looked at; pixels that are not usable are in the mask
+    settings : of the threshold
+    sigma : noise, px, in the place of the measurement's own
+    drawn : pictures of masks by the names of views
+    on_view : called with the number of views done
+
+    Raises
+    ------
+    InputError
+        If there is no noise to measure displacements by, or a mask holds no flow.
+    """
+    drawn = drawn or {}
+    usable = measurement.usable
+    masks = torch.zeros(usable.shape, dtype=torch.bool)
+    for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
+        height, width = camera.image_size
+        inside = (slice(0, height), slice(0, width))
+        if name in drawn:
+            mask = read_mask(drawn[name], camera.image_size)
+        else:
+            if sigma is None and measurement.sigma is None:
+                raise InputError(
+                    f"sigma: the measurement holds no noise to measure the displacements of view '{name}' by; give it "
+                    "in px, or drawn masks of all views"
+                )
+            known = usable[i][inside].numpy()
+            d = np.where(known[..., None], measurement.displacement[i][inside].numpy(), np.nan)
+            own = measurement.sigma[i][inside].numpy() if sigma is None and measurement.sigma is not None else sigma
+            mask = flow_mask(d, np.broadcast_to(np.asarray(own, dtype=np.float32), d.shape), settings)
+            if not (mask & known).any():
+                raise InputError(f"threshold: no flow is left in view '{name}'; give less than {settings.threshold:g}")
+        masks[i][inside] = torch.from_numpy(mask)
+        on_view(i + 1)
+    return replace(measurement, flow_mask=masks)

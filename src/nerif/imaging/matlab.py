@@ -1,7 +1,18 @@
-"""MATLAB calibrations: Bouguet's toolbox, cameraParameters exported as plain arrays, plain K, R, t.
+"""MATLAB's calibrations: structs of its Computer Vision Toolbox, Bouguet's toolbox, plain K, R, t.
 
-MATLAB's own toolbox counts pixels from 1 and multiplies row vectors, so its matrices are transposed; Bouguet's counts
-from 0 and is OpenCV's in everything else.
+The toolbox counts pixels from 1. Its structs (cameraParameters and stereoParameters by toStruct) hold
+
+    K                             [fx s cx; 0 fy cy; 0 0 1], since R2022b
+    IntrinsicMatrix               its transpose, before
+    RotationVectors               (picture, 3): x_cam = R x_world + t with R by Rodrigues' formula, as OpenCV's
+    TranslationVectors            (picture, 3), in WorldUnits
+    RadialDistortion              k1 k2, or k1 k2 k3;       TangentialDistortion  p1 p2;       ImageSize  rows, columns
+    RotationOfCamera2             of row vectors, x_2 = x_1 R + t: the transpose of OpenCV's; so are RotationMatrices
+
+Bouguet's toolbox counts from 0 and is OpenCV's in everything else.
+
+Source: MathWorks, Computer Vision Toolbox: cameraParameters, stereoParameters and rotvec2mat3d (since R2022b),
+cameraMatrix and rotationVectorToMatrix (before).
 """
 
 from __future__ import annotations
@@ -14,11 +25,13 @@ import numpy as np
 import torch
 
 from nerif.conventions import InputError
-from nerif.imaging.cameras_file import CalibratedCamera, five, numbers, upright
+from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, image_size, numbers, upright
 
 __all__ = ["read_matlab"]
 
 EXPORT = "in MATLAB run  s = toStruct(params); save('plain.mat', '-struct', 's')  and give plain.mat"
+TOOLBOX = ("IntrinsicMatrix", "RadialDistortion", "RotationVectors", "RotationMatrices")
+"""Fields that tell a struct of the toolbox from plain arrays."""
 
 
 def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
@@ -38,24 +51,18 @@ def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
     except Exception as error:  # of SciPy and h5py, of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: not a readable MATLAB file ({reason})") from None
-    content = {k: v for k, v in content.items() if not k.startswith("__") or k == "__function_workspace__"}
     objects = _opaque(path, content)
+    if "__function_workspace__" in content and not objects:
+        objects = ["params"]
     content = {k: v for k, v in content.items() if not k.startswith(("__", "#")) and k not in objects}
-    if "fc" in content and "cc" in content:
-        return [_bouguet(content, path, pose)]
-    if "IntrinsicMatrix" in content or ("K" in content and "RotationMatrices" in content):
-        return [_parameters(content, path.stem, path, pose)]
-    structs = {k: v for k, v in content.items() if isinstance(v, dict) and ("IntrinsicMatrix" in v or "K" in v)}
-    if structs:
-        return [_parameters(v, k, path, pose) if _has_poses(v) else _plain(v, k, path) for k, v in structs.items()]
-    if {"K", "R", "t"} <= set(content) or {"K", "R", "T"} <= set(content):
-        return _stacked(content, path)
-    if objects or "__function_workspace__" in content:
-        name = objects[0] if objects else "params"
-        raise InputError(f"{path}: holds a MATLAB object '{name}', which only MATLAB can read; {EXPORT}")
+    cameras = _cameras(content, path.stem, path, pose)
+    if cameras:
+        return cameras
+    if objects:
+        raise InputError(f"{path}: holds a MATLAB object '{objects[0]}', which only MATLAB can read; {EXPORT}")
     raise InputError(
-        f"{path}: expected fc, cc, kc (Bouguet's toolbox), IntrinsicMatrix and RotationMatrices (cameraParameters), or "
-        f"K, R, t, got {', '.join(content) or 'nothing'}"
+        f"{path}: expected fc, cc, kc (Bouguet's toolbox), K or IntrinsicMatrix with RotationVectors "
+        f"(cameraParameters by toStruct), or K, R, t, got {', '.join(content) or 'nothing'}"
     )
 
 
@@ -81,6 +88,89 @@ def _opaque(path: Path, content: dict[str, Any]) -> list[str]:
     return sorted({n for n in found if n and n != "None" and not n.startswith("__")})
 
 
+def _cameras(content: dict[str, Any], name: str, path: Path, pose: int) -> list[CalibratedCamera]:
+    """All cameras of the variables of a file or the fields of a struct."""
+    if "fc" in content and "cc" in content:
+        return [_bouguet(content, path, pose)]
+    if "CameraParameters1" in content and "CameraParameters2" in content:
+        return _stereo(content, f"{path}: {name}", pose)
+    if "MappingCoefficients" in content or "MappingCoefficients" in str(content.get("Intrinsics", "")):
+        check_model("fisheyeParameters", f"{path}: {name}")
+    if any(field in content for field in TOOLBOX):
+        return [_toolbox(content, name, f"{path}: {name}", pose)]
+    if "K" in content:
+        return _plain_cameras(content, name, path)
+    structs = {k: v for k, v in content.items() if isinstance(v, dict)}
+    return [camera for key, own in structs.items() for camera in _cameras(own, key, path, pose)]
+
+
+# -- MATLAB's own toolbox ------------------------------------------------------------------------------------------
+
+
+def _toolbox(
+    content: dict[str, Any], name: str, where: str, pose: int, known: tuple[np.ndarray, np.ndarray] | None = None
+) -> CalibratedCamera:
+    """cameraParameters as a struct; `known` is its rotation and translation where those of the pictures don't count."""
+    given = next((content[k] for k in ("IntrinsicMatrix", "K") if k in content), None)
+    if given is None:
+        raise InputError(f"{where}: expected K or IntrinsicMatrix, got {', '.join(content)}")
+    k = upright(np.asarray(given).tolist(), f"{where}: intrinsics").clone()
+    k[:2, 2] -= 1
+    rotation, translation = known or _pose(content, where, pose)
+    radial = np.ravel(content.get("RadialDistortion", []))
+    k1, k2, k3 = (float(v) for v in np.concatenate([radial, np.zeros(3)])[:3])
+    p1, p2 = (float(v) for v in np.concatenate([np.ravel(content.get("TangentialDistortion", [])), np.zeros(2)])[:2])
+    return CalibratedCamera(
+        name=name,
+        intrinsics=k,
+        rotation=numbers(rotation.tolist(), (3, 3), f"{where}: rotation"),
+        translation=numbers(translation.tolist(), (3,), f"{where}: translation"),
+        distortion=five([k1, k2, p1, p2, k3], where),
+        image_size=_size(content, "ImageSize", where),
+    )
+
+
+def _pose(content: dict[str, Any], where: str, pose: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation, world to camera, of one target picture."""
+    import cv2
+
+    translations = np.asarray(content.get("TranslationVectors", []), dtype=np.float64).reshape(-1, 3)
+    if "RotationVectors" in content:
+        vectors = np.asarray(content["RotationVectors"], dtype=np.float64).reshape(-1, 3)
+        rotations = [cv2.Rodrigues(v)[0] for v in vectors]
+    else:
+        matrices = np.asarray(content.get("RotationMatrices", np.zeros((3, 3, 0))), dtype=np.float64)
+        rotations = list(matrices.reshape(3, 3, -1).transpose(2, 1, 0))
+    if not 1 <= pose <= min(len(rotations), len(translations)):
+        raise InputError(
+            f"{where}: expected the pose of picture {pose} in RotationVectors and TranslationVectors, got "
+            f"{len(rotations)} and {len(translations)} poses"
+        )
+    return rotations[pose - 1], translations[pose - 1]
+
+
+def _stereo(content: dict[str, Any], where: str, pose: int) -> list[CalibratedCamera]:
+    """stereoParameters as a struct; without target pictures the first camera is the world."""
+    first, second = content["CameraParameters1"], content["CameraParameters2"]
+    if np.size(first.get("RotationVectors", [])):
+        return [_toolbox(own, f"cam{i}", f"{where}: camera {i}", pose) for i, own in ((1, first), (2, second))]
+    if "RotationOfCamera2" not in content or "TranslationOfCamera2" not in content:
+        raise InputError(f"{where}: expected RotationOfCamera2 and TranslationOfCamera2, got {', '.join(content)}")
+    turn, shift = np.asarray(content["RotationOfCamera2"]).T, np.ravel(content["TranslationOfCamera2"])
+    return [
+        _toolbox(first, "cam1", f"{where}: camera 1", pose, (np.eye(3), np.zeros(3))),
+        _toolbox(second, "cam2", f"{where}: camera 2", pose, (turn, shift)),
+    ]
+
+
+def _size(content: dict[str, Any], key: str, where: str) -> tuple[int, int] | None:
+    """(rows, columns), where they are told; the toolbox leaves them empty where they are not."""
+    return image_size(np.ravel(content[key]).tolist(), f"{where}: {key}") if np.size(content.get(key, [])) else None
+
+
+# -- Bouguet's, and plain arrays -----------------------------------------------------------------------------------
+
+
 def _bouguet(content: dict[str, Any], path: Path, pose: int) -> CalibratedCamera:
     """fc, cc, alpha_c, kc, and the pose of one picture."""
     rotation, translation = content.get(f"Rc_{pose}"), content.get(f"Tc_{pose}")
@@ -88,76 +178,25 @@ def _bouguet(content: dict[str, Any], path: Path, pose: int) -> CalibratedCamera
         there = sorted(k for k in content if k.startswith("Rc_"))
         raise InputError(
             f"{path}: expected the pose of picture {pose} (Rc_{pose}, Tc_{pose}), got {', '.join(there) or 'no pose'}; "
-            "save the extrinsic parameters in one world frame"
+            "give the number of another --pose, or save the extrinsic parameters in one world frame"
         )
     fc, cc = (numbers(np.ravel(content[k]).tolist(), (2,), f"{path}: {k}") for k in ("fc", "cc"))
     skew = float(np.ravel(content.get("alpha_c", 0.0))[0]) * float(fc[0])
-    k = torch.tensor([[fc[0], skew, cc[0]], [0, fc[1], cc[1]], [0, 0, 1]], dtype=torch.float64)
-    size = (int(content["ny"]), int(content["nx"])) if "nx" in content and "ny" in content else None
     return CalibratedCamera(
         name=path.stem,
-        intrinsics=k,
+        intrinsics=torch.tensor([[fc[0], skew, cc[0]], [0, fc[1], cc[1]], [0, 0, 1]], dtype=torch.float64),
         rotation=numbers(np.asarray(rotation).tolist(), (3, 3), f"{path}: Rc_{pose}"),
         translation=numbers(np.ravel(translation).tolist(), (3,), f"{path}: Tc_{pose}"),
         distortion=five(content.get("kc", []), f"{path}: kc"),
-        image_size=size,
+        image_size=(int(content["ny"]), int(content["nx"])) if "nx" in content and "ny" in content else None,
     )
 
 
-def _has_poses(content: dict[str, Any]) -> bool:
-    return "RotationMatrices" in content or "IntrinsicMatrix" in content
-
-
-def _parameters(content: dict[str, Any], name: str, path: Path, pose: int) -> CalibratedCamera:
-    """cameraParameters as a struct: row vectors and pixels from 1."""
-    where = f"{path}: {name}"
-    given = content["IntrinsicMatrix"] if "IntrinsicMatrix" in content else content["K"]
-    k = upright(np.asarray(given).tolist(), f"{where}: IntrinsicMatrix").clone()
-    k[:2, 2] -= 1
-    rotations = np.asarray(content.get("RotationMatrices", np.zeros((3, 3, 0))), dtype=np.float64)
-    translations = np.asarray(content.get("TranslationVectors", np.zeros((0, 3))), dtype=np.float64).reshape(-1, 3)
-    rotations = rotations.reshape(3, 3, -1)
-    if not 1 <= pose <= rotations.shape[2] or len(translations) < pose:
-        raise InputError(
-            f"{where}: expected the pose of picture {pose} in RotationMatrices and TranslationVectors, got "
-            f"{rotations.shape[2]} and {len(translations)} poses"
-        )
-    radial = np.ravel(content.get("RadialDistortion", [0.0, 0.0]))
-    tangential = np.ravel(content.get("TangentialDistortion", [0.0, 0.0]))
-    radial = np.concatenate([radial, np.zeros(3 - len(radial))])
-    size = np.ravel(content["ImageSize"]) if np.size(content.get("ImageSize", [])) == 2 else None
-    return CalibratedCamera(
-        name=name,
-        intrinsics=k,
-        rotation=torch.from_numpy(rotations[:, :, pose - 1].T.copy()),
-        translation=torch.from_numpy(translations[pose - 1].copy()),
-        distortion=five([radial[0], radial[1], tangential[0], tangential[1], radial[2]], where),
-        image_size=None if size is None else (int(size[0]), int(size[1])),
-    )
-
-
-def _plain(content: dict[str, Any], name: str, path: Path) -> CalibratedCamera:
-    """K, R, t as they are."""
-    where = f"{path}: {name}"
-    translation = content.get("t", content.get("T"))
-    if "R" not in content or translation is None:
-        raise InputError(f"{where}: expected R and t beside K, got {', '.join(content)}")
-    size = np.ravel(content["image_size"]) if np.size(content.get("image_size", [])) == 2 else None
-    return CalibratedCamera(
-        name=name,
-        intrinsics=upright(np.asarray(content["K"]).tolist(), f"{where}: K"),
-        rotation=numbers(np.asarray(content["R"]).tolist(), (3, 3), f"{where}: R"),
-        translation=numbers(np.ravel(translation).tolist(), (3,), f"{where}: t"),
-        distortion=five(content.get("distortion", content.get("D", [])), f"{where}: distortion"),
-        image_size=None if size is None else (int(size[0]), int(size[1])),
-    )
-
-
-def _stacked(content: dict[str, Any], path: Path) -> list[CalibratedCamera]:
-    """Plain arrays of one camera, or stacked along the last axis for several."""
-    rotation = np.asarray(content["R"])
+def _plain_cameras(content: dict[str, Any], name: str, path: Path) -> list[CalibratedCamera]:
+    """K, R, t of one camera, or stacked along the last axis for several."""
+    rotation = np.asarray(content.get("R", np.zeros((3, 3))))
     if rotation.ndim == 2:
-        return [_plain(content, path.stem, path)]
+        return [_plain(content, name, path)]
     count = rotation.shape[-1]
     single = {"K": 2, "R": 2, "t": 1, "T": 1, "distortion": 1, "D": 1, "image_size": 1}
     cameras = []
@@ -169,3 +208,19 @@ def _stacked(content: dict[str, Any], path: Path) -> list[CalibratedCamera]:
             own[key] = array[..., i] if stacked else value
         cameras.append(_plain(own, f"cam{i + 1}", path))
     return cameras
+
+
+def _plain(content: dict[str, Any], name: str, path: Path) -> CalibratedCamera:
+    """K, R, t as they are."""
+    where = f"{path}: {name}"
+    translation = content.get("t", content.get("T"))
+    if "R" not in content or translation is None:
+        raise InputError(f"{where}: expected R and t beside K, got {', '.join(content)}")
+    return CalibratedCamera(
+        name=name,
+        intrinsics=upright(np.asarray(content["K"]).tolist(), f"{where}: K"),
+        rotation=numbers(np.asarray(content["R"]).tolist(), (3, 3), f"{where}: R"),
+        translation=numbers(np.ravel(translation).tolist(), (3,), f"{where}: t"),
+        distortion=five(content.get("distortion", content.get("D", [])), f"{where}: distortion"),
+        image_size=_size(content, "image_size", where),
+    )

@@ -14,16 +14,9 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["FLOWS", "warp"]
+from nerif.imaging.correlation import window_correlation
 
-
-def warp(image: np.ndarray, movement: np.ndarray) -> np.ndarray:
-    """Return image(p + movement(p)) by cubic splines, edge values beyond the edges."""
-    from scipy.ndimage import map_coordinates
-
-    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
-    where = [rows + movement[..., 1], columns + movement[..., 0]]
-    return np.asarray(map_coordinates(image.astype(np.float32), where, order=3, mode="nearest"))
+__all__ = ["FLOWS"]
 
 
 def deepflow(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
@@ -67,8 +60,6 @@ def ilk(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarra
 
 def correlation(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
     """Cross-correlation of interrogation windows, of 12 px at smoothness 1 (correlation.py)."""
-    from nerif.imaging.correlation import window_correlation
-
     return window_correlation(flow, reference, window=max(8, 2 * round(6 * smoothness)))
 
 

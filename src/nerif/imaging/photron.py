@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.imaging.readers import Frames
+from nerif.imaging.frames import Frames
 
 __all__ = ["PhotronFrames"]
 

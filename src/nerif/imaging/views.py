@@ -22,18 +22,22 @@ import difflib
 import re
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import overload
 
 import numpy as np
+from jaxtyping import Bool
 
 from nerif.conventions import InputError
-from nerif.imaging.calibration import ViewPictures
 from nerif.imaging.crop import Crop
-from nerif.imaging.readers import Frames, check_exposure, effective_bits, good_frames, open_frames, size_in_words
-from nerif.imaging.targets import Detection, Target
+from nerif.imaging.exposure import check_exposure, full_scale
+from nerif.imaging.frames import Frames, read_each, size_in_words
+from nerif.imaging.masks import read_mask
+from nerif.imaging.readers import open_frames
+from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
 
-__all__ = ["SOURCES", "View", "find_targets", "find_views", "good_pictures"]
+__all__ = ["SOURCES", "Pictures", "View", "find_targets", "find_views", "good_pictures"]
 
 SOURCES = ("target", "background", "reference", "flow", "mask", "region")
 """What a view may have: target pictures, the target on the background, pictures without and with flow, drawn masks."""
@@ -57,9 +61,14 @@ class View:
     folder: Path
     sources: dict[str, str]
     crop: Crop | None = None
+    _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __reduce__(self) -> tuple[type[View], tuple[object, ...]]:
+        """What another process gets: where the pictures are, which it opens for itself."""
+        return View, (self.name, self.folder, self.sources, self.crop)
 
     def open(self, source: str) -> Frames:
-        """Open the frames of a source.
+        """Return the frames of a source, opened once.
 
         Raises
         ------
@@ -71,7 +80,18 @@ class View:
                 f"view '{self.name}': no {source} pictures; expected {self.folder / self.name / source}/ or a line "
                 f'{source} = "..." in {self.folder / "views.toml"}'
             )
-        return open_frames(self.sources[source], self.folder)
+        if source not in self._opened:
+            self._opened[source] = open_frames(self.sources[source], self.folder)
+        return self._opened[source]
+
+    @property
+    def full_scale(self) -> float:
+        """Grey value of a full sensor, as far as the pictures without and with flow tell."""
+        return full_scale(self.open("reference"), self.open("flow"))
+
+    def drawn(self, source: str, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"] | None:
+        """Return the mask that was drawn for the view, "mask" or "region", or None."""
+        return read_mask(self.folder / self.sources[source], shape) if source in self.sources else None
 
     def check_alike(self) -> None:
         """Check that the pictures without and with flow are of one size and bit depth.
@@ -172,12 +192,32 @@ def _from_file(file: Path) -> list[View]:
     return views
 
 
-def good_pictures(view: View, source: str, say: Callable[[str], None], most: int = 0) -> list[np.ndarray]:
-    """Read the pictures of a source that can be used; what is wrong with the others is said.
+class Pictures(Sequence[np.ndarray]):
+    """Some pictures of a view, its part of each frame, read whenever one is asked for."""
+
+    def __init__(self, view: View, frames: Frames, indices: Sequence[int]) -> None:
+        self._view, self._frames, self._indices = view, frames, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, i: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, i: slice) -> Pictures: ...
+    def __getitem__(self, i: int | slice) -> np.ndarray | Pictures:
+        if isinstance(i, slice):
+            return Pictures(self._view, self._frames, self._indices[i])
+        index = self._indices[i]
+        return self._view.cropped(self._frames[index], self._frames.name(index))
+
+
+def good_pictures(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Pictures:
+    """Look for the pictures of a source that can be used; what is wrong with the others is said.
 
     Parameters
     ----------
-    most : number of pictures to read, evenly spread; 0 for all
+    most : number of pictures to look at, evenly spread; 0 for all
 
     Raises
     ------
@@ -185,30 +225,30 @@ def good_pictures(view: View, source: str, say: Callable[[str], None], most: int
         If none can be used.
     """
     frames = view.open(source)
-    good, bad = good_frames(frames)
-    for line in bad:
-        say(f"left out: {line}")
-    if not good:
-        raise InputError(f"view '{view.name}': none of its {len(frames)} {source} pictures can be used; {bad[0]}")
-    if most and len(good) > most:
-        good = [good[i] for i in np.linspace(0, len(good) - 1, most).round().astype(int)]
-    bits, pictures = effective_bits(frames), []
-    for i in good:
-        name = frames.name(i)
-        picture = view.cropped(frames[i], name)
-        exposure = check_exposure(picture, bits, name)
+    count = len(frames)
+    chosen = np.linspace(0, count - 1, min(most or count, count)).round().astype(int).tolist()
+    good, bad = [], []
+    for i, found in read_each(frames, chosen):
+        if isinstance(found, InputError):
+            bad.append(str(found))
+            say(f"left out: {found}")
+            continue
+        good.append(i)
+        exposure = check_exposure(view.cropped(found, frames.name(i)), full_scale(frames), frames.name(i))
         if exposure:
             say(f"note: {exposure}")
-        pictures.append(picture)
-    return pictures
+    if not good:
+        looked = f"{len(chosen)}" if len(chosen) == count else f"{len(chosen)} looked at out of {count}"
+        raise InputError(f"view '{view.name}': none of its {looked} {source} pictures can be used; {bad[0]}")
+    return Pictures(view, frames, good)
 
 
 def find_targets(
     view: View,
-    target: Target,
+    target: CalibrationTarget,
     say: Callable[[str], None],
     on_picture: Callable[[], None] = lambda: None,
-    on_background: Target | None = None,
+    on_background: CalibrationTarget | None = None,
 ) -> ViewPictures:
     """Find the target in all pictures of a view; say which pictures were of no use.
 
@@ -225,12 +265,12 @@ def find_targets(
                 view.open(source)  # says what is missing
             continue
         frames = view.open(source)
-        good, bad = good_frames(frames)
-        for line in bad:
-            say(f"left out: {line}")
         keys = _pose_keys([frames.name(i) for i in range(len(frames))])
-        for i in good:
-            picture = view.cropped(frames[i], frames.name(i))
+        for i, image in read_each(frames, range(len(frames))):
+            if isinstance(image, InputError):
+                say(f"left out: {image}")
+                continue
+            picture = view.cropped(image, frames.name(i))
             if size not in ((0, 0), picture.shape):
                 raise InputError(
                     f"{frames.name(i)}: expected a picture of {size[0]} x {size[1]} px as the others of view "

@@ -13,45 +13,63 @@ import torch
 
 from nerif.conventions import InputError
 from nerif.geometry import Ring
+from nerif.physics.gas_optics import ambient_index
 
-__all__ = ["Expectation", "Plan", "expect"]
+__all__ = ["DesignSettings", "Expectation", "expect"]
 
 DIFFRACTION = 2.44  # diameter of the Airy disc over wavelength and f-number
 DOT = 3.0  # px
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is planned.
-
-    Parameters
-    ----------
-    index_contrast : largest difference of the index to the ambient
-    f_number : focal length over aperture
-    wavelength_nm : of the light
-    flow_size : width of the flow, and path length through it, mm
-    feature_size : smallest structure that has the whole contrast, mm
-    displacement_noise : of the optical flow, px
-    window : over which the optical flow averages, px
+class DesignSettings:
+    """The flow to be measured, the light and the optical flow.
 
     Raises
     ------
     InputError
-        If a number is not positive.
+        If a number is not positive, or the temperatures are the same.
     """
 
     index_contrast: float = 2.0e-4
+    """Largest difference of the index to the ambient."""
+    temperature: float | None = None
+    """Hottest (or coldest) temperature of air, K; takes the place of index_contrast."""
+    ambient_temperature: float = 293.15
+    """Temperature of the air around, K."""
+    pressure_pa: float = 101325.0
+    """Pressure, Pa."""
     f_number: float = 16.0
+    """Focal length over aperture."""
     wavelength_nm: float = 532.0
+    """Wavelength of the light, nm."""
     flow_size: float = 50.0
+    """Width of the flow, and path length through it, mm."""
     feature_size: float = 5.0
+    """Smallest structure of interest, which has the whole contrast, mm."""
     displacement_noise: float = 0.03
+    """Noise of the optical flow, px."""
     window: float = 8.0
+    """What the optical flow averages over, px."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError(f"{name}: expected a positive number, got {value}")
+        if self.temperature == self.ambient_temperature:
+            raise InputError(f"temperature: expected another one than ambient_temperature, {self.temperature:g} K")
+
+    @property
+    def contrast(self) -> float:
+        """Largest difference of the index to the ambient, by the temperature if that is given."""
+        if self.temperature is None:
+            return self.index_contrast
+        flow, ambient = (
+            ambient_index("air", t, self.pressure_pa, self.wavelength_nm)
+            for t in (self.temperature, self.ambient_temperature)
+        )
+        return abs(flow - ambient)
 
 
 @dataclass(frozen=True)
@@ -90,7 +108,7 @@ class Expectation:
     """What looks wrong."""
 
 
-def expect(ring: Ring, plan: Plan) -> Expectation:
+def expect(ring: Ring, flow: DesignSettings) -> Expectation:
     """Return what the first camera of a ring will see of a flow around the origin.
 
     The largest deflection by n = dn exp(-r^2 / 2 s^2) is dn sqrt(2 pi / e), at the distance s from its middle, whatever
@@ -107,13 +125,13 @@ def expect(ring: Ring, plan: Plan) -> Expectation:
     per_mrad = lever * float((ray.sensitivity[0, 0] @ camera.rotation[0]).abs()) / 1000
     focal = float(camera.intrinsics[0, 0])
     at_flow, at_background = to_flow / focal, to_background / focal
-    deflection = 1000 * plan.index_contrast * math.sqrt(2 * math.pi / math.e)
+    deflection = 1000 * flow.contrast * math.sqrt(2 * math.pi / math.e)
     displacement = per_mrad * deflection
-    sheet = per_mrad * 1000 * plan.index_contrast * plan.flow_size / plan.feature_size
+    sheet = per_mrad * 1000 * flow.contrast * flow.flow_size / flow.feature_size
     # the cone is as wide as the aperture at the lens, and a point on the background
-    cone = ring.focal_length / plan.f_number * lever / to_background
-    airy = DIFFRACTION * plan.wavelength_nm * 1e-6 * plan.f_number / ring.pixel_pitch * at_flow
-    window = plan.window * at_flow
+    cone = ring.focal_length / flow.f_number * lever / to_background
+    airy = DIFFRACTION * flow.wavelength_nm * 1e-6 * flow.f_number / ring.pixel_pitch * at_flow
+    window = flow.window * at_flow
     size = (1.1 * width * at_background, 1.1 * height * at_background)
     result = Expectation(
         pixel_at_flow=at_flow,
@@ -125,40 +143,40 @@ def expect(ring: Ring, plan: Plan) -> Expectation:
         deflection=deflection,
         displacement=displacement,
         displacement_of_sheet=sheet,
-        smallest_contrast=plan.index_contrast * plan.displacement_noise / displacement,
+        smallest_contrast=flow.contrast * flow.displacement_noise / displacement,
         cone=cone,
         window=window,
         diffraction=airy,
         resolution=math.sqrt(cone**2 + window**2 + airy**2),
         notes=(),
     )
-    return Expectation(**{**result.__dict__, "notes": tuple(_notes(result, ring, plan))})
+    return Expectation(**{**result.__dict__, "notes": tuple(_notes(result, ring, flow))})
 
 
-def _notes(e: Expectation, ring: Ring, plan: Plan) -> list[str]:
+def _notes(e: Expectation, ring: Ring, flow: DesignSettings) -> list[str]:
     notes = []
-    if e.displacement < 3 * plan.displacement_noise:
+    if e.displacement < 3 * flow.displacement_noise:
         notes.append(
-            f"the displacement of {e.displacement:.3f} px is hardly above the noise of {plan.displacement_noise:g} px: "
+            f"the displacement of {e.displacement:.3f} px is hardly above the noise of {flow.displacement_noise:g} px: "
             "move the background away from the flow, or take a longer lens"
         )
-    if e.displacement > plan.window / 2:
-        notes.append(f"the displacement of {e.displacement:.1f} px is more than half a window of {plan.window:g} px")
-    if e.resolution > plan.feature_size:
+    if e.displacement > flow.window / 2:
+        notes.append(f"the displacement of {e.displacement:.1f} px is more than half a window of {flow.window:g} px")
+    if e.resolution > flow.feature_size:
         largest = max((e.cone, "stop the lens down, or bring the background nearer"), (e.window, "use smaller windows"),
                       (e.diffraction, "open the lens"))  # fmt: skip
         notes.append(
-            f"structures of {plan.feature_size:g} mm are finer than the resolution of {e.resolution:.2f} mm: "
+            f"structures of {flow.feature_size:g} mm are finer than the resolution of {e.resolution:.2f} mm: "
             f"{largest[1]}"
         )
-    if min(e.field_of_view) < plan.flow_size:
+    if min(e.field_of_view) < flow.flow_size:
         notes.append(
-            f"the flow of {plan.flow_size:g} mm is larger than the picture of {e.field_of_view[0]:.0f} x "
+            f"the flow of {flow.flow_size:g} mm is larger than the picture of {e.field_of_view[0]:.0f} x "
             f"{e.field_of_view[1]:.0f} mm"
         )
     if e.dot < 0.2:
         notes.append(f"dots of {e.dot:.2f} mm are finer than most printers can do, 0.2 mm")
-    if ring.background_distance < plan.flow_size:
+    if ring.background_distance < flow.flow_size:
         notes.append("the background stands inside or next to the flow")
     angles = sorted(a % 180 for a in ring.angles)
     if len(angles) >= 2:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.atomic import atomic
-from nerif.imaging.calibration import Calibration
+from nerif.imaging.calibration_result import Calibration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

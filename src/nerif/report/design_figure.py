@@ -10,7 +10,7 @@ import numpy as np
 
 from nerif.atomic import atomic
 from nerif.geometry import Ring
-from nerif.physics.design import Plan, expect
+from nerif.physics.design import DesignSettings, expect
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 __all__ = ["draw_displacement", "draw_plan", "draw_resolution", "save_design"]
 
 
-def draw_plan(axes: Axes, ring: Ring, plan: Plan) -> Axes:
+def draw_plan(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
     """Draw the rig from above: cameras, what they see, backgrounds and the flow; mm."""
-    view = expect(ring, plan)
+    view = expect(ring, flow)
     for angle in np.radians(ring.angles):
         towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
         lens, back = ring.distance * towards, -ring.background_distance * towards
@@ -29,7 +29,7 @@ def draw_plan(axes: Axes, ring: Ring, plan: Plan) -> Axes:
         axes.fill(*np.stack([lens, *edges]).T, color="#0072B2", alpha=0.08, linewidth=0)
         axes.plot(*np.stack(edges).T, color="black", linewidth=2)
         axes.plot(*lens, marker="o", color="#0072B2", markersize=5)
-    axes.add_patch(_circle(plan.flow_size / 2))
+    axes.add_patch(_circle(flow.flow_size / 2))
     axes.set_aspect("equal")
     axes.set_xlabel("x [mm]")
     axes.set_ylabel("y [mm]")
@@ -37,14 +37,14 @@ def draw_plan(axes: Axes, ring: Ring, plan: Plan) -> Axes:
     return axes
 
 
-def draw_displacement(axes: Axes, ring: Ring, plan: Plan) -> Axes:
+def draw_displacement(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
     """Draw the expected displacement (px) and the resolution (mm) over the distance of the background."""
     distances = ring.background_distance * np.geomspace(0.2, 3, 60)
-    results = [expect(replace(ring, background_distance=float(d)), plan) for d in distances]
+    results = [expect(replace(ring, background_distance=float(d)), flow) for d in distances]
     axes.plot(distances, [r.displacement for r in results], color="#0072B2", label="displacement [px]")
     axes.plot(distances, [r.resolution for r in results], color="#D55E00", linestyle="--", label="resolution [mm]")
-    axes.axhline(plan.displacement_noise, color="0.5", linewidth=0.8)
-    axes.text(distances[-1], plan.displacement_noise, "noise [px]", fontsize=7, ha="right", va="bottom", color="0.4")
+    axes.axhline(flow.displacement_noise, color="0.5", linewidth=0.8)
+    axes.text(distances[-1], flow.displacement_noise, "noise [px]", fontsize=7, ha="right", va="bottom", color="0.4")
     axes.axvline(ring.background_distance, color="0.7", linewidth=0.8, linestyle=":")
     axes.set_yscale("log")
     axes.set_xlabel("flow to background [mm]")
@@ -54,14 +54,14 @@ def draw_displacement(axes: Axes, ring: Ring, plan: Plan) -> Axes:
     return axes
 
 
-def draw_resolution(axes: Axes, ring: Ring, plan: Plan) -> Axes:
+def draw_resolution(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
     """Draw the parts of the resolution (mm at the flow) over the f-number."""
     numbers = np.geomspace(1.4, 64, 60)
-    results = [expect(ring, replace(plan, f_number=float(n))) for n in numbers]
+    results = [expect(ring, replace(flow, f_number=float(n))) for n in numbers]
     for name, style in (("cone", "--"), ("window", ":"), ("diffraction", "-.")):
         axes.plot(numbers, [getattr(r, name) for r in results], linestyle=style, label=name)
     axes.plot(numbers, [r.resolution for r in results], color="black", label="together")
-    axes.axvline(plan.f_number, color="0.7", linewidth=0.8, linestyle=":")
+    axes.axvline(flow.f_number, color="0.7", linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
     axes.set_xticks([2, 4, 8, 16, 32, 64], [f"{n}" for n in (2, 4, 8, 16, 32, 64)])
     axes.minorticks_off()
@@ -73,7 +73,7 @@ def draw_resolution(axes: Axes, ring: Ring, plan: Plan) -> Axes:
     return axes
 
 
-def save_design(path: Path, ring: Ring, plan: Plan) -> None:
+def save_design(path: Path, ring: Ring, flow: DesignSettings) -> None:
     """Write the three drawings side by side, as PNG or PDF by the ending."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -81,9 +81,9 @@ def save_design(path: Path, ring: Ring, plan: Plan) -> None:
     figure = Figure(figsize=(13, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     first, second, third = figure.subplots(1, 3)
-    draw_plan(first, ring, plan)
-    draw_displacement(second, ring, plan)
-    draw_resolution(third, ring, plan)
+    draw_plan(first, ring, flow)
+    draw_displacement(second, ring, flow)
+    draw_resolution(third, ring, flow)
     with atomic(path) as part:
         figure.savefig(part, dpi=130)
 

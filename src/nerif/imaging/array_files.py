@@ -1,0 +1,105 @@
+"""Frames in arrays on disc: NumPy's .npy and .npz, and HDF5."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from nerif.conventions import InputError
+from nerif.imaging.frames import Frames
+
+__all__ = ["ArrayFrames", "Hdf5Frames"]
+
+
+class ArrayFrames(Frames):
+    """A NumPy array: of an .npy file, mapped, or one of an .npz file, read whole, as these cannot be read in parts."""
+
+    def __init__(self, path: Path, name: str, dataset: str) -> None:
+        try:
+            if path.suffix.lower() == ".npy":
+                arrays = {"array": np.load(path, mmap_mode="r", allow_pickle=False)}
+            else:
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
+                    arrays = {key: found[key] for key in ([dataset] if dataset in found.files else found.files)}
+        except Exception as error:
+            raise InputError(f"{name}: cannot be read, truncated or damaged? ({error}); copy it again") from None
+        key = _choose({k: a.ndim for k, a in arrays.items()}, dataset, name)
+        self._array = arrays[key] if arrays[key].ndim == 3 else arrays[key][None]
+        self._name = name
+        if not len(self._array):
+            raise InputError(f"{name}: expected one frame at least, got none")
+
+    def __len__(self) -> int:
+        return len(self._array)
+
+    def name(self, i: int) -> str:
+        return f"{self._name} frame {i}" if len(self) > 1 else self._name
+
+    def load(self, i: int) -> np.ndarray:
+        return np.array(self._array[i])
+
+
+def _choose(dims: dict[str, int], wanted: str, name: str) -> str:
+    """The dataset wanted, or the only one that can hold frames."""
+    fitting = [key for key, n in dims.items() if n in (2, 3)]
+    there = f"the file holds {', '.join(dims) or 'none'}"
+    if wanted:
+        if wanted not in dims:
+            raise InputError(f"{name}:{wanted}: no such dataset; {there}")
+        if wanted not in fitting:
+            raise InputError(f"{name}:{wanted}: expected 2 or 3 dims (frame, row, column), got {dims[wanted]}")
+        return wanted
+    if len(fitting) != 1:
+        raise InputError(
+            f"{name}: expected one dataset of 2 or 3 dims, got {len(fitting)}; name it after ':' ({there})"
+        )
+    return fitting[0]
+
+
+class Hdf5Frames(Frames):
+    """A dataset (frame, row, column) or (row, column) of an HDF5 file.
+
+    Times (s) may stand in its attribute `times` or in a dataset `times` beside it, effective bits in `bits`.
+    """
+
+    def __init__(self, path: Path, name: str, dataset: str) -> None:
+        import h5py
+
+        self._path, self._name = path, name
+        try:
+            with h5py.File(path, "r") as file:
+                dims: dict[str, int] = {}
+                file.visititems(lambda key, x: dims.update({key: x.ndim}) if isinstance(x, h5py.Dataset) else None)
+                self._key = _choose(dims, dataset.strip("/"), name)
+                data = file[self._key]
+                self._stack, self._length = data.ndim == 3, len(data) if data.ndim == 3 else 1
+                bits = data.attrs.get("bits")
+                times = data.attrs.get("times", data.parent.get("times"))
+                times = None if times is None else np.atleast_1d(np.array(times, dtype=float))
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{name}: cannot be read as HDF5, truncated or damaged? ({error})") from None
+        self._bits = None if bits is None else int(bits)
+        if not self._length:
+            raise InputError(f"{name}:{self._key}: expected one frame at least, got none")
+        if times is not None and times.shape != (self._length,):
+            raise InputError(f"{name}: expected {self._length} times, one for each frame, got shape {times.shape}")
+        self.times = times
+
+    def __len__(self) -> int:
+        return self._length
+
+    def name(self, i: int) -> str:
+        return f"{self._name}:{self._key}" + (f" frame {i}" if self._stack else "")
+
+    @property
+    def known_bits(self) -> int | None:
+        return self._bits
+
+    def load(self, i: int) -> np.ndarray:
+        import h5py
+
+        with h5py.File(self._path, "r") as file:
+            return file[self._key][i] if self._stack else file[self._key][()]

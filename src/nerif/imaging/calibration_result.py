@@ -1,0 +1,208 @@
+"""What a calibration found, how well it fits, and what looks wrong about it."""
+
+from __future__ import annotations
+
+import datetime
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nerif.conventions import InputError
+from nerif.geometry import Plane
+from nerif.imaging.bundle import Bundle, Observation, Pose
+from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
+
+__all__ = ["Calibration", "FittedPlane", "ImageError"]
+
+COVERED = 0.4  # of the picture: with less, distortion is not known at its edges
+FOCAL_KNOWN = 0.01  # of the focal length: a larger standard deviation is told
+PLANE_FLAT = 0.005  # of the distance: a background that is less flat is none
+
+
+@dataclass(frozen=True)
+class ImageError:
+    """Reprojection error of one picture: rms over `points` points, px."""
+
+    camera: str
+    picture: str
+    rms: float
+    points: int
+    used: bool
+    background: bool
+
+
+@dataclass(frozen=True)
+class FittedPlane:
+    """A background plane normal . x = offset (mm), and the rms distance (mm) of the target points from it."""
+
+    normal: tuple[float, float, float]
+    offset: float
+    rms: float
+
+    @classmethod
+    def through(cls, points: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, 3]) -> FittedPlane:
+        """Return the plane nearest to points (mm) in the sense of least squares, its normal towards a point (mm)."""
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+        normal = normal if normal @ (towards - middle) > 0 else -normal
+        rms = float(np.sqrt((((points - middle) @ normal) ** 2).mean()))
+        return cls((float(normal[0]), float(normal[1]), float(normal[2])), float(normal @ middle), rms)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Calibrated cameras and how well they fit.
+
+    Parameters
+    ----------
+    names, sizes : of the cameras and their pictures (height, width)
+    intrinsics : (camera, 9) fx, fy, cx, cy (px), k1, k2, p1, p2, k3
+    poses : world to camera, mm
+    backgrounds : plane of each camera, or None
+    errors : one a picture
+    sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm
+    sigma_focal : (camera,) share of the focal length
+    residuals : (camera) arrays (n, 4) of u, v and the residual in u, v, px: to be drawn
+    """
+
+    names: tuple[str, ...]
+    sizes: tuple[tuple[int, int], ...]
+    intrinsics: Float[np.ndarray, "camera 9"]
+    poses: tuple[Pose, ...]
+    backgrounds: tuple[FittedPlane | None, ...]
+    errors: tuple[ImageError, ...]
+    sigma_rotation: Float[np.ndarray, " camera"]
+    sigma_translation: Float[np.ndarray, " camera"]
+    sigma_focal: Float[np.ndarray, " camera"]
+    residuals: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(
+        cls, names: Sequence[str], bundle: Bundle, sigma: Float[np.ndarray, "camera 15"],
+        observations: Sequence[Observation], used: Sequence[bool],
+    ) -> Calibration:  # fmt: skip
+        """Sum up an adjusted bundle.
+
+        Parameters
+        ----------
+        names : of the cameras
+        bundle : adjusted, in the world frame
+        sigma : standard deviations of every camera's parameters (bundle.adjust)
+        observations : all points found
+        used : which observations the adjustment took
+        """
+        errors = [
+            ImageError(names[o.camera], o.picture, bundle.rms(o), len(o.detection.points), u, o.on_background)
+            for o, u in zip(observations, used, strict=True)
+        ]
+        residuals, backgrounds = [], []
+        for i in range(len(names)):
+            own = [o for o, u in zip(observations, used, strict=True) if u and o.camera == i]
+            residuals.append(np.concatenate([np.hstack([o.detection.pixels, bundle.residual(o)]) for o in own]))
+            laid = [bundle.poses[o.pose].moved(o.detection.points) for o in own if o.on_background]
+            centre = bundle.cameras[i].inverse.translation
+            backgrounds.append(FittedPlane.through(np.concatenate(laid), centre) if laid else None)
+        return cls(
+            names=tuple(names),
+            sizes=bundle.sizes,
+            intrinsics=bundle.intrinsics,
+            poses=bundle.cameras,
+            backgrounds=tuple(backgrounds),
+            errors=tuple(errors),
+            sigma_rotation=np.degrees(np.linalg.norm(sigma[:, 9:12], axis=1)),
+            sigma_translation=np.linalg.norm(sigma[:, 12:], axis=1),
+            sigma_focal=sigma[:, 0] / bundle.intrinsics[:, 0],
+            residuals=tuple(residuals),
+        )
+
+    def rms(self, camera: str | None = None) -> float:
+        """Rms reprojection error over the pictures used, of one camera or all, px."""
+        chosen = [e for e in self.errors if e.used and camera in (None, e.camera)]
+        return float(np.sqrt(np.average([e.rms**2 for e in chosen], weights=[e.points for e in chosen])))
+
+    @property
+    def cameras(self) -> tuple[CalibratedCamera, ...]:
+        """The cameras."""
+        return tuple(self._camera(i) for i in range(len(self.names)))
+
+    def _camera(self, i: int) -> CalibratedCamera:
+        fx, fy, cx, cy = (float(v) for v in self.intrinsics[i, :4])
+        plane = self.backgrounds[i]
+        return CalibratedCamera(
+            name=self.names[i],
+            intrinsics=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
+            rotation=torch.from_numpy(self.poses[i].rotation.copy()),
+            translation=torch.from_numpy(self.poses[i].translation.copy()),
+            distortion=torch.from_numpy(self.intrinsics[i, 4:].copy()),
+            image_size=self.sizes[i],
+            background=None if plane is None else Plane(torch.tensor(plane.normal, dtype=torch.float64), plane.offset),
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know: pictures left out, and what may be wrong with a camera, short of refusing it."""
+        notes = [
+            f"{e.camera}/{e.picture}: left out, its reprojection error of {e.rms:.2f} px does not fit"
+            for e in self.errors
+            if not e.used
+        ]
+        for i, name in enumerate(self.names):
+            u, v = self.residuals[i][:, :2].T
+            covered = np.ptp(u) * np.ptp(v) / (self.sizes[i][0] * self.sizes[i][1])
+            if covered < COVERED:
+                notes.append(
+                    f"{name}: the targets cover {covered:.0%} of the picture; distortion is a guess beyond them"
+                )
+            if self.sigma_focal[i] > FOCAL_KNOWN:
+                notes.append(
+                    f"{name}: the focal length is known to {self.sigma_focal[i]:.1%} only; tilt the target more"
+                )
+            if self.backgrounds[i] is None:
+                notes.append(f"{name}: no target on the background was found, so its plane is not known")
+        return tuple(notes)
+
+    def check(self, max_error: float) -> None:
+        """Refuse what cannot be right; `max_error` is the largest rms reprojection error of a camera to accept, px.
+
+        Raises
+        ------
+        InputError
+            If a camera fits badly, has intrinsics that no camera has, or a background that is not flat.
+        """
+        for i, name in enumerate(self.names):
+            rms, (height, width) = self.rms(name), self.sizes[i]
+            if not rms <= max_error:
+                worst = max((e for e in self.errors if e.camera == name and e.used), key=lambda e: e.rms)
+                raise InputError(
+                    f"view '{name}': reprojection error {rms:.2f} px, expected {max_error:g} px or less; the worst "
+                    f"picture is {worst.picture} ({worst.rms:.2f} px). Check pitch and number of squares, and that "
+                    "pictures under one name show one pose; or raise --max-error"
+                )
+            fx, fy, cx, cy = self.intrinsics[i, :4]
+            if not (0.8 < fx / fy < 1.25 and -0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
+                raise InputError(
+                    f"view '{name}': got fx = {fx:.5g}, fy = {fy:.5g}, cx = {cx:.5g}, cy = {cy:.5g} px, which no "
+                    "camera has; take more target pictures, tilted in different ways and filling the picture"
+                )
+            plane = self.backgrounds[i]
+            if plane is not None and plane.rms > PLANE_FLAT * np.linalg.norm(self.poses[i].translation):
+                raise InputError(
+                    f"view '{name}': the targets on its background lie {plane.rms:.2f} mm rms off one plane; did the "
+                    "background move, or does a picture show the target off it?"
+                )
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the cameras as a calibration file, with how well they fit under [about]."""
+        about = {
+            "date": datetime.date.today().isoformat(),
+            "rms_px": self.rms(),
+            "camera_rms_px": {name: self.rms(name) for name in self.names},
+            "sigma_rotation_deg": dict(zip(self.names, self.sigma_rotation.tolist(), strict=True)),
+            "sigma_translation_mm": dict(zip(self.names, self.sigma_translation.tolist(), strict=True)),
+            "notes": list(self.notes),
+        }
+        write_cameras(path, self.cameras, about)

@@ -1,0 +1,212 @@
+"""Grey frames of one size, counted from 0 and read one at a time, with checks that name the one that is wrong."""
+
+from __future__ import annotations
+
+import operator
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from nerif.conventions import InputError
+
+__all__ = ["Frames", "Layout", "SelectedFrames", "good_frames", "size_in_words"]
+
+LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What most frames of a sequence agree on, and what values were met while finding out.
+
+    Parameters
+    ----------
+    shape : height and width, px
+    dtype : of the grey values
+    example : name of a frame that is so
+    peak : largest value
+    used : bits that are set in any value, 0 for floats
+    """
+
+    shape: tuple[int, int]
+    dtype: np.dtype
+    example: str
+    peak: float
+    used: int
+
+
+class Frames(ABC):
+    """Grey frames of one size and type, each read and checked when asked for."""
+
+    times: np.ndarray | None = None
+    """When each frame was taken, s; None if the file does not say."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def name(self, i: int) -> str:
+        """Return what messages call frame `i`, such as ``cam1/ref_003.tif`` or ``rec.mraw frame 17``."""
+
+    @abstractmethod
+    def load(self, i: int) -> np.ndarray:
+        """Return frame `i` as it is stored, unchecked."""
+
+    @property
+    def known_bits(self) -> int | None:
+        """Effective bits by the file's metadata, None where it has none."""
+        return None
+
+    def single(self, i: int) -> np.ndarray:
+        """Return frame `i` as uint8, uint16 or float32 (row, column), checked by itself, not against the others."""
+        try:
+            image = self.load(i)
+        except (InputError, MemoryError):
+            raise
+        except Exception as error:
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            text = f"{self.name(i)}: cannot be read, truncated or damaged? ({reason}); copy or export it again"
+            raise InputError(text) from None
+        return _grey_frame(image, self.name(i))
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Size and type of most out of five frames spread over the sequence, so that one bad file does not rule."""
+        n = len(self)
+        found: list[Layout] = []
+        errors: list[InputError] = []
+        for k, i in enumerate(dict.fromkeys([*(round(j * (n - 1) / 4) for j in range(5)), *range(n)])):
+            if found and k >= min(5, n):
+                break
+            try:
+                image = self.single(i)
+            except InputError as error:
+                errors.append(error)
+            else:
+                used = int(np.bitwise_or.reduce(image, axis=None)) if image.dtype.kind == "u" else 0
+                size = (image.shape[0], image.shape[1])
+                found.append(Layout(size, image.dtype, self.name(i), float(image.max()), used))
+        if not found:
+            raise errors[0]
+        (most, _), *_ = Counter((x.shape, x.dtype) for x in found).most_common()
+        agreeing = [x for x in found if (x.shape, x.dtype) == most]
+        used = int(np.bitwise_or.reduce([x.used for x in agreeing]))
+        return Layout(*most, agreeing[0].example, max(x.peak for x in agreeing), used)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width, px."""
+        return self.layout.shape
+
+    @property
+    def bits(self) -> int:
+        """Effective bits, full scale being 2**bits - 1: by the metadata, else all the container has (8, 16).
+
+        Floats from 0 to 1 have 1 bit (full scale 1), others 16. For a guess from the values see `effective_bits`.
+        """
+        if self.known_bits is not None:
+            return self.known_bits
+        if self.layout.dtype == np.uint8:
+            return 8
+        return 1 if self.layout.dtype == np.float32 and self.layout.peak <= 1 else 16
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        """Return frame `i`; InputError if it cannot be read, or differs from the others in size or type."""
+        n, i = len(self), operator.index(i)
+        if not -n <= i < n:
+            raise IndexError(f"{self.name(0)}: frame {i} of {n}")
+        i %= n
+        image, layout = self.single(i), self.layout
+        if (image.shape, image.dtype) != (layout.shape, layout.dtype):
+            raise InputError(
+                f"{self.name(i)}: expected {size_in_words(layout.shape)} of {layout.dtype} as in {layout.example}, "
+                f"got {size_in_words(image.shape)} of {image.dtype}; other frames need a sequence of their own"
+            )
+        return image
+
+
+class SelectedFrames(Frames):
+    """Some frames of another sequence."""
+
+    def __init__(self, frames: Frames, indices: Sequence[int]) -> None:
+        self._frames, self._indices = frames, indices
+        if frames.times is not None:
+            self.times = frames.times[list(indices)]
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def name(self, i: int) -> str:
+        return self._frames.name(self._indices[i])
+
+    def load(self, i: int) -> np.ndarray:
+        return self._frames.load(self._indices[i])
+
+    @property
+    def known_bits(self) -> int | None:
+        return self._frames.known_bits
+
+
+def size_in_words(shape: Sequence[int]) -> str:
+    return " x ".join(str(n) for n in shape) + " px (height x width)"
+
+
+def _grey_frame(image: np.ndarray, name: str) -> np.ndarray:
+    """Return a stored image as a grey one in native byte order, its values checked."""
+    if image.dtype == bool:
+        raise InputError(f"{name}: expected grey values of 8 to 16 bit, got a 1-bit image; export it with 8 or 16 bit")
+    image = np.asarray(image, dtype=image.dtype.newbyteorder("="))
+    if image.ndim == 3 and image.shape[2] <= 4:
+        image = _grey(image)
+    if image.ndim != 2 or not image.size:
+        raise InputError(f"{name}: expected an image (row, column), got an array of shape {image.shape}")
+    if image.dtype.kind != "f":
+        if image.dtype not in (np.uint8, np.uint16):
+            raise InputError(f"{name}: expected grey values of 8 to 16 bit, got {image.dtype}; save it as uint16")
+        return image
+    image = image.astype(np.float32)
+    if bad := int(np.count_nonzero(~np.isfinite(image))):
+        raise InputError(f"{name}: expected numbers in all pixels, got NaN or infinity in {bad} of {image.size}")
+    low, high = float(image.min()), float(image.max())
+    if low < 0 or 1 < high < 16 or high > 65535:
+        raise InputError(
+            f"{name}: expected float values from 0 to 1, or counts up to 255 to 65535, got {low:g} to {high:g}; "
+            "save the frames as 8- or 16-bit integers"
+        )
+    return image
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    """Luminance of (row, column, channel) as R, G, B; one channel if all agree; alpha is left out."""
+    first = image[..., 0]
+    if image.shape[2] < 3 or ((image[..., 1] == first).all() and (image[..., 2] == first).all()):
+        return np.ascontiguousarray(first)
+    grey = image[..., :3] @ LUMINANCE
+    return (np.rint(grey) if image.dtype.kind == "u" else grey).astype(image.dtype)
+
+
+def read_each(frames: Frames, indices: Iterable[int]) -> Iterator[tuple[int, np.ndarray | InputError]]:
+    """Read frames one after the other, each once: the picture, or what is wrong with it."""
+    try:
+        read = frames.__getitem__ if frames.shape else frames.single
+    except InputError:  # none can be read
+        read = frames.single
+    for i in indices:
+        try:
+            yield i, read(i)
+        except InputError as error:
+            yield i, error
+
+
+def good_frames(frames: Frames) -> tuple[list[int], list[str]]:
+    """Return the indices of the frames that can be used, and for each other one a line that says what is wrong."""
+    good, lines = [], []
+    for i, found in read_each(frames, range(len(frames))):
+        if isinstance(found, InputError):
+            lines.append(str(found))
+        else:
+            good.append(i)
+    return good, lines

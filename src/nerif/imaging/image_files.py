@@ -1,0 +1,278 @@
+"""Frames in image files, one or more in each: TIFF, PNG, BMP, JPEG, LaVision."""
+
+from __future__ import annotations
+
+import logging
+import re
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from nerif.conventions import InputError
+from nerif.imaging.frames import Frames
+
+__all__ = ["FileFrames"]
+
+
+class FileFrames(Frames):
+    """Frames of image files. The file of the frame that was read last stays open, so that pages are found once."""
+
+    def __init__(self, files: list[Path], names: list[str]) -> None:
+        self._files, self._names = files, names
+        self._last: tuple[int, ImageFile] | None = None
+        counts: list[int] = []
+        for k, path in enumerate(files):
+            lavision = _opener(path) is LaVision
+            if lavision:
+                _lvpyio()
+            # each LaVision file would have to be read to know
+            counts.append(counts[0] if lavision and counts else self._count(k))
+        self._counts = counts
+        self._places = [(k, i) for k, count in enumerate(counts) for i in range(count)]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process gets: all but the open file."""
+        return {**self.__dict__, "_last": None}
+
+    def _open(self, k: int) -> ImageFile:
+        if self._last is None or self._last[0] != k:
+            self._last = None
+            self._last = k, _opener(self._files[k])(self._files[k])
+        return self._last[1]
+
+    def _count(self, k: int) -> int:
+        try:
+            return max(1, len(self._open(k)))
+        except Exception:  # counts as one frame, which says what is wrong when it is read
+            return 1
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def name(self, i: int) -> str:
+        k, inner = self._places[i]
+        return self._names[k] if self._counts[k] == 1 else f"{self._names[k]} frame {inner}"
+
+    def load(self, i: int) -> np.ndarray:
+        k, inner = self._places[i]
+        try:
+            return self._open(k).read(inner)
+        except InputError as error:  # which does not know the name
+            raise InputError(f"{self.name(i)}: {error}") from None
+
+    @cached_property
+    def _known_bits(self) -> int | None:
+        for k in range(len(self._files)):
+            try:
+                return self._open(k).bits
+            except Exception:  # of no interest here: reading it says what is wrong
+                continue
+        return None
+
+    @property
+    def known_bits(self) -> int | None:
+        return self._known_bits
+
+
+class ImageFile(ABC):
+    """An open file of pictures."""
+
+    @abstractmethod
+    def __init__(self, path: Path) -> None: ...
+
+    def __len__(self) -> int:
+        return 1
+
+    @abstractmethod
+    def read(self, i: int) -> np.ndarray:
+        """Return picture `i` as it is stored; channels, if any, as R, G, B."""
+
+    @property
+    def bits(self) -> int | None:
+        """Effective bits as the file tells them, or None."""
+        return None
+
+
+class Tiff(ImageFile):
+    """A TIFF file, each page a picture."""
+
+    def __init__(self, path: Path) -> None:
+        import tifffile
+
+        self._path = path
+        handle = path.open("rb")
+        weakref.finalize(self, handle.close)
+        with _quiet():
+            self._tiff = tifffile.TiffFile(handle)
+            self._pages = len(self._tiff.pages)
+
+    def __len__(self) -> int:
+        return self._pages + self._breaks_off()
+
+    def _breaks_off(self) -> bool:
+        """Whether the last page points at another beyond the end of the file: tifffile leaves that out in silence."""
+        handle, layout = self._tiff.filehandle, self._tiff.tiff
+        order: Literal["little", "big"] = "little" if self._tiff.byteorder == "<" else "big"
+        handle.seek(self._tiff.pages[-1].offset)
+        tags = int.from_bytes(handle.read(layout.tagnosize), order)
+        handle.seek(tags * layout.tagsize, 1)
+        return int.from_bytes(handle.read(layout.offsetsize), order) >= self._path.stat().st_size
+
+    def read(self, i: int) -> np.ndarray:
+        if i >= self._pages:
+            raise ValueError(f"the file ends after {self._pages} frames")
+        with _quiet():
+            page: Any = self._tiff.pages[i]
+            if page.bitspersample < 8:
+                raise _too_few_bits(page.bitspersample)
+            try:
+                image = page.asarray()
+            except (ValueError, NotImplementedError) as error:
+                if "imagecodecs" not in str(error):
+                    raise
+                return self._read_by_opencv(i, page.bitspersample)
+        return np.moveaxis(image, 0, -1) if page.axes == "SYX" else image
+
+    def _read_by_opencv(self, i: int, bits: int) -> np.ndarray:
+        """Compressed and packed pages that tifffile leaves to another package; OpenCV moves packed bits to the top."""
+        import cv2
+
+        _, images = cv2.imreadmulti(str(self._path), start=i, count=1, flags=cv2.IMREAD_UNCHANGED)
+        if not images:
+            raise ValueError("neither tifffile nor OpenCV can decode it")
+        image = np.asarray(images[0])
+        return _as_rgb(np.right_shift(image, 16 - bits) if 8 < bits < 16 else image)
+
+    @property
+    def bits(self) -> int | None:
+        page: Any = self._tiff.pages[0]
+        if 8 < page.bitspersample < 16:
+            return int(page.bitspersample)
+        if page.bitspersample != 16:
+            return None
+        if match := re.search(r'SignificantBits="(\d+)"', self._tiff.ome_metadata or ""):
+            return int(match[1])
+        top = page.tags.valueof("MaxSampleValue")
+        top = max(top) if isinstance(top, tuple) else top
+        return {2**bits - 1: bits for bits in (9, 10, 11, 12, 13, 14, 15)}.get(top)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep tifffile from logging damage that the error which follows tells."""
+    logger = logging.getLogger("tifffile")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+class Png(ImageFile):
+    """A PNG file, checked to its end, which OpenCV would not."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def read(self, i: int) -> np.ndarray:
+        import cv2
+
+        data = self._path.read_bytes()
+        chunks = _png_chunks(data)
+        if not data.startswith(b"\x89PNG") or b"IEND" not in chunks:
+            raise ValueError("no end of a PNG file" if data.startswith(b"\x89PNG") else "no PNG file")
+        if (depth := chunks[b"IHDR"][8]) < 8:
+            raise _too_few_bits(depth)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise ValueError("OpenCV cannot decode it")
+        if bits := _significant_bits(chunks):  # the format wants them at the top
+            image = np.right_shift(image, 16 - bits)
+        return _as_rgb(image)
+
+    @property
+    def bits(self) -> int | None:
+        return _significant_bits(_png_chunks(self._path.read_bytes()))
+
+
+def _png_chunks(data: bytes) -> dict[bytes, bytes]:
+    """The first chunk of each kind."""
+    chunks: dict[bytes, bytes] = {}
+    at = 8
+    while at + 8 <= len(data):
+        size, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
+        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 12 + size
+    return chunks
+
+
+def _significant_bits(chunks: dict[bytes, bytes]) -> int | None:
+    bits = max(chunks.get(b"sBIT", b"\0"))
+    return bits if chunks[b"IHDR"][8] == 16 and 8 < bits < 16 else None
+
+
+class Picture(ImageFile):
+    """What imageio reads: BMP, JPEG."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def read(self, i: int) -> np.ndarray:
+        from imageio import v3
+
+        return v3.imread(self._path.read_bytes(), extension=self._path.suffix.lower())
+
+
+class LaVision(ImageFile):
+    """Counts of all pictures in a file, frame by frame (camera, exposure), as stored: masks and scales are left out."""
+
+    def __init__(self, path: Path) -> None:
+        self._planes: list[np.ndarray] = []
+        for frame in _lvpyio().read_buffer(str(path)):
+            if "PIXEL" not in frame.components:
+                raise InputError("expected pictures, got vectors; give the .im7 files they were computed from")
+            self._planes += list(frame.components["PIXEL"].planes)
+
+    def __len__(self) -> int:
+        return len(self._planes)
+
+    def read(self, i: int) -> np.ndarray:
+        if i >= len(self._planes):
+            raise InputError(f"expected at least {i + 1} pictures as in the first file, got {len(self._planes)}")
+        return np.asarray(self._planes[i])
+
+
+def _lvpyio() -> Any:
+    try:
+        import lvpyio
+    except ImportError:
+        raise InputError(
+            "LaVision files (.im7, .vc7): expected the package lvpyio, which is not installed; "
+            "get it by pip install 'nerif[lavision]' (it is under LaVision's own terms)"
+        ) from None
+    return lvpyio
+
+
+OPENERS: dict[str, type[ImageFile]] = {
+    ".tif": Tiff, ".tiff": Tiff, ".png": Png, ".bmp": Picture, ".jpg": Picture, ".jpeg": Picture,
+    ".im7": LaVision, ".vc7": LaVision,
+}  # fmt: skip
+
+
+def _opener(path: Path) -> type[ImageFile]:
+    return OPENERS[path.suffix.lower()]
+
+
+def _as_rgb(image: np.ndarray) -> np.ndarray:
+    """OpenCV's order, B, G, R, turned round; without alpha."""
+    return image[..., 2::-1] if image.ndim == 3 and image.shape[2] >= 3 else image
+
+
+def _too_few_bits(bits: int) -> InputError:
+    return InputError(f"expected grey values of 8 to 16 bit, got {bits}-bit ones; export it with 8 or 16 bit")

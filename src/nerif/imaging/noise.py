@@ -1,0 +1,45 @@
+"""How well a pattern fixes a shift, from its gradients and from what is left of the difference once it is moved."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = ["FLOOR", "local_correlation", "smoothed_away", "structure_variance"]
+
+Image = Float[np.ndarray, "row column"]
+FLOOR = 1e-3  # px: no optical flow is better than that
+
+
+def structure_variance(flow: Image, moved: Image, reach: float) -> Float[np.ndarray, "row column 2"]:
+    """Return the variance (px^2) of a shift by the gradients of the moved picture and what is left of the difference.
+
+    cov = <r^2> (sum grad(I) grad(I)^T)^-1 with r the difference, over Gaussian windows of standard deviation `reach`.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    pixels = 4 * np.pi * reach**2  # effective number in a Gaussian window
+    gv, gu = np.gradient(moved.astype(np.float64))
+    uu, vv, uv = (gaussian_filter(g, reach) * pixels for g in (gu * gu, gv * gv, gu * gv))
+    left = gaussian_filter((flow - moved).astype(np.float64) ** 2, max(4.0, 2 * reach))
+    determinant = np.maximum(uu * vv - uv**2, 1e-9 * (uu + vv) ** 2 + 1e-12)
+    return np.stack([left * vv / determinant, left * uu / determinant], axis=-1)
+
+
+def smoothed_away(d: Float[np.ndarray, "row column 2"], reach: float) -> Float[np.ndarray, "row column 2"]:
+    """Rms over a Gaussian window of what that window takes from d, px."""
+    from scipy.ndimage import gaussian_filter
+
+    parts = [gaussian_filter((d[..., k] - gaussian_filter(d[..., k], reach)) ** 2, reach) for k in range(2)]
+    return np.sqrt(np.stack(parts, axis=-1))
+
+
+def local_correlation(a: Image, b: Image, reach: float) -> Image:
+    """Correlation coefficient of two pictures over a Gaussian window."""
+    from scipy.ndimage import gaussian_filter
+
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    mean_a, mean_b = gaussian_filter(a, reach), gaussian_filter(b, reach)
+    cross = gaussian_filter(a * b, reach) - mean_a * mean_b
+    variance = (gaussian_filter(a * a, reach) - mean_a**2) * (gaussian_filter(b * b, reach) - mean_b**2)
+    return cross / np.sqrt(np.maximum(variance, 1e-6))

@@ -1,0 +1,110 @@
+"""Cameras of OpenCV's FileStorage, YAML or XML: one a file, several, or a stereo pair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerif.conventions import InputError
+from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, numbers, upright
+
+__all__ = ["ENDINGS", "read_opencv", "read_opencv_folder"]
+
+ENDINGS = (".yml", ".yaml", ".xml")
+WORDS = {
+    "intrinsics": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsics", "K", "M"),
+    "distortion": ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "distortion", "dist", "D"),
+    "rotation": ("rotation_matrix", "rotation", "rvec", "R", "om"),
+    "translation": ("translation_vector", "translation", "tvec", "T", "t"),
+}
+
+
+MODELS = ("camera_model", "distortion_model", "calibration_model")
+OTHER_MODELS = ("fisheye_model", "xi")  # a flag of OpenCV's calibration program; a parameter of omnidirectional cameras
+
+
+def read_opencv_folder(folder: Path) -> list[CalibratedCamera]:
+    """One file a camera, named by the file."""
+    files = sorted(p for p in folder.iterdir() if p.suffix in ENDINGS)
+    if not files:
+        raise InputError(f"{folder}: expected OpenCV files ({' '.join(ENDINGS)}), one a camera, found none")
+    cameras = []
+    for file in files:
+        own = read_opencv(file)
+        cameras += [replace(own[0], name=file.stem)] if len(own) == 1 else own
+    return cameras
+
+
+def read_opencv(path: Path) -> list[CalibratedCamera]:
+    """One camera, or several whose names carry numbers: K1, D1, R1, T1, K2 ... or a stereo pair with one R and T."""
+    import cv2
+
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        keys = storage.root().keys() if storage.isOpened() else []
+    except (cv2.error, SystemError):
+        keys = []
+    if not keys:
+        raise InputError(f"{path}: not a file written by OpenCV's FileStorage, or empty")
+    values: dict[str, Any] = {}
+    for key in keys:
+        node = storage.getNode(key)
+        number = node.real() if node.isReal() or node.isInt() else None
+        values[key] = node.mat() if node.isMap() else node.string() if node.isString() else number
+    storage.release()
+    for key in MODELS:
+        if values.get(key) is not None:
+            check_model(values[key], f"{path}: {key}")
+    for key in OTHER_MODELS:
+        if values.get(key):
+            check_model(key, str(path))
+
+    def find(what: str, suffix: str) -> Any:
+        return next((values[w + suffix] for w in WORDS[what] if values.get(w + suffix) is not None), None)
+
+    suffixes = [s for s in ("", *map(str, range(1, 33))) if find("intrinsics", s) is not None]
+    if not suffixes:
+        raise InputError(
+            f"{path}: no camera matrix; expected {', '.join(WORDS['intrinsics'])} (with a number behind each for "
+            f"several cameras), got {', '.join(keys)}"
+        )
+    size = _opencv_size(values)
+    stereo = suffixes == ["1", "2"] and find("rotation", "2") is None
+    cameras = []
+    for suffix in suffixes:
+        where = f"{path}: camera {suffix or 1}"
+        rotation, translation = find("rotation", suffix), find("translation", suffix)
+        if stereo:  # OpenCV's stereo pair: the first camera is the world, x2 = R x1 + T
+            first = suffix == "1"
+            rotation = np.eye(3) if first else find("rotation", "")
+            translation = np.zeros(3) if first else find("translation", "")
+        if rotation is None or translation is None:
+            raise InputError(
+                f"{where}: no pose; expected {', '.join(WORDS['rotation'])} and {', '.join(WORDS['translation'])} "
+                f"beside the camera matrix, got {', '.join(keys)}"
+            )
+        rotation = np.asarray(rotation, dtype=np.float64)
+        if rotation.size == 3:
+            rotation = cv2.Rodrigues(rotation.reshape(3))[0]
+        distortion = find("distortion", suffix)
+        cameras.append(
+            CalibratedCamera(
+                name=f"cam{suffix}" if suffix else path.stem,
+                intrinsics=upright(find("intrinsics", suffix).tolist(), f"{where}: camera matrix"),
+                rotation=numbers(rotation.tolist(), (3, 3), f"{where}: rotation"),
+                translation=numbers(np.ravel(translation).tolist(), (3,), f"{where}: translation"),
+                distortion=five([] if distortion is None else distortion, f"{where}: distortion"),
+                image_size=size,
+            )
+        )
+    return cameras
+
+
+def _opencv_size(values: dict[str, Any]) -> tuple[int, int] | None:
+    for width, height in (("image_width", "image_height"), ("Image_Width", "Image_Height"), ("width", "height")):
+        if values.get(width) and values.get(height):
+            return int(values[height]), int(values[width])
+    return None

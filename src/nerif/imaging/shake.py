@@ -1,0 +1,51 @@
+"""Camera shake, fitted where nothing flows, and taken away."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nerif.conventions import InputError
+
+__all__ = ["border", "remove_shake"]
+
+
+def remove_shake(
+    d: Float[np.ndarray, "row column 2"], still: Bool[np.ndarray, "row column"]
+) -> Float[np.ndarray, "row column 2"]:
+    """Take away the similarity d = t + [[a, -b], [b, a]] p that fits best where nothing flows.
+
+    Parameters
+    ----------
+    d : px
+    still : pixels without flow; outliers among them count little (Cauchy's loss)
+    """
+    if still.sum() < 8:
+        raise InputError(f"shake: expected at least 8 pixels without flow, got {int(still.sum())}; widen the border")
+    from scipy.optimize import least_squares
+
+    rows, columns = np.mgrid[: d.shape[0], : d.shape[1]].astype(np.float64)
+    scale = max(d.shape[:2]) / 2
+    x, y = (columns - columns.mean()) / scale, (rows - rows.mean()) / scale
+
+    def design(at: np.ndarray | slice) -> np.ndarray:
+        one, zero = np.ones_like(x[at]), np.zeros_like(x[at])
+        u = np.stack([one, zero, x[at], -y[at]], axis=-1)
+        v = np.stack([zero, one, y[at], x[at]], axis=-1)
+        return np.stack([u, v], axis=-2)
+
+    a, b = design(still).reshape(-1, 4), d[still].reshape(-1).astype(np.float64)
+    start = np.linalg.lstsq(a, b, rcond=None)[0]
+    noise = 1.4826 * np.median(np.abs(a @ start - b)) + 1e-6
+    fit = least_squares(lambda p: a @ p - b, start, jac=lambda p: a, loss="cauchy", f_scale=2 * noise)
+    everywhere = design(slice(None)).reshape(-1, 4) @ fit.x
+    return (d - everywhere.reshape(d.shape)).astype(np.float32)
+
+
+def border(shape: tuple[int, ...], width: int) -> Bool[np.ndarray, "row column"]:
+    """Return the outer `width` px of a picture."""
+    if 2 * width >= min(shape):
+        raise InputError(f"shake_border: expected less than half the picture ({min(shape) // 2} px), got {width}")
+    mask = np.ones(shape, dtype=bool)
+    mask[width:-width, width:-width] = False
+    return mask
