@@ -45,8 +45,8 @@ def add_ensemble(
         if result.outcome.reason == "interrupted":
             say(f"ensemble: interrupted after {spread.count} of {ensemble.members} members; --resume goes on")
             break
-        if result.outcome.reason == "diverged":
-            say(f"ensemble: member {number} diverged and is left out: {result.outcome.message}")
+        if result.outcome.failed:
+            say(f"ensemble: member {number} {result.outcome.reason} and is left out: {result.outcome.message}")
             diverged.append(number)
             continue
         spread.add(all_quantities(settings, result))
@@ -108,7 +108,7 @@ def _member(
     title = f"member {number} of {ensemble.members}{out}"
     with interruptible() as asked, progress_bar(title) as bar:
         result = reconstructor(noisy, compose(bar, lambda _: asked[0]), None, start)  # type: ignore[arg-type]
-    if result.outcome.reason not in ("interrupted", "diverged"):
+    if result.outcome.reason != "interrupted" and not result.outcome.failed:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ASKED).unlink(missing_ok=True)
         write_field(folder, result)

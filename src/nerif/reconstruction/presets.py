@@ -35,6 +35,7 @@ PRESETS: dict[str, NeRIF] = {
         sampling="random",
         points_per_batch=1 << 15,
         learning_rate=1e-3,
+        rates_by_shape=False,
         schedule="constant",
         epochs=200,
         stop_ratio=0.005,
