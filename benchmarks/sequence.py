@@ -40,6 +40,7 @@ from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan, warm
 from nerif.sequence.store import DONE, Frame, SequenceStore
+from nerif.simulation import Simulation
 from nerif.volume_sequence import VolumeSequence
 
 
@@ -58,7 +59,8 @@ def film(folder: Path, views: int, frames: int, pixels: int, interval: float, no
     ring = Ring(views=views, image_size=(pixels, pixels), pixel_pitch=0.02 * 200 / pixels)
     times = f"0:{(frames - 1) * interval}:{frames}"
     assert len(instants(times)) == frames
-    simulate(Simulate(out=out, phantom="flame", times=times, noise=noise, truth_voxels=voxels, ring=ring))
+    simulation = Simulation(noise=noise, truth_voxels=voxels)
+    simulate(Simulate(out=out, times=times, simulation=simulation, ring=ring))
     return out
 
 

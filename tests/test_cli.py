@@ -18,9 +18,10 @@ import torch
 import xarray as xr
 
 from nerif.cli import VERBS, main
-from nerif.evaluation import evaluate_views, reproject
+from nerif.evaluation import evaluate_views
 from nerif.measurement import Measurement
 from nerif.physics.deflection import MODELS
+from nerif.prediction import reproject
 from nerif.reconstruction.files import read_field
 from nerif.volume import read_volume
 

@@ -118,12 +118,12 @@ def test_coverage_counts_the_voxels_of_the_truth(measured, tmp_path):
 
 def test_interrupted_in_the_second_member(measured, tmp_path, capsys, monkeypatch):
     """Ctrl-C in a member keeps the main result and the members before it; --resume ends as if nothing had been."""
-    from nerif.commands import members
+    from nerif.commands import output
 
     whole, out = tmp_path / "whole", tmp_path / "r"
     arguments = ["reconstruct", str(measured), *QUICK, "--ensemble", "3", "--no-report"]
     assert main([*arguments, "-o", str(whole)]) == 0
-    plain = members.progress_bar
+    plain = output.progress_bar
 
     def interrupting(title):
         if "member 2" not in title:
@@ -141,11 +141,11 @@ def test_interrupted_in_the_second_member(measured, tmp_path, capsys, monkeypatc
 
         return Bar()
 
-    monkeypatch.setattr(members, "progress_bar", interrupting)
+    monkeypatch.setattr(output, "progress_bar", interrupting)
     assert main([*arguments, "-o", str(out)]) == 0
     assert "interrupted after 1 of 3" in capsys.readouterr().out
     assert (out / "volume.nc").is_file()
-    monkeypatch.setattr(members, "progress_bar", plain)
+    monkeypatch.setattr(output, "progress_bar", plain)
     assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
     with xr.open_dataset(out / "volume.nc") as a, xr.open_dataset(whole / "volume.nc") as b:
         assert (a["index_excess_std"].values == b["index_excess_std"].values).all()

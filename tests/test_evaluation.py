@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from nerif.conventions import Points, Values, Vectors
-from nerif.evaluation import evaluate_views, evaluate_volume, predict_view, reproject, update_json
+from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.geometry import Grid
 from nerif.physics.deflection import MODELS, Deflection, project
+from nerif.prediction import predict_view, reproject
+from nerif.result import METRICS, ResultDirectory
 from nerif.volume import Volume
 
 
@@ -47,10 +49,11 @@ def test_a_field_ten_per_cent_too_strong(measurement, ball):
 
 
 def test_json_is_plain_and_kept(tmp_path):
-    path = tmp_path / "m.json"
-    update_json(path, {"a": 1.5, "bad": math.nan, "views": [{"x": math.inf, "y": (1, 2)}]})
-    update_json(path, {"b": "text"})
-    assert json.loads(path.read_text()) == {"a": 1.5, "bad": None, "views": [{"x": None, "y": [1, 2]}], "b": "text"}
+    directory = ResultDirectory(tmp_path)
+    directory.add_metrics({"a": 1.5, "bad": math.nan, "views": [{"x": math.inf, "y": (1, 2)}]})
+    directory.add_metrics({"b": "text"})
+    kept = json.loads((tmp_path / METRICS).read_text())
+    assert kept == {"a": 1.5, "bad": None, "views": [{"x": None, "y": [1, 2]}], "b": "text"}
 
 
 def test_predictions_on_views_without_valid_pixels_are_not_numbers(measurement, ball):

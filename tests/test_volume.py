@@ -10,8 +10,8 @@ import torch
 import xarray as xr
 
 from nerif.conventions import InputError
+from nerif.exports import export
 from nerif.geometry import Box, Grid
-from nerif.report.exports import export
 from nerif.volume import Volume, read_volume, write_netcdf
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))

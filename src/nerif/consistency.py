@@ -16,12 +16,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import FACES
-from nerif.evaluation import predict_view
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.mistakes import Correction, everywhere, exchanges, of_one_view
 from nerif.physics.deflection import Deflection
+from nerif.prediction import predict_view
 from nerif.reconstruction.tikhonov import Tikhonov
 
 __all__ = ["Consistency", "ViewAgreement", "binned", "check_consistency"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Collection
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,66 +12,63 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.fields.grid import DEGREES, VoxelField
-from nerif.geometry import Camera, Rays
+from nerif.fields.grid import VoxelField
+from nerif.geometry import Box
 from nerif.measurement import Measurement
 from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
-from nerif.physics.deflection import Deflection, ForwardModel, project
-from nerif.reconstruction.operator import MODELS, DeflectionOperator
+from nerif.prediction import reproject
 from nerif.reprojection import Reprojection
-from nerif.volume import Volume
+from nerif.result import VOLUME, ResultDirectory
+from nerif.volume import Volume, read_volume
 
-VOXEL_STEP = 0.25  # voxels between samples
-REPROJECTION_SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame
+FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 
-__all__ = ["evaluate_views", "evaluate_volume", "predict_view", "reproject", "update_json", "write_json"]
-
-
-def predict_view(
-    field: Field, camera: Camera, model: ForwardModel, box: Any, device: torch.device | str = "cpu"
-) -> Float[Tensor, "row column 2"]:
-    """Return the displacement (px) that a camera would see of a field; 0 where a ray misses the box."""
-    rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
-    if not rays.crosses.any():
-        return torch.zeros(*camera.image_size, 2)
-    if isinstance(field, VoxelField) and isinstance(model, Deflection) and model.model in MODELS:
-        return _through_voxels(field, rays, model, device).reshape(*camera.image_size, 2)
-    return project(model, field, rays, device).reshape(*camera.image_size, 2)
+__all__ = ["FLOW", "evaluate", "evaluate_views", "evaluate_volume", "score_lines"]
 
 
-def _through_voxels(
-    field: VoxelField, rays: Rays, model: Deflection, device: torch.device | str
-) -> Float[Tensor, "n 2"]:
-    """What `project` gives, by the compiled operator: tens of times faster, and 1 / n to first order only."""
-    basis = next(name for name, degree in DEGREES.items() if degree == field.degree)
-    operator = DeflectionOperator(
-        rays, field.grid, model.n_ambient, model.model, basis, step=VOXEL_STEP, device=device
-    )  # fmt: skip
-    return operator.through(field.coefficients).cpu()
+def evaluate(
+    result: str | os.PathLike[str],
+    truth: str | os.PathLike[str] | None = None,
+    measurement: str | os.PathLike[str] | None = None,
+    hold_out: Sequence[str] | None = None,
+    on_view: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Compare a result directory with a truth or with measured views; return the metrics, and add them to it.
 
+    Parameters
+    ----------
+    result : directory of a reconstruction
+    truth : volume file (.nc, .vti) of the true index, compared on its own grid
+    measurement : measurement file to re-project into
+    hold_out : views of it which the reconstruction has not seen; None for those that run.toml held out
+    on_view : told how many views are re-projected, out of how many
 
-def reproject(
-    field: Field,
-    measurement: Measurement,
-    held_out: Collection[str] = (),
-    device: torch.device | str = "cpu",
-    on_view: Callable[[int], None] = lambda done: None,
-    model: str = "lever_arm",
-) -> Reprojection:
-    """Predict what every view of a measurement sees of a field; px.
-
-    `on_view` hears how many views are done; `model` is the forward model that the field was reconstructed with.
+    Raises
+    ------
+    InputError
+        If there is nothing to compare, the truth is of another quantity, over an unknown ambient or sticks out of the
+        box, or there is no such view.
     """
-    forward = Deflection(model, REPROJECTION_SAMPLES, measurement.n_ambient)
-    predicted = torch.full_like(measurement.displacement, float("nan"))
-    for i, camera in enumerate(measurement.cameras):
-        height, width = camera.image_size
-        predicted[i, :height, :width] = predict_view(field, camera, forward, measurement.box, device)
-        on_view(i + 1)
-    return Reprojection(measurement, predicted, tuple(held_out))
+    if truth is None and measurement is None:
+        raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")
+    directory = ResultDirectory(result)
+    field, box, n_ambient = directory.field()
+    metrics: dict[str, Any] = {}
+    if truth is not None:
+        compared = _truth(Path(truth), box, n_ambient)
+        metrics |= evaluate_volume(field, compared, n_ambient) | _coverage(directory, compared)
+        metrics["truth"] = str(Path(truth).resolve())
+    if measurement is not None:
+        data, asked = Measurement.read(measurement), directory.settings()
+        held_out = _held_out(hold_out, asked, data)
+        views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", "lever_arm")))
+        metrics |= {"views": evaluate_views(views), "reprojection": asdict(views.accuracy)}
+        metrics["measurement"] = str(Path(measurement).resolve())
+        directory.write_reprojection(views)
+    directory.add_metrics(metrics)
+    return metrics
 
 
 def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
@@ -95,38 +93,77 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     return views
 
 
+def score_lines(views: list[dict[str, Any]]) -> list[str]:
+    """Return a line for the training views and one for those held out: the worst scores of each."""
+    lines = []
+    for group, held in (("training view", False), ("held-out view", True)):
+        chosen = [v for v in views if v["held_out"] is held]
+        if chosen:
+            cc = min(v["cc"] for v in chosen)
+            rms = max(v["rms_px"] for v in chosen)
+            noise = max(v.get("rms_over_sigma", float("nan")) for v in chosen)
+            beside = "" if noise != noise else f", at most {noise:.2f} sigma"
+            plural = "s" if len(chosen) > 1 else ""
+            lines.append(f"{len(chosen)} {group}{plural}: CC at least {cc:.4f}, rms error at most {rms:.4f} px{beside}")
+    return lines
+
+
 def evaluate_volume(
     field: Field, truth: Volume, n_ambient: float, device: torch.device | str = "cpu"
 ) -> dict[str, Any]:
-    """Compare a field with a truth on the truth's own grid: see metrics.volume_metrics, and ten slices."""
+    """Compare a field with a truth on the truth's own grid: see metrics.volume_metrics, and ten slices.
+
+    Parameters
+    ----------
+    field : of index excess over n_ambient
+    truth : index excess over the same ambient
+    n_ambient : 1
+    """
     rec = field.sample(truth.grid, device).numpy()
     gt = truth.values.numpy()
     heights = truth.grid.axis("z").numpy()
     return {**volume_metrics(gt, rec, n_ambient), "slices": slice_metrics(gt, rec, heights)}
 
 
-def update_json(path: Path, entries: dict[str, Any]) -> dict[str, Any]:
-    """Add entries to a JSON file, atomically, and return all it holds; NaN and infinity are written as null."""
+def _truth(path: Path, box: Box, n_ambient: float) -> Volume:
+    """The truth as index excess over the ambient of the reconstruction; refused where it sticks out of the box."""
+    truth = read_volume(path)
+    sides = zip("xyz", truth.grid.box.lower, truth.grid.box.upper, box.lower, box.upper, strict=True)
+    outside = [a for a, low, high, lower, upper in sides if low < lower - 1e-6 or high > upper + 1e-6]
+    if outside:
+        raise InputError(
+            f"{path}: expected a volume inside the reconstructed box ({box.lower} to {box.upper} mm), "
+            f"got one that sticks out along {', '.join(outside)}"
+        )
     try:
-        known = json.loads(path.read_text()) if path.is_file() else {}
-    except ValueError:
-        raise InputError(f"{path}: not a JSON file, or truncated; remove it and evaluate again") from None
-    known |= entries
-    write_json(path, known)
-    return known
+        return truth.relative_to(n_ambient)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
-def write_json(path: Path, entries: dict[str, Any]) -> None:
-    """Write a JSON file, atomically; NaN and infinity as null."""
-    with atomic(path) as part:
-        part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
+def _held_out(asked: Sequence[str] | None, settings: dict[str, Any], measurement: Measurement) -> tuple[str, ...]:
+    """Names of the views that the reconstruction has not seen."""
+    if asked is None:
+        return tuple(name for name in settings.get("hold_out", ()) if name in measurement.names)
+    unknown = [name for name in asked if name not in measurement.names]
+    if unknown:
+        raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{unknown[0]}'")
+    return tuple(asked)
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not (-float("inf") < value < float("inf")):
-        return None
-    return value
+def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
+    """Share of the truth's voxels within two standard deviations of the mean, if there is an ensemble."""
+    found = directory.volumes() if directory.has(VOLUME) else {}
+    if "index_excess_std" not in found:
+        return {}
+
+    def on_its_grid(volume: Volume) -> Float[Tensor, "z y x"]:
+        if volume.grid == truth.grid:
+            return volume.values
+        return VoxelField.through(volume.values, volume.grid).sample(truth.grid)
+
+    mean, std = (on_its_grid(found[f"index_excess_{s}"]) for s in ("mean", "std"))
+    within = (truth.values - mean).abs() <= 2 * std
+    flow = truth.values.abs() > FLOW * truth.values.abs().max()
+    share = {"share": float(within.float().mean()), "share_in_flow": float(within[flow].float().mean())}
+    return {"coverage": share}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -156,11 +157,11 @@ class Measurement:
             mask[i, : camera.image_size[0], : camera.image_size[1]] = True
         return mask
 
-    @property
+    @cached_property
     def sees_box(self) -> Bool[Tensor, "view row column"]:
         """Pixels whose rays cross the box on the way to the background."""
         mask = self._inside
-        for _ in self._crossing(mask):
+        for _ in self._crossing(mask, sensitivity=False):
             pass
         return mask
 
@@ -170,7 +171,7 @@ class Measurement:
         rays = Rays.collect(self._crossing(mask), int(mask.sum()))
         return rays, self.displacement[mask].float(), None if self.sigma is None else self.sigma[mask].float()
 
-    def _crossing(self, mask: Bool[Tensor, "view row column"]) -> Iterator[Rays]:
+    def _crossing(self, mask: Bool[Tensor, "view row column"], sensitivity: bool = True) -> Iterator[Rays]:
         """Trace the pixels of a mask, some at a time, and clear those whose ray does not cross the box.
 
         Rays are made in double precision: cameras stand far off, and positions lose digits in single precision.
@@ -181,7 +182,7 @@ class Measurement:
                 block = wanted[first : first + rows]  # a view, through which the mask is changed
                 row, column = block.nonzero().unbind(-1)
                 pixels = torch.stack([column, row + first], dim=-1).to(camera.intrinsics.dtype)
-                rays = camera.rays(pixels).clip(self.box)
+                rays = camera.rays(pixels, sensitivity).clip(self.box)
                 keep = rays.crosses & (rays.background > rays.far)
                 block[row, column] = keep
                 yield rays[keep]

@@ -14,9 +14,23 @@ from nerif.conventions import InputError
 from nerif.measurement import Measurement
 from nerif.measurement_file import VARIABLES
 
-__all__ = ["REPROJECTION", "Reprojection"]
+__all__ = ["Accuracy", "Reprojection"]
 
-REPROJECTION = "reprojection.nc"
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How views were predicted, and how far from the path integral through the field itself.
+
+    Parameters
+    ----------
+    how : in words
+    error_px : rms difference from that integral over the compared pixels, px; 0 where it is the integral
+    compared : pixels on which both were computed, or 0
+    """
+
+    how: str = "the path integral through the field on every pixel"
+    error_px: float = 0.0
+    compared: int = 0
 
 
 @dataclass(frozen=True)
@@ -28,11 +42,13 @@ class Reprojection:
     measurement : Measurement
     predicted : (view, row, column, 2) displacement, px; 0 where a ray misses the box
     held_out : names of the views that the reconstruction has not seen
+    accuracy : of the prediction
     """
 
     measurement: Measurement
     predicted: Float[Tensor, "view row column 2"]
     held_out: tuple[str, ...] = ()
+    accuracy: Accuracy = Accuracy()
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a measurement file of the predicted displacement, with `measured` and `held_out` in it, atomically."""
@@ -54,7 +70,7 @@ class Reprojection:
         more["measured"].attrs = {"units": "px", "long_name": "measured displacement"}
         with atomic(path) as part:
             predicted.write(part)
-            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding={"measured": {"zlib": True, "complevel": 3}})
+            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding={"measured": PACKED})
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Reprojection:

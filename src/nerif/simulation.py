@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -11,12 +12,20 @@ from torch import Tensor
 
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
-from nerif.geometry import Box, Camera
+from nerif.fields.grid import VoxelField
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Camera, Grid
 from nerif.measurement import Measurement
+from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.ray_tracing import background_points
+from nerif.volume import Volume, read_volume
+from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["add_noise", "simulate", "view_displacement"]
+__all__ = ["AMBIENT", "Simulation", "add_noise", "simulate", "view_displacement"]
 
+AMBIENT = 1.00027  # air at 20 °C
+
+MOVING = ("flame", "2", "3", "4", "5", "6", "7")
 STEPS = 120  # Runge-Kutta steps through the box: 2e-4 of the rms displacement on the flame (tests/test_simulation.py)
 
 
@@ -105,3 +114,95 @@ def simulate(
             if on_view is not None:
                 on_view(i + 1)
     return add_noise(replace(measurement, displacement=displacement), noise, seed)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A phantom, and how it is measured."""
+
+    phantom: str = "flame"
+    """One of gaussians, flame, octahedron, 1-7 (the paper's numbers), or a volume file (.nc, .vti) of your own."""
+    noise: float = 0.0
+    """Standard deviation of the noise as a share of the rms displacement over rays that cross the box."""
+    seed: int = 0
+    """Of phantom and noise."""
+    time: float = 0.0
+    """Instant of the flame, s."""
+    box: tuple[float, float, float] = (50.0, 50.0, 50.0)
+    """Edges of the box around the origin, along x y z, mm; a volume file brings its own."""
+    n_ambient: float | None = None
+    """Refractive index around the flow; default: that of the volume file, else 1.00027."""
+    wavelength_nm: float = 532.0
+    """Wavelength of the light, nm (kept in the file)."""
+    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
+    """Faces of the box on which the index is ambient (kept in the file)."""
+    truth_voxels: int = 100
+    """Voxels of the truth along the longest edge."""
+    steps: int = STEPS
+    """Runge-Kutta steps of a ray through the box."""
+
+    def __post_init__(self) -> None:
+        if self.truth_voxels < 1:
+            raise InputError(f"truth_voxels: expected at least 1, got {self.truth_voxels}")
+
+    def __call__(
+        self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None
+    ) -> tuple[Measurement, Volume]:
+        """Return what the cameras would measure, and the truth as index excess.
+
+        Raises
+        ------
+        InputError
+            If there is no such phantom, or a volume file is none.
+        """
+        field, box, n_ambient = self._field()
+        measurement = simulate(
+            field, cameras, box, n_ambient, self.noise, self.seed, self.steps, self.wavelength_nm, self.ambient_faces,
+            on_view,
+        )  # fmt: skip
+        grid = Grid.of_resolution(box, self.truth_voxels)
+        return measurement, Volume(field.sample(grid), grid, attributes={"n_ambient": n_ambient})
+
+    def over_time(
+        self,
+        times: Sequence[float],
+        cameras: Sequence[Camera],
+        out: Path,
+        truth: Path,
+        force: bool = False,
+        on_frame: Callable[[int, int], None] = lambda done, total: None,
+    ) -> tuple[MeasurementSequence, VolumeSequence]:
+        """Write a measurement of every instant (s) and its truth as two stores, and return them.
+
+        Raises
+        ------
+        InputError
+            If the phantom does not move.
+        """
+        if self.phantom not in MOVING:
+            raise InputError(f"times: expected a phantom that moves (flame, 2-7), got '{self.phantom}'")
+        for i, time in enumerate(times):
+            measurement, volume = replace(self, time=time, seed=self.seed + i)(cameras)
+            if i == 0:
+                sequence = MeasurementSequence.create(out, times, measurement, force)
+                store = VolumeSequence.create(truth, times, volume.grid, ("index_excess",), measurement.n_ambient)
+            sequence.write_frame(i, measurement)
+            store.write(i, [volume])
+            on_frame(i + 1, len(times))
+        return sequence, store
+
+    def _field(self) -> tuple[Field, Box, float]:
+        """The field of index excess, its box, and the ambient it is counted from."""
+        path = Path(self.phantom)
+        if path.suffix not in (".nc", ".vti"):
+            x, y, z = (e / 2 for e in self.box)
+            box = Box((-x, -y, -z), (x, y, z))
+            n_ambient = AMBIENT if self.n_ambient is None else self.n_ambient
+            return make_phantom(self.phantom, box, self.seed, self.time), box, n_ambient
+        volume = read_volume(path)
+        try:
+            n_ambient = next(n for n in (self.n_ambient, volume.n_ambient, AMBIENT) if n is not None)
+            excess = volume.relative_to(n_ambient)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        return VoxelField.through(excess.values, excess.grid), excess.grid.box, n_ambient

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -73,6 +73,28 @@ class Volume:
         """Refractive index around the flow, from which an excess is counted; None where nobody said."""
         value = self.attributes.get("n_ambient")
         return None if value is None else ambient_index(value, "attribute n_ambient")
+
+    def relative_to(self, n_ambient: float) -> Volume:
+        """Return the index excess over `n_ambient`: n - n_ambient, with n = excess + n_ambient of the volume itself.
+
+        Raises
+        ------
+        InputError
+            If it holds another quantity, or an excess and nobody said over which ambient.
+        """
+        if self.quantity not in ("index_excess", "n"):
+            raise InputError(f"expected index_excess or n, got '{self.quantity}'")
+        own = 0.0 if self.quantity == "n" else self.n_ambient
+        if own is None:
+            raise InputError(
+                "expected the attribute n_ambient, from which its index_excess is counted, got none; add it, or give n"
+            )
+        if own == n_ambient:
+            return self
+        values = (self.values.double() + (own - n_ambient)).float()
+        return replace(
+            self, values=values, quantity="index_excess", attributes={**self.attributes, "n_ambient": n_ambient}
+        )
 
 
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:

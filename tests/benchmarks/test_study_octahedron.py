@@ -7,12 +7,12 @@ import json
 import pytest
 import torch
 
-from nerif.evaluation import write_json
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Box, Grid, Ring
 from nerif.resolution import measure_resolution
+from nerif.result import write_json
 from study.octahedron import from_plain, pixels_per_unit, to_plain
 
 PHANTOM = Octahedron(Box.cube(50.0))

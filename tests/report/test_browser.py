@@ -12,7 +12,7 @@ import pytest
 from nerif.cli import main
 from nerif.report.packing import relation
 from nerif.report.pages import error_of
-from nerif.report.result import read_result
+from nerif.result import ResultDirectory
 from report.browsing import (
     choose,
     drag,
@@ -108,7 +108,7 @@ def value_at_cross(driver: Any) -> float:
 
 def test_the_value_at_the_cross_is_that_of_the_file(page, whole):
     press(page, "#slice-z", "right", "up", "page up")
-    result = read_result(whole)
+    result = ResultDirectory(whole).read()
     volumes, error = result.volumes, error_of(result)
     assert error is not None
     at = tuple(n // 2 + 1 for n in error.grid.shape)

@@ -15,7 +15,7 @@ from nerif.geometry import Box, Grid
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
 from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, style
-from nerif.report.result import Result, read_result
+from nerif.result import Result, ResultDirectory
 from nerif.volume import Volume
 
 
@@ -29,7 +29,7 @@ def volume() -> Volume:
 
 def test_every_figure_is_whole(whole):
     """The names expected; nothing beyond the edge of the paper; a unit on every axis and colour bar; no empty panel."""
-    result = read_result(whole)
+    result = ResultDirectory(whole).read()
     names = []
     with style():
         for name, figure in figures_of(result, *JOURNALS["elsevier"]):
@@ -66,7 +66,7 @@ def test_the_command_writes_pdf_and_png(copy, tmp_path, capsys):
 
 
 def test_functions_give_back_the_axes_they_take(volume, whole):
-    result = read_result(whole)
+    result = ResultDirectory(whole).read()
     assert result.reprojection is not None
     figure = Figure()
     for draw, *data in (
@@ -112,7 +112,7 @@ def test_masked_voxels_have_no_surface_of_their_own(volume):
 
 
 def test_names_of_views_become_names_of_files(whole):
-    result = read_result(whole)
+    result = ResultDirectory(whole).read()
     assert result.reprojection is not None
     m = result.reprojection.measurement
     odd = ("a/b", "a b", "a$x_$", "é<")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
-from nerif.report.movie import Movie, frames_there
+from nerif.report.movie import Movie, _points, _surfaces, frames_there
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
 
@@ -55,6 +56,27 @@ def test_a_movie_shows_every_frame_and_they_differ(store, tmp_path, capsys, name
     middle = (slice(50, 140), slice(70, 170))
     assert np.abs(pictures[0][middle].astype(float) - pictures[2][middle].astype(float)).mean() > 1
     assert not list(tmp_path.glob(".*"))
+
+
+def test_masked_voxels_are_shown_as_such(store):
+    """They are grey in slices, and have no isosurface of their own, as the lowest value in their place would give."""
+    z = store.grid.points()[..., 2]
+    values = 1 + 0.01 * z
+    values[12:, 5:15, 5:15] = float("nan")  # above the surface of 1, and below it nowhere
+    volume = Volume(values, store.grid, "density", "kg m-3")
+    surface, hidden = _surfaces(_points(volume, "density"), "density", 1.0)
+    assert surface.n_points
+    assert np.abs(surface.points[:, 2]).max() < 0.5 * store.grid.spacing[2]
+    assert hidden.n_points
+    for style in ("slices", "isosurface"):
+        movie = Movie(style=style, quantity="density", size=(240, 180))
+        with_mask, without = (movie._picture(v, "", (0.8, 1.2), 1.0).astype(int) for v in (volume, _whole(volume)))
+        grey = [((p.max(-1) - p.min(-1) < 12) & (abs(p.mean(-1) - 190) < 40)).sum() for p in (with_mask, without)]
+        assert grey[0] > grey[1] + 100, style
+
+
+def _whole(volume: Volume) -> Volume:
+    return replace(volume, values=volume.values.nan_to_num(1.2))
 
 
 def test_only_frames_that_are_there_are_drawn(store, tmp_path):

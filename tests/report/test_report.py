@@ -17,10 +17,10 @@ from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import html, packing
 from nerif.report.pages import residuals_over_sigma
-from nerif.report.result import Result, read_result
 from nerif.report.summary import headline, number, trust
 from nerif.report.view_images import _shrink, view_images
 from nerif.reprojection import Reprojection
+from nerif.result import Result, ResultDirectory
 from nerif.volume import Volume
 
 PARTS = ("run.toml", "metrics.json", "history.csv", "volume.nc", "reprojection.nc")
@@ -50,7 +50,7 @@ def test_page_is_whole_and_needs_no_network(whole):
 
 
 def test_figures_on_the_page_are_those_of_the_files(whole):
-    result = read_result(whole)
+    result = ResultDirectory(whole).read()
     assert not result.missing
     metrics = json.loads((whole / "metrics.json").read_text())
     held = next(v for v in metrics["views"] if v["held_out"])
@@ -110,7 +110,7 @@ def test_finer_volumes_are_averaged_down_in_their_box():
 
 
 def test_pictures_of_views_share_their_scales(whole):
-    reprojection = read_result(whole).reprojection
+    reprojection = ResultDirectory(whole).read().reprojection
     assert reprojection is not None
     views, limit, apart = view_images(reprojection, [])
     assert [v.held_out for v in views] == [False, False, False, True]
@@ -137,7 +137,7 @@ def test_a_broken_result_gives_a_page_that_says_what_is_missing(copy, capsys, na
     assert name in capsys.readouterr().out
     page = (copy / "report.html").read_text()
     assert name in page
-    level = headline(trust(read_result(copy))).level
+    level = headline(trust(ResultDirectory(copy).read())).level
     assert level == "bad" or name not in ("metrics.json", "volume.nc")
 
 
@@ -171,7 +171,7 @@ def test_refusals(tmp_path, capsys, whole):
         assert main(arguments) == 2, arguments
         assert words in capsys.readouterr().err
     with pytest.raises(InputError, match="no such directory"):
-        read_result(tmp_path / "absent")
+        ResultDirectory(tmp_path / "absent").read()
     assert there.read_text() == "somebody's page"
     assert main(["report", str(whole), "-o", str(there), "--force"]) == 0
     assert there.read_text().startswith("<!")
@@ -218,7 +218,7 @@ def test_what_cannot_be_shown_does_not_condemn(copy):
     metrics |= {"views": good, "truth": "/nowhere/truth.nc", "outcome": "epochs", "cc": 0.999, "l2_variation": 0.01}
     (copy / "metrics.json").write_text(json.dumps(metrics))
     (copy / "history.csv").unlink()
-    result = read_result(copy)
+    result = ResultDirectory(copy).read()
     assert {gap.what for gap in result.missing} == {"history.csv", "truth"}
     assert result.truth is None
     statements = [s for s in trust(result) if "masked" not in s.text]
@@ -229,7 +229,7 @@ def test_a_truth_that_moved_with_the_result_is_found(copy):
     (copy / "t.nc").write_bytes((copy / "volume.nc").read_bytes())
     metrics = json.loads((copy / "metrics.json").read_text()) | {"truth": "/nowhere/t.nc"}
     (copy / "metrics.json").write_text(json.dumps(metrics))
-    assert read_result(copy).truth is not None
+    assert ResultDirectory(copy).read().truth is not None
 
 
 @pytest.mark.parametrize(
@@ -244,7 +244,7 @@ def test_a_truth_that_moved_with_the_result_is_found(copy):
 )
 def test_tables_of_another_kind_are_refused_not_drawn(copy, name, text, words):
     (copy / name).write_text(text)
-    (gap,) = [gap for gap in read_result(copy).missing if gap.what == name]
+    (gap,) = [gap for gap in ResultDirectory(copy).read().missing if gap.what == name]
     assert words in gap.sentence
     assert main(["report", str(copy)]) == 0
 

@@ -10,13 +10,13 @@ import tyro
 
 from nerif.commands import evaluate, reconstruct, simulate
 from nerif.commands.methods import ReconstructNeRIF
-from nerif.commands.output import check_directory, say
-from nerif.commands.report import write_report
+from nerif.commands.output import MONITOR, check_directory, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
-from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
+from nerif.simulation import Simulation
+from nerif.workflow import Run, write_report
 
 __all__ = ["Demo", "main", "run"]
 
@@ -52,7 +52,10 @@ def run(settings: Demo) -> None:
     ring = Ring(extra_angles=(between,), image_size=(settings.pixels,) * 2, pixel_pitch=0.02 * 200 / settings.pixels)
     simulate.run(
         simulate.Simulate(
-            out=measured, noise=settings.noise, seed=settings.seed, truth_voxels=80, force=True, ring=ring
+            out=measured,
+            force=True,
+            simulation=Simulation(noise=settings.noise, seed=settings.seed, truth_voxels=80),
+            ring=ring,
         )
     )
     held_out = f"{between:g}deg"
@@ -61,16 +64,14 @@ def run(settings: Demo) -> None:
             measurement=measured,
             out=settings.out,
             preset="fast",
-            hold_out=(held_out,),
             voxels=80,
             force=True,
-            report=False,
-            gas=GasSettings(),
+            run=Run(hold_out=(held_out,), report=False),
             reconstructor=NeRIF(time_limit=settings.time_limit, epochs=1000, seed=settings.seed),
         )
     )
     evaluate.run(evaluate.Evaluate(settings.out, truth=simulate.truth_path(measured)))
-    page = write_report(settings.out)
+    page = write_report(settings.out, monitor=MONITOR)
     say(f"Open {page} in a browser: the field, the views, and whether it can be trusted.")
     say(f"Open {settings.out}/volume.vti in ParaView; figures for print: nerif figures {settings.out}")
 

@@ -8,13 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, say, say_masked
+from nerif.commands.output import check_file, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
+from nerif.exports import FORMATS, export
 from nerif.geometry import Box, Grid
-from nerif.physics.quantities import GasSettings, derive
-from nerif.reconstruction.files import read_field
-from nerif.report.exports import FORMATS, export
+from nerif.physics.quantities import GasSettings, derive, masked_lines
+from nerif.result import ResultDirectory
 from nerif.volume import Volume
 
 __all__ = ["Export", "main", "run"]
@@ -53,7 +53,7 @@ def run(settings: Export) -> None:
     if settings.out.suffix not in FORMATS:
         raise InputError(f"out: expected a name ending in {', '.join(FORMATS)}, got '{settings.out.name}'")
     check_file(settings.out, settings.force)
-    index, whole, n_ambient = read_field(settings.result)
+    index, whole, n_ambient = ResultDirectory(settings.result).field()
     lower, upper = settings.lower or whole.lower, settings.upper or whole.upper
     box = Box(lower, upper)
     if any(a < w - 1e-6 for a, w in zip(lower, whole.lower, strict=True)) or any(
@@ -66,7 +66,8 @@ def run(settings: Export) -> None:
     volumes = [derive(excess, q, settings.gas) for q in settings.quantities]
     export(settings.out, volumes)
     say(f"{settings.out}: {', '.join(settings.quantities)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
-    say_masked(volumes)
+    for line in masked_lines(volumes):
+        say(line)
 
 
 def main(arguments: list[str]) -> None:

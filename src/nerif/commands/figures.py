@@ -12,7 +12,7 @@ from nerif.commands.output import say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.report.pages import JOURNALS, save_figures
-from nerif.report.result import FIGURES, read_result
+from nerif.result import FIGURES, ResultDirectory
 
 __all__ = ["Figures", "main", "run"]
 
@@ -37,7 +37,7 @@ def run(settings: Figures) -> None:
         raise InputError(f"journal: expected one of {', '.join(JOURNALS)}, got '{settings.journal}'")
     if not 20 <= settings.dpi <= 2400:
         raise InputError(f"dpi: expected 20 to 2400 dots per inch, got {settings.dpi}")
-    result = read_result(settings.result)
+    result = ResultDirectory(settings.result).read()
     out = settings.out or settings.result / FIGURES
     if out.is_file():
         raise InputError(f"{out}: expected a folder for --out, got a file")

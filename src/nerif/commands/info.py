@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,7 @@ from nerif.conventions import InputError
 from nerif.measurement import Measurement
 from nerif.measurement_file import CONVENTIONS
 from nerif.netcdf import opened
-from nerif.reconstruction.files import read_field
+from nerif.result import METRICS, ResultDirectory
 from nerif.volume import Volume, read_volume
 
 __all__ = ["Info", "main", "run"]
@@ -94,18 +93,15 @@ def _volume(path: Path, v: Volume) -> None:
 
 
 def _result(path: Path) -> None:
-    _, box, n_ambient = read_field(path)
+    directory = ResultDirectory(path)
+    _, box, n_ambient = directory.field()
     say(f"{path}: reconstruction")
     say(f"  box            {_corners(box.lower, box.upper)}")
     say(f"  n_ambient      {n_ambient:.8g}")
-    file = path / "metrics.json"
-    if not file.is_file():
-        say("  metrics.json is missing; the run may not have ended")
+    if not directory.has(METRICS):
+        say(f"  {METRICS} is missing; the run may not have ended")
         return
-    try:
-        metrics = json.loads(file.read_text())
-    except ValueError:
-        raise InputError(f"{file}: not a JSON file, or truncated") from None
+    metrics = directory.metrics()
     for name, value in metrics.items():
         if not isinstance(value, list):
             say(f"  {name:<18} {value}")

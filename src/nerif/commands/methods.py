@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from nerif.commands.settings import Flat, Settings
-from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.reconstruction.voxels import VoxelReconstructor
+from nerif.workflow import Run
 
-__all__ = ["METHODS", "Reconstruct", "ReconstructNeRIF"]
+__all__ = ["RECORDS", "Reconstruct", "ReconstructNeRIF"]
 
 
 @dataclass(frozen=True)
@@ -30,34 +29,24 @@ class Reconstruct(Settings):
     """Result directory to write."""
     method: str = "nerif"
     """One of nerif, tikhonov, landweber, tv; --method NAME --help tells the options of each."""
-    hold_out: tuple[str, ...] = ()
-    """Views kept out of the reconstruction and re-projected from it."""
-    start_from: Path | None = None
-    """Result directory of another reconstruction in the same box, of any method, to start from."""
-    ensemble: int = 0
-    """Reconstruct so many times more with other seeds and noise, for mean and standard deviation of every quantity."""
-    leave_one_out: bool = False
-    """Let each member of the ensemble do without one view, in turn."""
-    report: bool = True
-    """Write report.html at the end."""
     force: bool = False
     """Overwrite an existing result directory."""
     resume: bool = False
     """Go on with an interrupted run in --out; limits such as --epochs or --iterations may be raised."""
-    checkpoint_every: float = 60.0
-    """Seconds between checkpoints."""
     tensorboard: bool = False
     """Write TensorBoard scalars to OUT/tensorboard."""
-    gas: GasSettings = field(default_factory=GasSettings)
-    """What the density is computed for."""
+    run: Annotated[Run, Flat] = field(default_factory=Run)
     reconstructor: Annotated[Reconstructor, tyro.conf.Suppress] = field(default_factory=NeRIF)
 
     @property
-    def volume_voxels(self) -> int:
-        """Voxels of the written volume along the longest edge of the box."""
-        if isinstance(self.reconstructor, VoxelReconstructor):
-            return self.reconstructor.voxels
-        return int(getattr(self, "voxels", 100))
+    def volume_voxels(self) -> int | None:
+        """Voxels of the written volume along the longest edge of the box; None for those of the method."""
+        return getattr(self, "voxels", None)
+
+    @property
+    def kept(self) -> dict[str, Any]:
+        """What run.toml keeps beside the settings of run and method."""
+        return {"preset": getattr(self, "preset", None), "tensorboard": self.tensorboard}
 
 
 @dataclass(frozen=True)
@@ -95,7 +84,7 @@ class ReconstructTotalVariation(Reconstruct):
     reconstructor: Annotated[TotalVariation, Flat] = field(default_factory=TotalVariation)
 
 
-METHODS: dict[str, type[Reconstruct]] = {
+RECORDS: dict[str, type[Reconstruct]] = {
     "nerif": ReconstructNeRIF,
     "tikhonov": ReconstructTikhonov,
     "landweber": ReconstructLandweber,

@@ -10,10 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerif.conventions import InputError
-from nerif.reconstruction.base import Step
-from nerif.volume import Volume
+from nerif.monitor import Monitor
+from nerif.reconstruction.base import OnStep, Step, compose
+from nerif.result import ResultDirectory
 
-__all__ = ["check_directory", "check_file", "counting_bar", "interruptible", "progress_bar", "say", "say_masked"]
+__all__ = ["MONITOR", "check_directory", "check_file", "counting_bar", "interruptible", "progress_bar", "say"]
 
 SAME_SIGNAL = 0.5  # seconds
 
@@ -21,15 +22,6 @@ SAME_SIGNAL = 0.5  # seconds
 def say(text: str) -> None:
     """Print a line for the user."""
     print(text, flush=True)
-
-
-def say_masked(volumes: list[Volume]) -> None:
-    """Say of each quantity how many voxels are masked, and why."""
-    for v in volumes:
-        count = int(v.notes.get("masked_voxels", 0))
-        if count:
-            share = count / v.values.numel()
-            say(f"{v.quantity}: {count} of {v.values.numel()} voxels ({share:.2%}) are NaN: {v.notes['masked_where']}")
 
 
 def check_file(path: Path, force: bool, *others: Path) -> None:
@@ -45,13 +37,7 @@ def check_file(path: Path, force: bool, *others: Path) -> None:
 
 def check_directory(path: Path, force: bool) -> None:
     """Refuse an output directory that holds anything, unless forced."""
-    if path.is_file():
-        raise InputError(f"{path}: expected a directory for --out, got a file")
-    if path.is_dir() and any(path.iterdir()) and not force:
-        raise InputError(
-            f"{path}: exists already and was left as it is; give another --out, --force to overwrite, "
-            "or --resume to go on with it"
-        )
+    ResultDirectory(path).check_free(force)
 
 
 @contextmanager
@@ -82,18 +68,22 @@ def interruptible() -> Iterator[list[bool]]:
 
 
 @contextmanager
-def counting_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar that goes away when done: a callable that is told how many of `total` are."""
+def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
+    """Show a bar that goes away when done: a callable that is told how many are done, and out of how many."""
     from rich.console import Console
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=total)
-        yield lambda done: bar.update(task, completed=done)
+
+        def update(done: int, of: int | None = None) -> None:
+            bar.update(task, completed=done, total=total if of is None else of)
+
+        yield update
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[object]:
+def progress_bar(title: str) -> Iterator[OnStep]:
     """Show a bar of the training: a callable for each Step, with epoch, loss terms, rays/s and time left."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
@@ -114,3 +104,14 @@ def progress_bar(title: str) -> Iterator[object]:
                 print(f"{title} {step.progress:4.0%} {figures}", file=sys.stderr, flush=True)
 
         yield update
+
+
+@contextmanager
+def _training(title: str) -> Iterator[OnStep]:
+    """A bar of the training that Ctrl-C stops after the step it is in."""
+    with interruptible() as asked, progress_bar(title) as bar:
+        yield compose(bar, lambda _: asked[0])
+
+
+MONITOR = Monitor(say, _training, counting_bar)
+"""The terminal, as the library tells it how the work goes."""

@@ -6,18 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 
-from nerif.commands.output import check_file, say
+from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
-from nerif.evaluation import predict_view
 from nerif.geometry import Ring
 from nerif.measurement import Measurement
-from nerif.physics.deflection import Deflection, ForwardModel
-from nerif.physics.ray_tracing import CurvedRays
-from nerif.reconstruction.files import read_field
+from nerif.prediction import predict
+from nerif.result import ResultDirectory
 
 __all__ = ["Project", "main", "run"]
 
@@ -34,8 +31,8 @@ class Project(Settings):
     """Measurement file whose cameras to use; without it, the ring described below."""
     names: tuple[str, ...] = ()
     """Names of the cameras of that file to use; none for all."""
-    model: str = "lever_arm"
-    """Forward model: lever_arm, paraxial or curved."""
+    model: str | None = None
+    """Forward model: lever_arm, paraxial, curved, or traced (Runge-Kutta); default: that of the reconstruction."""
     samples: int = 200
     """Samples (or Runge-Kutta steps) along a ray."""
     force: bool = False
@@ -47,10 +44,9 @@ def run(settings: Project) -> Measurement:
     """Write the predicted measurement and return it."""
     if settings.out.suffix != ".nc":
         raise InputError(f"out: expected a name ending in .nc, got '{settings.out.name}'")
-    if settings.model not in ("lever_arm", "paraxial", "curved"):
-        raise InputError(f"model: expected lever_arm, paraxial or curved, got '{settings.model}'")
     check_file(settings.out, settings.force)
-    index, box, n_ambient = read_field(settings.result)
+    result = ResultDirectory(settings.result)
+    index, box, n_ambient = result.field()
     if settings.cameras is not None:
         given = Measurement.read(settings.cameras)
         cameras = (given.select(settings.names) if settings.names else given).cameras
@@ -58,22 +54,14 @@ def run(settings: Project) -> Measurement:
         raise InputError("names: expected together with --cameras FILE, got no file")
     else:
         cameras = settings.ring.cameras()
-    model: ForwardModel
-    if settings.model == "curved":
-        model = CurvedRays(settings.samples, n_ambient)
-    else:
-        model = Deflection(settings.model, settings.samples, n_ambient)
-    height, width = (max(c.image_size[i] for c in cameras) for i in (0, 1))
-    displacement = torch.full((len(cameras), height, width, 2), float("nan"))
-    for i, camera in enumerate(cameras):
-        h, w = camera.image_size
-        displacement[i, :h, :w] = predict_view(index, camera, model, box)
-    predicted = Measurement(cameras=cameras, displacement=displacement, box=box, n_ambient=n_ambient)
+    model = settings.model or str(result.settings().get("model", "lever_arm"))
+    with counting_bar("projecting") as bar:
+        predicted = predict(index, cameras, box, n_ambient, model, settings.samples, bar)
     predicted.write(settings.out)
-    for i, camera in enumerate(cameras):
-        rms = float(displacement[i].nan_to_num().square().mean().sqrt())
+    for camera, d in zip(cameras, predicted.displacement, strict=True):
+        rms = float(d.nan_to_num().square().mean().sqrt())
         say(f"{camera.name}: rms displacement {rms:.4f} px a component")
-    say(f"{settings.out}: {len(cameras)} predicted views ({settings.model})")
+    say(f"{settings.out}: {len(cameras)} predicted views ({model})")
     return predicted
 
 

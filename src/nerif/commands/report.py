@@ -8,15 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, say
+from nerif.commands.output import MONITOR, check_file
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
-from nerif.report import html
-from nerif.report.result import REPORT, read_result
-from nerif.report.sequence_page import render_sequence
-from nerif.volume_sequence import VolumeSequence
+from nerif.result import REPORT
+from nerif.workflow import write_report, write_sequence_report
 
-__all__ = ["Report", "main", "run", "write_report"]
+__all__ = ["Report", "main", "run"]
 
 
 @dataclass(frozen=True)
@@ -41,27 +39,8 @@ def run(settings: Report) -> Path:
         check_file(out, settings.force)
     elif not out.parent.is_dir():
         raise InputError(f"{settings.result}: no such directory")
-    if is_store:
-        html.write(render_sequence(VolumeSequence(settings.result)), out)
-        _say_size(out)
-        return out
-    return write_report(settings.result, out)
-
-
-def write_report(directory: Path, out: Path | None = None) -> Path:
-    """Write the page of a result directory and return its path."""
-    out = out or directory / REPORT
-    result = read_result(directory)
-    html.write(html.render(result), out)
-    for gap in result.missing:
-        say(f"missing: {gap.sentence}")
-    _say_size(out)
-    return out
-
-
-def _say_size(out: Path) -> None:
-    size = out.stat().st_size
-    say(f"{out}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")
+    write = write_sequence_report if is_store else write_report
+    return write(settings.result, out, MONITOR)
 
 
 def main(arguments: list[str]) -> None:

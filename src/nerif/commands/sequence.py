@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import tyro
 
 from nerif.commands.output import say
-from nerif.commands.reconstruct import derive_check
 from nerif.commands.settings import Settings, read_settings, value_given
 from nerif.conventions import InputError
 from nerif.geometry import Grid
@@ -24,6 +23,7 @@ from nerif.sequence.plan import SequencePlan, warm
 from nerif.sequence.run import Progress, outcome_table, run_sequence
 from nerif.sequence.store import MISSING, SequenceStore
 from nerif.volume import QUANTITIES
+from nerif.workflow import check_gas
 
 __all__ = ["Sequence", "main", "run"]
 
@@ -152,7 +152,7 @@ def _store(settings: Sequence, sequence: MeasurementSequence) -> tuple[Sequence,
         raise InputError("hold_out: every view is held out, so none is left to reconstruct from")
     if like.wavelength_nm is not None:
         settings = replace(settings, gas=replace(settings.gas, wavelength_nm=like.wavelength_nm))
-    derive_check(settings.gas, like)
+    check_gas(settings.gas, like)
     kept: dict[str, Any] = {
         "measurement": str(settings.measurement.resolve()),
         "frames": len(sequence),

@@ -119,10 +119,11 @@ class Camera:
         """Project world points (mm) to pixels (px)."""
         return self._project_jacobian(points)[0]
 
-    def rays(self, pixels: Float[Tensor, "n 2"]) -> Rays:
+    def rays(self, pixels: Float[Tensor, "n 2"], sensitivity: bool = True) -> Rays:
         """Back-trace the rays seen by `pixels` (px) to the background; not yet clipped to a box.
 
-        S = -d project / d X at the background point X0, so that S . direction = 0.
+        S = -d project / d X at the background point X0, so that S . direction = 0; left at 0 where only the paths are
+        asked for.
         """
         k = self.intrinsics
         y = (pixels[..., 1] - k[1, 2]) / k[1, 1]
@@ -133,8 +134,10 @@ class Camera:
         origin = self.centre.expand_as(direction)
         normal = self.background.normal.to(direction)
         s_b = (self.background.offset - origin @ normal) / (direction @ normal)
-        _, jacobian = self._project_jacobian(origin + s_b[..., None] * direction)
         zero = torch.zeros_like(s_b)
+        if not sensitivity:
+            return Rays(origin, direction, zero[:, None, None].expand(-1, 2, 3), s_b, zero, zero)
+        _, jacobian = self._project_jacobian(origin + s_b[..., None] * direction)
         return Rays(origin, direction, -jacobian, s_b, zero, zero)
 
     def view(self, row: int, column: int, height: int, width: int) -> Camera:
@@ -179,6 +182,8 @@ class Camera:
         if not bool(self.distortion.any()):
             return distorted
         ideal = distorted
+        if not bool(self.distortion.any()):
+            return ideal
         for _ in range(20):
             value, jacobian = self._distort(ideal)
             residual = distorted - value

@@ -12,7 +12,7 @@ from nerif.conventions import InputError
 from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
 from nerif.volume import QUANTITIES, Volume
 
-__all__ = ["TEMPERATURE_RANGE", "GasSettings", "derive"]
+__all__ = ["TEMPERATURE_RANGE", "GasSettings", "derive", "derive_all", "masked_lines"]
 
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; beyond, gases of the table condense or dissociate, and one composition holds no more."""
@@ -83,6 +83,22 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
     )
     where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
     return _quantity(excess, "temperature", temperature, attributes, assumption, where)
+
+
+def derive_all(excess: Volume, gas: GasSettings) -> list[Volume]:
+    """Return index_excess, n, density and temperature; see `derive`."""
+    return [derive(excess, quantity, gas) for quantity in QUANTITIES]
+
+
+def masked_lines(volumes: list[Volume]) -> list[str]:
+    """Return a line for each quantity with masked voxels: how many, and why."""
+    lines = []
+    for v in volumes:
+        count = int(v.notes.get("masked_voxels", 0))
+        if count:
+            share = f"{count} of {v.values.numel()} voxels ({count / v.values.numel():.2%})"
+            lines.append(f"{v.quantity}: {share} are NaN: {v.notes['masked_where']}")
+    return lines
 
 
 def _density_assumption(gas: GasSettings, k: float) -> str:

@@ -270,7 +270,7 @@ class Training:
     def _take_back(self, empty: bool = False) -> Outcome | None:
         """Return to the last good state, or from there to the first, with a third of the learning rate."""
         retries, rate, seconds, why = self.retries + 1, self.rate / 3, self.budget.seconds, self.watch.left
-        self._restore(self.good)
+        self._restore(self.good if self.watch.found or not empty else self.first)
         self.good = self.first
         self.budget.restore({**self.budget.used(), "seconds": seconds})
         self.retries, self.rate = retries, rate

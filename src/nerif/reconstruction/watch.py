@@ -13,7 +13,7 @@ from typing import Any
 __all__ = ["Watch"]
 
 EMPTY = 0.9  # of what can be explained is left: nothing is found
-HALF = 0.5
+HALF, LOSS = 0.5, 0.1
 PATIENCE, LEAST = 200, 50  # steps in which the loss must have fallen; steps after which an end says something
 MEMORY = 0.95  # of the running mean, a step
 
@@ -42,8 +42,8 @@ class Watch:
 
     @property
     def healthy(self) -> bool:
-        """Whether something is found, and not being lost."""
-        return self.left < min(EMPTY, 2 * self.lowest)
+        """Whether what was found is still there."""
+        return self.left < self.lowest + LOSS
 
     def collapsed(self, over: bool) -> bool:
         """Whether nothing is found for long, or what was found is lost.
@@ -52,8 +52,13 @@ class Watch:
         ----------
         over : whether the run is; then fewer steps must do
         """
-        long_enough = self.since >= (LEAST if over or self.lowest < HALF else PATIENCE)
+        long_enough = self.since >= (LEAST if over or self.found else PATIENCE)
         return long_enough and self.left > EMPTY
+
+    @property
+    def found(self) -> bool:
+        """Whether anything ever was."""
+        return self.lowest < HALF
 
     @property
     def remark(self) -> str:

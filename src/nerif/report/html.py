@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from nerif import __version__
 from nerif.atomic import atomic
@@ -17,10 +18,10 @@ from nerif.report import packing
 from nerif.report.figures import COLOUR_MAPS, DIVERGING, draw_history, draw_residuals, draw_slice_scores
 from nerif.report.isosurface import default_level
 from nerif.report.pages import error_of, residuals_over_sigma, style
-from nerif.report.result import Result
 from nerif.report.rig_figure import picture_corners
 from nerif.report.summary import came_out, headline, measured, number, trust, trust_figures
 from nerif.report.view_images import colour_table, view_images
+from nerif.result import Result
 from nerif.volume import Volume
 
 if TYPE_CHECKING:
@@ -116,15 +117,15 @@ def _scene(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     small = packing.coarsen(excess)
     sources: dict[str, Volume] = {"value": small}
     error = error_of(result)
-    for name, volume in (
-        ("error", error),
-        ("mean", result.volumes.get("index_excess_mean")),
-        ("std", result.volumes.get("index_excess_std")),
-        ("temperature_mean", result.volumes.get("temperature_mean")),
-        ("temperature_std", result.volumes.get("temperature_std")),
-    ):
-        if volume is not None:
-            sources[name] = packing.coarsen(volume)
+    if error is not None:
+        sources["error"] = packing.coarsen(error)
+    for statistic in ("mean", "std"):
+        if f"index_excess_{statistic}" in result.volumes:
+            sources[statistic] = packing.coarsen(result.volumes[f"index_excess_{statistic}"])
+        for quantity in ("density", "temperature"):
+            volume = result.volumes.get(f"{quantity}_{statistic}")
+            if volume is not None and _own(quantity, volume):
+                sources[volume.quantity] = packing.coarsen(volume)
     packed = {
         name: packing.pack(volume.values.double().numpy(), packing.FINE if name == "value" else packing.COARSE)
         for name, volume in sources.items()
@@ -157,6 +158,11 @@ def _scene(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
         "cameras": _cameras(result),
     }
     return scene, {name: p["text"] for name, p in packed.items()}
+
+
+def _own(quantity: str, volume: Volume) -> bool:
+    """Whether a statistic has to be packed for itself: it is no linear function of the excess, or masked somewhere."""
+    return quantity == "temperature" or not bool(torch.isfinite(volume.values).all())
 
 
 def _variants(sources: dict[str, Volume]) -> dict[str, str]:

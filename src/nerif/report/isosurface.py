@@ -13,7 +13,7 @@ from nerif.volume import Volume
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["default_level", "draw_isosurface", "surface_triangles"]
+__all__ = ["default_level", "draw_isosurface", "filled", "surface_triangles"]
 
 LARGEST = 80  # voxels along an edge: finer surfaces cannot be told apart in print, and take minutes to draw
 FACE = "#E69F00"
@@ -36,7 +36,7 @@ def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"
 
     stride = max(1, -(-max(volume.grid.shape) // LARGEST))
     values = shown(volume)[::stride, ::stride, ::stride]
-    values = _filled(values)
+    values = filled(values)
     if min(values.shape) < 2 or not values.min() < level < values.max():
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(values, level)
@@ -44,8 +44,8 @@ def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"
     return (vertices[:, ::-1] * np.array(volume.grid.spacing) * stride + first)[faces]
 
 
-def _filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
-    """Masked voxels take the value of the nearest that is not: they must not have a surface of their own."""
+def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
+    """Return masked voxels (NaN) with the value of the nearest that is not: they must have no surface of their own."""
     from scipy.ndimage import distance_transform_edt
 
     masked = ~np.isfinite(values)

@@ -12,7 +12,7 @@ import numpy as np
 from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.report.figures import COLOUR_MAPS, LABELS, colour_range, shown
-from nerif.report.isosurface import default_level
+from nerif.report.isosurface import default_level, filled
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
 
@@ -20,6 +20,7 @@ __all__ = ["STYLES", "Movie", "frames_there"]
 
 STYLES = ("isosurface", "slices")
 FORMATS = (".mp4", ".gif")
+MASKED, GREY = "masked", "#BEBEBE"
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,9 @@ class Movie:
         # VTK looks for a display first, warns that there is none, and draws without
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
 
-        values = shown(volume)
-        grid = pv.ImageData(
-            dimensions=volume.grid.shape[::-1],
-            spacing=volume.grid.spacing,
-            origin=[float(volume.grid.axis(a)[0]) for a in "xyz"],
-        )
         label, unit = _plain(self.quantity)
         name = f"{label} [{unit}]"
-        grid[name] = np.nan_to_num(values, nan=float(limits[0])).ravel()
+        grid = _points(volume, name)
         plotter = pv.Plotter(off_screen=True, window_size=list(self.size))
         try:
             plotter.set_background("white")
@@ -87,12 +82,19 @@ class Movie:
                 bar |= {"position_x": 0.86, "position_y": 0.15, "width": 0.06, "height": 0.5}
                 x, y, z = volume.grid.box.centre
                 slices = grid.slice_orthogonal(x=x, y=y, z=z)
-                plotter.add_mesh(slices, clim=limits, cmap=colour_map, scalar_bar_args=bar, lighting=False)
-            elif values[np.isfinite(values)].size and np.nanmin(values) < level < np.nanmax(values):
                 plotter.add_mesh(
-                    grid.contour([level], scalars=name), color="#E69F00", smooth_shading=True, ambient=0.25
-                )
-                plotter.add_text(f"{label} = {level:.4g} {'' if unit == '1' else unit}", **_text("lower_left"))
+                    slices, scalars=name, clim=limits, cmap=colour_map, scalar_bar_args=bar, lighting=False,
+                    nan_color=GREY,
+                )  # fmt: skip
+            else:
+                surface, hidden = _surfaces(grid, name, level)
+                if surface.n_points:
+                    plotter.add_mesh(surface, color="#E69F00", smooth_shading=True, ambient=0.25)
+                    plotter.add_text(f"{label} = {level:.4g} {'' if unit == '1' else unit}", **_text("lower_left"))
+                if hidden.n_points:
+                    plotter.add_mesh(hidden, color=GREY, opacity=0.35)
+            if grid[MASKED].any():
+                plotter.add_text("grey: masked", **_text("lower_right"))
             lower, upper = volume.grid.box.lower, volume.grid.box.upper
             box = [end for pair in zip(lower, upper, strict=True) for end in pair]
             plotter.add_mesh(pv.Box(bounds=box), style="wireframe", color="black", line_width=1)
@@ -154,6 +156,31 @@ def frames_there(store: VolumeSequence) -> list[int]:
     if "status" not in store.group:
         return list(range(len(store)))
     return [int(i) for i in np.flatnonzero(np.asarray(store.array("status")[:]) == 1)]
+
+
+def _points(volume: Volume, name: str) -> Any:
+    """Voxel centres with the values shown, NaN where masked, and 1 there and 0 elsewhere under MASKED."""
+    import pyvista as pv
+
+    values = shown(volume)
+    grid = pv.ImageData(
+        dimensions=volume.grid.shape[::-1],
+        spacing=volume.grid.spacing,
+        origin=[float(volume.grid.axis(a)[0]) for a in "xyz"],
+    )
+    grid[name] = values.ravel()
+    grid[MASKED] = (~np.isfinite(values)).astype(np.float32).ravel()
+    return grid
+
+
+def _surfaces(grid: Any, name: str, level: float) -> tuple[Any, Any]:
+    """The surface of `level` where the values are known, and the surface of what is masked."""
+    whole = grid.copy()
+    whole[name] = filled(grid[name].reshape(grid.dimensions[::-1])).ravel()
+    surface = whole.contour([level], scalars=name)
+    if surface.n_points:
+        surface = surface.clip_scalar(scalars=MASKED, value=0.5)
+    return surface, whole.contour([0.5], scalars=MASKED)
 
 
 def _writer(path: Path, frames_per_second: float) -> Any:

@@ -26,8 +26,9 @@ from nerif.report.figures import (
     shown,
 )
 from nerif.report.isosurface import default_level, draw_isosurface
-from nerif.report.result import Result
+from nerif.report.view_images import lattice_step
 from nerif.reprojection import Reprojection
+from nerif.result import Result
 from nerif.volume import Volume
 
 if TYPE_CHECKING:
@@ -177,13 +178,22 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
     return figure
 
 
-def residuals_over_sigma(reprojection: Reprojection) -> np.ndarray:
-    """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box."""
-    measurement = reprojection.measurement
-    assert measurement.sigma is not None
-    seen = measurement.usable & measurement.sees_box
-    residual = (reprojection.predicted - measurement.displacement)[seen] / measurement.sigma[seen]
-    return residual.flatten().numpy()
+def residuals_over_sigma(reprojection: Reprojection, most: int = 1 << 20) -> np.ndarray:
+    """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box.
+
+    Of more than `most` pixels, those of a regular lattice are taken.
+    """
+    m = reprojection.measurement
+    assert m.sigma is not None
+    step, usable, found = lattice_step(m, most), m.usable, []
+    for i, camera in enumerate(m.cameras):
+        rows, columns = (slice(0, n, step) for n in camera.image_size)
+        pixels = camera.pixel_grid()[::step, ::step]
+        crosses = camera.rays(pixels.reshape(-1, 2)).clip(m.box).crosses.reshape(pixels.shape[:2])
+        seen = usable[i, rows, columns] & crosses
+        residual = reprojection.predicted[i, rows, columns] - m.displacement[i, rows, columns]
+        found.append((residual[seen] / m.sigma[i, rows, columns][seen]).flatten())
+    return torch.cat(found).numpy()
 
 
 def rig(reprojection: Reprojection, width: float) -> Figure:

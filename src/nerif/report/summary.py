@@ -11,7 +11,7 @@ from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
 from nerif.report.figures import shown
-from nerif.report.result import METRICS, VOLUME, Result
+from nerif.result import METRICS, VOLUME, Result
 
 __all__ = ["Statement", "came_out", "headline", "measured", "number", "percent", "trust", "trust_figures"]
 

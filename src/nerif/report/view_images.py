@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from nerif.measurement import Measurement
 from nerif.report.figures import DIVERGING
 from nerif.reprojection import Reprojection
 
-__all__ = ["ViewImages", "colour_table", "view_images"]
+__all__ = ["ViewImages", "colour_table", "lattice_step", "view_images"]
 
 LARGEST = 320  # px along an edge of a picture in the page
+ALL_PICTURES = 4_000_000  # px of all pictures of a page: 5 MB of it
+FOR_LIMITS = 1 << 20  # px from which the ends of the colours are found
 
 
 @dataclass(frozen=True)
@@ -47,29 +51,42 @@ def colour_table(name: str) -> list[tuple[int, int, int]]:
     return [(int(r), int(g), int(b)) for r, g, b, _ in colormaps[name](np.arange(256), bytes=True)]
 
 
+def lattice_step(measurement: Measurement, most: int) -> int:
+    """Return the step, px, of the regular lattice on which a measurement has at most about `most` pixels."""
+    views, height, width, _ = measurement.displacement.shape
+    return max(1, math.ceil(math.sqrt(views * height * width / most)))
+
+
 def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tuple[list[ViewImages], float, float]:
     """Return the pictures of all views, the limit (px) of measured and re-projected, and that of the differences.
 
-    Limits hold for all views: the 99.8th percentile of what was measured, the 99.5th of the difference.
+    Limits hold for all views: the 99.8th percentile of what was measured, the 99.5th of the difference; of more than a
+    million pixels, on a regular lattice.
     """
     m = reprojection.measurement
     scores = {v.get("name"): v for v in metrics}
     usable = m.usable
-    difference = (reprojection.predicted - m.displacement)[usable].abs().flatten().numpy()
-    limit = float(np.quantile(m.displacement[usable].abs().flatten().numpy(), 0.998)) or 1.0
-    apart = float(np.quantile(difference, 0.995)) or 1.0
+    step = lattice_step(m, FOR_LIMITS)
+    some = usable[:, ::step, ::step]
+    if not bool(some.any()):
+        step, some = 1, usable
+    d, predicted = m.displacement[:, ::step, ::step][some], reprojection.predicted[:, ::step, ::step][some]
+    limit = float(np.quantile(d.abs().flatten().numpy(), 0.998)) or 1.0
+    apart = float(np.quantile((predicted - d).abs().flatten().numpy(), 0.995)) or 1.0
+    largest = min(LARGEST, math.isqrt(ALL_PICTURES // (6 * len(m.cameras))))
     found = []
     for i, camera in enumerate(m.cameras):
         height, width = camera.image_size
-        step = (-(-height // LARGEST), -(-width // LARGEST))
+        shrink = (-(-height // largest), -(-width // largest))
         valid = usable[i, :height, :width, None].numpy()
         measured = np.where(valid, m.displacement[i, :height, :width].numpy(), np.nan)
-        predicted = reprojection.predicted[i, :height, :width].numpy()
+        seen = reprojection.predicted[i, :height, :width].numpy()
         rows = {}
         for c, component in enumerate("uv"):
-            images = (measured[..., c], predicted[..., c], (predicted - measured)[..., c])
+            images = (measured[..., c], seen[..., c], seen[..., c] - measured[..., c])
             limits = (limit, limit, apart)
-            rows[component] = tuple(_picture(_shrink(x, step), reach) for x, reach in zip(images, limits, strict=True))
+            small = [_shrink(image, shrink) for image in images]
+            rows[component] = tuple(_picture(x, reach) for x, reach in zip(small, limits, strict=True))
         found.append(
             ViewImages(
                 camera.name,
@@ -77,7 +94,7 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
                 scores.get(camera.name, {}),
                 rows,  # type: ignore[arg-type]
                 (height, width),
-                step,
+                shrink,
             )
         )
     return found, limit, apart

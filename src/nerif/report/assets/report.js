@@ -62,7 +62,7 @@ async function main() {
     if (cache[key]) return cache[key];
     const q = scene.quantities[chosen.quantity], r = q.relation, v = arrays.value, e = arrays.error;
     const values = new Float32Array(count);
-    const own = arrays[chosen.quantity + "_" + chosen.variant];  // temperature: no linear function of the excess
+    const own = arrays[chosen.quantity + "_" + chosen.variant];  // no linear function of the excess, or masked somewhere
     if (own) values.set(own);
     else if (chosen.variant === "std") for (let i = 0; i < count; i++) values[i] = arrays.std[i] * r.factor;
     else if (chosen.variant === "mean") for (let i = 0; i < count; i++) values[i] = quantityOf(r, arrays.mean[i]);

@@ -1,0 +1,159 @@
+"""The ensemble of a result directory: its members one by one, each kept as soon as it is done, and their spread."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.atomic import atomic
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views
+from nerif.fields.base import Field
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
+from nerif.monitor import QUIET, Monitor
+from nerif.physics.quantities import GasSettings, derive_all, masked_lines
+from nerif.prediction import reproject
+from nerif.reconstruction.base import Outcome, Reconstruction, Reconstructor
+from nerif.reconstruction.ensemble import Ensemble, Spread
+from nerif.reconstruction.files import FIELD
+from nerif.result import ResultDirectory
+from nerif.volume import Volume
+
+__all__ = ["Members", "all_quantities"]
+
+ASKED = "asked.json"
+FAILED = ("diverged", "collapsed")
+
+
+def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
+    """Sample a reconstruction as index excess, n, density and temperature, `voxels` along the longest edge."""
+    return derive_all(result.volume(Grid.of_resolution(result.box, voxels)), gas)
+
+
+@dataclass(frozen=True)
+class Members:
+    """Members of an ensemble in a result directory.
+
+    Parameters
+    ----------
+    out : the directory, with the main result in it
+    ensemble : how many members, and what they see
+    reconstructor : settings of the main result
+    training : what that was reconstructed from
+    start : field that every member starts from, or None
+    made_of : what else the members depend on; those made of anything else are done again
+    monitor : told how the work goes
+    """
+
+    out: ResultDirectory
+    ensemble: Ensemble
+    reconstructor: Reconstructor
+    training: Measurement
+    start: Field | None = None
+    made_of: Mapping[str, str] = field(default_factory=dict)
+    monitor: Monitor = QUIET
+
+    def add_to(self, main: Reconstruction, gas: GasSettings, voxels: int) -> None:
+        """Reconstruct the members, and write mean and standard deviation of every quantity beside the main result.
+
+        Members that an interrupted run of the same settings has left are not done again. An interruption leaves those
+        done so far. A member that diverges is left out, and told.
+        """
+        say, started = self.monitor.say, time.monotonic()
+        noise, source = self._noise(main)
+        spread, left_out, diverged = Spread(), [], []
+        for number in range(1, self.ensemble.members + 1):
+            result = self._member(number, noise)
+            if result.outcome.reason == "interrupted":
+                say(f"ensemble: interrupted after {spread.count} of {self.ensemble.members} members; --resume goes on")
+                break
+            if result.outcome.reason in FAILED:
+                say(f"ensemble: member {number} {result.outcome.reason} and is left out: {result.outcome.message}")
+                diverged.append(number)
+                continue
+            spread.add(all_quantities(result, gas, voxels))
+            out = self.ensemble.left_out(number, self.training)
+            if out:
+                left_out += _compared(result, self.training.select(out), out)
+        if spread.count < 2:
+            say(f"ensemble: {spread.count} members are too few for a standard deviation; none is written")
+            return
+        volumes = [*all_quantities(main, gas, voxels), *spread.volumes()]
+        self.out.write_volumes(volumes)
+        about: dict[str, Any] = {
+            "members": spread.count, "diverged": diverged, "noise": source,
+            "leave_one_out": self.ensemble.leave_one_out, "left_out": left_out,
+            "seconds": time.monotonic() - started,
+        }  # fmt: skip
+        self.out.add_metrics({"ensemble": about})
+        for line in masked_lines(volumes):
+            say(line)
+        excess = next(v for v in volumes if v.quantity == "index_excess_std")
+        largest = float(volumes[0].values.abs().max())
+        rms = float(excess.values.square().mean().sqrt())
+        share = f"{rms / largest:.2%} of the largest excess"
+        say(f"ensemble of {spread.count}: rms standard deviation of n {rms:.3g}, {share}")
+        for v in left_out:
+            say(f"left out {v['name']}: CC {v['cc']:.4f}, rms error {v['rms_px']:.4f} px")
+
+    def _noise(self, main: Reconstruction) -> tuple[Float[Tensor, "view row column 2"], str]:
+        """Standard deviation of the noise of every pixel, px: that of the file, else the rms residual of each view."""
+        training = self.training
+        if training.sigma is not None:
+            return training.sigma.nan_to_num(0.0, 0.0, 0.0), "sigma of the measurement"
+        rms = torch.tensor([v["rms_px"] for v in _compared(main, training)])
+        instead = "noise of the size of each view's rms residual is added"
+        self.monitor.say(f"ensemble: the measurement has no sigma; {instead}")
+        # NaN for a view of which no ray crosses the box
+        return rms.nan_to_num(0.0)[:, None, None, None].expand(training.displacement.shape).clone(), "rms residual"
+
+    def _member(self, number: int, noise: Float[Tensor, "view row column 2"]) -> Reconstruction:
+        """One member: read if it is there already, made by the same settings from the same data; else reconstructed."""
+        directory = self.out.member(number)
+        reconstructor, noisy = self.ensemble.member(number, self.reconstructor, self.training, noise)
+        made_of = self._fingerprint(reconstructor, noisy)
+        if directory.has(FIELD) and directory.has(ASKED) and (directory / ASKED).read_text() == made_of:
+            try:
+                kept = Outcome("converged", "read from disc")
+                return Reconstruction(*directory.field(), [], kept, dataclasses.asdict(reconstructor), device="cpu")  # type: ignore[call-overload]
+            except InputError as error:
+                self.monitor.say(f"{error}; this member is done again")
+        out = "".join(f", without {name}" for name in self.ensemble.left_out(number, self.training))
+        with self.monitor.training(f"member {number} of {self.ensemble.members}{out}") as told:
+            result = reconstructor(noisy, told, None, self.start)
+        if result.outcome.reason not in ("interrupted", *FAILED):
+            directory.path.mkdir(parents=True, exist_ok=True)
+            (directory / ASKED).unlink(missing_ok=True)
+            directory.write_field(dataclasses.replace(result, state=None))
+            with atomic(directory / ASKED) as part:
+                part.write_text(made_of)
+        return result
+
+    def _fingerprint(self, reconstructor: Reconstructor, data: Measurement) -> str:
+        """What a member was made by and from, as text: another one of either gives another text."""
+        seen = hashlib.sha256()
+        for values in (data.displacement, data.sigma, data.usable):
+            if values is not None:
+                seen.update(values.contiguous().numpy().tobytes())
+        asked = {
+            "views": data.names,
+            "data": seen.hexdigest(),
+            **self.made_of,
+            **dataclasses.asdict(reconstructor),  # type: ignore[call-overload]
+        }
+        return json.dumps(asked, indent=1, default=str) + "\n"
+
+
+def _compared(result: Reconstruction, data: Measurement, held_out: Collection[str] = ()) -> list[dict[str, Any]]:
+    """How well the views of some data are predicted."""
+    return evaluate_views(reproject(result.field, data, held_out, result.device, model=result.model))

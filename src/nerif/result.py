@@ -1,0 +1,386 @@
+"""A result directory: the names of its files, how each is written and read, and what is told where one is missing."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import shutil
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+from nerif import __version__
+from nerif.atomic import atomic
+from nerif.conventions import InputError
+from nerif.exports import export
+from nerif.fields.base import Field
+from nerif.geometry import Box
+from nerif.measurement import Measurement
+from nerif.reconstruction.base import Reconstruction, State
+from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_state, write_field, write_state
+from nerif.reprojection import Reprojection
+from nerif.volume import Volume, read_volume, read_volumes
+
+__all__ = [
+    "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions", "write_json",
+]  # fmt: skip
+
+RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
+VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
+ENSEMBLE, FIGURES = "ensemble", "figures"
+FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT)
+
+RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
+
+UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Something that is not there or cannot be read.
+
+    Parameters
+    ----------
+    what : name of the file, or "truth"
+    sentence : what follows from it, with the remedy
+    """
+
+    what: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a result directory holds.
+
+    Parameters
+    ----------
+    directory : where it was found
+    settings : of run.toml; empty if missing
+    about : the table [about] of run.toml: versions, outcome
+    metrics : of metrics.json; empty if missing
+    history : records of history.csv, blanks as NaN
+    volumes : by quantity; with an ensemble also index_excess_mean, index_excess_std, ...
+    reprojection : measured and predicted views, or None
+    measurement : what was measured, or None
+    truth : index excess it was compared with, relative to the ambient of the result, or None
+    missing : what is not there or cannot be read
+    """
+
+    directory: Path
+    settings: dict[str, Any] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    history: list[dict[str, float]] = field(default_factory=list)
+    volumes: dict[str, Volume] = field(default_factory=dict)
+    reprojection: Reprojection | None = None
+    measurement: Measurement | None = None
+    truth: Volume | None = None
+    missing: tuple[Missing, ...] = ()
+
+    @property
+    def method(self) -> str:
+        """Name of the method as a reader knows it."""
+        names = {"nerif": "NeRIF", "tikhonov": "Tikhonov", "landweber": "Landweber", "tv": "total variation"}
+        method = str(self.settings.get("method", "unknown method"))
+        return names.get(method, method)
+
+
+class ResultDirectory:
+    """The directory a reconstruction is written to and read from; every file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : of the directory, which need not be there yet
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    def __truediv__(self, name: str) -> Path:
+        return self.path / name
+
+    def has(self, name: str) -> bool:
+        """Whether a file of that name is there."""
+        return (self.path / name).is_file()
+
+    def check_free(self, force: bool = False) -> None:
+        """Refuse a directory that holds anything, unless forced.
+
+        Raises
+        ------
+        InputError
+            If it does, or is a file.
+        """
+        if self.path.is_file():
+            raise InputError(f"{self.path}: expected a directory for --out, got a file")
+        if self.path.is_dir() and any(self.path.iterdir()) and not force:
+            raise InputError(
+                f"{self.path}: exists already and was left as it is; give another --out, --force to overwrite, "
+                "or --resume to go on with it"
+            )
+
+    # -- writing -------------------------------------------------------------------------------------------------
+
+    def begin(self, settings: Mapping[str, Any], resume: bool = False) -> None:
+        """Make the directory and keep the settings; what an earlier run has left is removed, unless it is resumed."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            self.clear()
+        self.write_settings(settings)
+
+    def clear(self) -> None:
+        """Remove the files of a reconstruction, and nothing else."""
+        for name in FILES:
+            (self.path / name).unlink(missing_ok=True)
+        for name in (ENSEMBLE, FIGURES):
+            shutil.rmtree(self.path / name, ignore_errors=True)
+
+    def write_settings(self, settings: Mapping[str, Any], about: Mapping[str, Any] | None = None) -> None:
+        """Write run.toml: settings under the names of the flags, and what came out in the table [about]."""
+        import tomli_w
+
+        table = {**settings, "about": {"nerif": __version__, **(about or {})}}
+        with atomic(self.path / RUN) as part:
+            part.write_text(RUN_HEAD + tomli_w.dumps(_without_none(table)))
+
+    def write_field(self, result: Reconstruction) -> None:
+        """Write the field and, where there is one, the checkpoint to go on from."""
+        write_field(self.path, result)
+        if result.state is not None:
+            self.write_state(result.state)
+
+    def write_state(self, state: State) -> None:
+        """Write the checkpoint."""
+        write_state(self.path, state)
+
+    def write_history(self, history: Sequence[Mapping[str, float]]) -> None:
+        """Write history.csv, a line a record, blank where a record lacks a column."""
+        columns = list(dict.fromkeys(key for record in history for key in record))
+        with atomic(self.path / HISTORY) as part, part.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="")
+            writer.writeheader()
+            writer.writerows(history)
+
+    def write_metrics(self, entries: Mapping[str, Any]) -> None:
+        """Write metrics.json afresh: scores of an earlier field do not stay."""
+        write_json(self.path / METRICS, entries)
+
+    def add_metrics(self, entries: Mapping[str, Any]) -> None:
+        """Add entries to metrics.json."""
+        path = self.path / METRICS
+        try:
+            known = json.loads(path.read_text()) if path.is_file() else {}
+        except ValueError:
+            raise InputError(f"{path}: not a JSON file, or truncated; remove it and evaluate again") from None
+        self.write_metrics({**known, **entries})
+
+    def write_volumes(self, volumes: list[Volume]) -> None:
+        """Write volume.nc and volume.vti."""
+        for name in (VOLUME, VOLUME_VTI):
+            export(self.path / name, volumes)
+
+    def write_reprojection(self, reprojection: Reprojection) -> None:
+        """Write measured and predicted views."""
+        reprojection.write(self.path / REPROJECTION)
+
+    # -- reading; each raises InputError where the file is missing or damaged --------------------------------------
+
+    def field(self) -> tuple[Field, Box, float]:
+        """Return the field of index excess, its box (mm) and n_ambient."""
+        return read_field(self.path)
+
+    def state(self) -> State:
+        """Return the checkpoint."""
+        return read_state(self.path)
+
+    def settings(self) -> dict[str, Any]:
+        """Return run.toml as it is, with [about]; nothing where there is none."""
+        path = self.path / RUN
+        try:
+            return tomllib.loads(path.read_text()) if path.is_file() else {}
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: not a TOML file ({error})") from None
+
+    def metrics(self) -> dict[str, Any]:
+        """Return metrics.json, refused as a whole where a part is not what nerif writes."""
+        path = self.path / METRICS
+        try:
+            return _checked(json.loads(path.read_text()))
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file; nerif evaluate {self.path} --measurement FILE adds it") from None
+        except ValueError as error:
+            raise InputError(f"{path}: not a JSON file of nerif, or truncated ({error})") from None
+
+    def history(self) -> list[dict[str, float]]:
+        """Return the records of history.csv, blanks as NaN."""
+        path = self.path / HISTORY
+        with path.open(newline="") as file:
+            rows = [{k: _number(v) for k, v in row.items() if k is not None} for row in csv.DictReader(file)]
+        if rows and not {"seconds", "step"} & set(rows[0]):
+            raise InputError(f"{path}: expected columns 'seconds' or 'step', got {', '.join(list(rows[0])[:5])}")
+        return rows
+
+    def volumes(self) -> dict[str, Volume]:
+        """Return the quantities of volume.nc."""
+        return read_volumes(self.path / VOLUME)
+
+    def reprojection(self) -> Reprojection:
+        """Return measured and predicted views."""
+        return Reprojection.read(self.path / REPROJECTION)
+
+    def member(self, number: int) -> ResultDirectory:
+        """Return the directory of one member of an ensemble."""
+        return ResultDirectory(self.path / ENSEMBLE / f"{number:02d}")
+
+    def read(self) -> Result:
+        """Read what there is, whole, half-finished or broken: what is missing is told in the Result, never fatal.
+
+        Raises
+        ------
+        InputError
+            If there is no such directory, or nothing of a reconstruction in it.
+        """
+        if not self.path.is_dir():
+            raise InputError(f"{self.path}: no such directory; expected one written by nerif reconstruct")
+        if not any((self.path / name).exists() for name in FILES if name != REPORT):
+            known = ", ".join((RUN, METRICS, HISTORY, VOLUME, REPROJECTION))
+            raise InputError(f"{self.path}: expected a result of nerif reconstruct, got none of {known} in it")
+        finished = self.has(FIELD)
+        missing: list[Missing] = []
+        not_yet: list[str] = []
+
+        def attempt(name: str, read: Callable[[], T], default: T, without: str) -> T:
+            if not self.has(name):
+                if finished:
+                    missing.append(Missing(name, f"{name} is not there: {without}"))
+                else:
+                    not_yet.append(name)
+                return default
+            try:
+                return read()
+            except UNREADABLE as error:
+                reason = " ".join(str(error).split()).replace(f"{self.path / name}: ", "")
+                missing.append(Missing(name, f"{name} cannot be read ({reason}): {without}"))
+                return default
+
+        run: dict[str, Any] = attempt(RUN, self.settings, {}, "the settings are not known")
+        metrics: dict[str, Any] = attempt(
+            METRICS, self.metrics, {}, "how well the field meets the views is not known; nerif evaluate adds it"
+        )
+        history: list[dict[str, float]] = attempt(HISTORY, self.history, [], "there are no training curves")
+        volumes: dict[str, Volume] = attempt(
+            VOLUME, self.volumes, {}, "there is no field to show; nerif export writes it from the network"
+        )
+        views = attempt(
+            REPROJECTION, self.reprojection, None, "the views cannot be shown; nerif evaluate --measurement FILE"
+        )
+        if not finished:
+            go_on = "Start it again"
+            if self.has(CHECKPOINT):
+                go_on = f"Go on with nerif reconstruct --resume -o {self.path}"
+            rest = f" Not there yet: {', '.join(not_yet)}." if not_yet else ""
+            missing.insert(0, Missing(FIELD, f"The run has not ended: there is no {FIELD}. {go_on}.{rest}"))
+        return Result(
+            directory=self.path,
+            settings={k: v for k, v in run.items() if k != "about"},
+            about=run.get("about", {}),
+            metrics=metrics,
+            history=history,
+            volumes=volumes,
+            reprojection=views,
+            measurement=_measurement(run) if views is None else views.measurement,
+            truth=self._truth(metrics, volumes, missing),
+            missing=tuple(missing),
+        )
+
+    def _truth(self, metrics: dict[str, Any], volumes: dict[str, Volume], missing: list[Missing]) -> Volume | None:
+        """The truth it was compared with: where it was then, or beside the result if both have moved."""
+        path = metrics.get("truth")
+        if not isinstance(path, str):
+            return None
+        places = (Path(path), self.path / Path(path).name, self.path.parent / Path(path).name)
+        try:
+            truth = read_volume(next((p for p in places if p.is_file()), places[0]))
+            ambient = volumes["index_excess"].n_ambient if "index_excess" in volumes else None
+            return truth if ambient is None else truth.relative_to(ambient)
+        except InputError as error:
+            missing.append(Missing("truth", f"The truth cannot be shown beside the field: {error}"))
+            return None
+
+
+def versions() -> dict[str, str]:
+    """When and with what it was done."""
+    import platform
+
+    import numpy as np
+    import torch
+
+    return {
+        "finished": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "machine": f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads",
+    }
+
+
+def write_json(path: Path, entries: Mapping[str, Any]) -> None:
+    """Write a JSON file, atomically; NaN and infinity as null."""
+    with atomic(path) as part:
+        part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _without_none(value: Any) -> Any:
+    """Settings as TOML has them: no word for nothing, paths as text."""
+    if isinstance(value, Mapping):
+        return {k: _without_none(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(v) for v in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _measurement(run: dict[str, Any]) -> Measurement | None:
+    """The measurement of the run, if it is still where it was."""
+    try:
+        return Measurement.read(str(run["measurement"]))
+    except (InputError, KeyError):
+        return None
+
+
+def _checked(found: Any) -> dict[str, Any]:
+    if not isinstance(found, dict):
+        raise ValueError("expected a table of names and values")
+    for name, known in (("views", "name"), ("slices", "z_mm")):
+        rows = found.get(name, [])
+        if not isinstance(rows, list) or not all(isinstance(row, dict) and known in row for row in rows):
+            raise ValueError(f"'{name}' is not a list of tables with '{known}'")
+    for name, known in (("ensemble", "members"), ("coverage", "share")):
+        table = found.get(name, {known: 0})
+        if not isinstance(table, dict) or known not in table:
+            raise ValueError(f"'{name}' is not a table with '{known}'")
+    return found
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text) if text else math.nan
+    except ValueError:
+        return math.nan

@@ -1,0 +1,52 @@
+"""How good the frames of a sequence are, each against its truth."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from nerif.conventions import InputError
+from nerif.metrics import volume_errors
+from nerif.result import write_json
+from nerif.sequence.store import DONE, SequenceStore
+from nerif.volume_sequence import VolumeSequence
+
+__all__ = ["evaluate_sequence"]
+
+
+def evaluate_sequence(
+    result: str | os.PathLike[str],
+    truth: str | os.PathLike[str],
+    on_frame: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Compare every frame of a sequence with its truth; return the metrics, and keep them in RESULT.metrics.json.
+
+    Parameters
+    ----------
+    result : store of nerif sequence
+    truth : volumes of index_excess at the same instants, over any ambient
+    on_frame : told how many frames are compared, out of how many
+
+    Raises
+    ------
+    InputError
+        If the instants differ, or no frame is done.
+    """
+    store, true = SequenceStore(Path(result)), VolumeSequence(truth)
+    if len(store) != len(true) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, true.times, strict=True)):
+        raise InputError(f"{truth}: expected the instants of {result}, {len(store)} frames, got others")
+    frames: list[dict[str, Any]] = []
+    done = [i for i, status in enumerate(store.status) if status == DONE]
+    for i in done:
+        expected = true.volume(i, "index_excess").relative_to(store.n_ambient).values.numpy()
+        found = store.field(i).sample(true.grid).numpy()
+        frames.append({"frame": i, "time_s": store.times[i], **volume_errors(expected, found, store.n_ambient)})
+        on_frame(len(frames), len(done))
+    if not frames:
+        raise InputError(f"{result}: no frame of it is done yet; run nerif sequence again")
+    mean = {name: sum(f[name] for f in frames) / len(frames) for name in ("l2", "l2_variation", "cc")}
+    metrics = {"truth": str(Path(truth).resolve()), "frames": frames, "mean": mean}
+    write_json(Path(result).with_suffix(".metrics.json"), metrics)
+    return metrics

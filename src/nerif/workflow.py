@@ -1,0 +1,291 @@
+"""From a measurement to a result directory: all that `nerif reconstruct` does, as a Python call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views, score_lines
+from nerif.fields.base import Field
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
+from nerif.members import Members, all_quantities
+from nerif.monitor import QUIET, Monitor
+from nerif.physics.quantities import GasSettings, derive, masked_lines
+from nerif.prediction import reproject
+from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
+from nerif.reconstruction.ensemble import Ensemble
+from nerif.reconstruction.files import checkpoints
+from nerif.reconstruction.landweber import Landweber
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.voxels import VoxelReconstructor
+from nerif.report import html
+from nerif.report.sequence_page import render_sequence
+from nerif.result import REPORT, ResultDirectory, versions
+from nerif.volume import Volume
+from nerif.volume_sequence import VolumeSequence
+
+__all__ = ["METHODS", "Run", "check_gas", "reconstruct_into", "write_report", "write_sequence_report"]
+
+METHODS: dict[str, type[Reconstructor]] = {
+    "nerif": NeRIF,
+    "tikhonov": Tikhonov,
+    "landweber": Landweber,
+    "tv": TotalVariation,
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is asked of a reconstruction into a directory, beside the settings of the method."""
+
+    hold_out: tuple[str, ...] = ()
+    """Views kept out of the reconstruction and re-projected from it."""
+    start_from: Path | None = None
+    """Result directory of another reconstruction in the same box, of any method, to start from."""
+    ensemble: int = 0
+    """Reconstruct so many times more with other seeds and noise, for mean and standard deviation of every quantity."""
+    leave_one_out: bool = False
+    """Let each member of the ensemble do without one view, in turn."""
+    report: bool = True
+    """Write report.html at the end."""
+    checkpoint_every: float = 60.0
+    """Seconds between checkpoints."""
+    gas: GasSettings = field(default_factory=GasSettings)
+    """What the density is computed for."""
+
+
+def reconstruct_into(
+    directory: str | os.PathLike[str],
+    measurement: Measurement | str | os.PathLike[str],
+    reconstructor: Reconstructor,
+    run: Run | None = None,
+    *,
+    voxels: int | None = None,
+    resume: bool = False,
+    force: bool = False,
+    keep: Mapping[str, Any] | None = None,
+    on_step: OnStep | None = None,
+    monitor: Monitor = QUIET,
+) -> Reconstruction:
+    """Reconstruct, and write the result directory that docs/formats.md lists.
+
+    Field, history and volumes are written as soon as the method ends, then the re-projection into the views and the
+    report.
+
+    Parameters
+    ----------
+    directory : of the result
+    measurement : or the file it is in, whose path is kept in run.toml
+    reconstructor : settings of the method
+    run : what else is asked
+    voxels : of the written volume along the longest edge of the box; None for those of the method, else 100
+    resume : go on with the checkpoint in the directory
+    force : replace the result in the directory
+    keep : further entries of run.toml
+    on_step : told every step of the main reconstruction, and may stop it
+    monitor : told how the work goes
+
+    Raises
+    ------
+    InputError
+        If anything asked cannot be; a result that is there stays as it is.
+    """
+    out, run, path = ResultDirectory(directory), run or Run(), None
+    if not isinstance(measurement, Measurement):
+        path = Path(measurement)
+        measurement = Measurement.read(path)
+    if voxels is None:
+        voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
+    if voxels < 1:
+        raise InputError(f"voxels: expected at least 1, got {voxels}")
+    training = _without(measurement, run.hold_out)
+    _check_ensemble(run, training)
+    if measurement.wavelength_nm is not None:
+        run = replace(run, gas=replace(run.gas, wavelength_nm=measurement.wavelength_nm))
+    check_gas(run.gas, measurement)
+    if measurement.bad_pixels:
+        where = "the measurement" if path is None else path
+        what = "pixels left out whose displacement or sigma is NaN, infinite or impossible"
+        monitor.say(f"{where}: {measurement.bad_pixels} {what}")
+    state = out.state() if resume else None
+    start = _start(run, measurement) if run.ensemble or not resume else None
+    if not resume:
+        out.check_free(force)
+    ranks = Ranks.from_environment()
+    if ranks.size > 1:
+        _check_parallel(run, reconstructor)
+    if not ranks.is_first:  # under torchrun the first process tells, and writes
+        with monitor.training("training") as told:
+            return reconstructor(training, told, state, start if state is None else None)
+    settings = _settings(run, path, reconstructor, voxels, keep or {})
+    begin = _begin(out, settings, resume)
+    with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
+        callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
+        result = reconstructor(training, compose(*callbacks), state, start if state is None else None)
+    monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
+    begin(None)
+    _write(out, measurement, result, run, settings, voxels, monitor)
+    try:
+        if run.ensemble and result.outcome.reason != "interrupted":
+            ensemble, made_of = Ensemble(run.ensemble, run.leave_one_out), {"start_from": str(run.start_from)}
+            members = Members(out, ensemble, reconstructor, training, start, made_of, monitor)
+            members.add_to(result, run.gas, voxels)
+    finally:  # the page of the main result, whatever becomes of the members
+        if run.report:
+            write_report(out.path, monitor=monitor)
+    return result
+
+
+def write_report(
+    directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET
+) -> Path:
+    """Write the page of a result directory, say what could not be shown, and return where it is."""
+    out = ResultDirectory(directory)
+    path = path or out / REPORT
+    result = out.read()
+    html.write(html.render(result), path)
+    for gap in result.missing:
+        monitor.say(f"missing: {gap.sentence}")
+    _say_size(path, monitor)
+    return path
+
+
+def write_sequence_report(
+    store: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET
+) -> Path:
+    """Write the page of a store of nerif sequence, finished or not, and return where it is."""
+    path = path or Path(store).with_suffix(".html")
+    html.write(render_sequence(VolumeSequence(store)), path)
+    _say_size(path, monitor)
+    return path
+
+
+def _say_size(path: Path, monitor: Monitor) -> None:
+    size = path.stat().st_size
+    monitor.say(f"{path}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")
+
+
+def check_gas(gas: GasSettings, measurement: Measurement) -> None:
+    """Refuse what density and temperature cannot be computed from before the long work, not after it."""
+    grid = Grid(measurement.box, (1, 1, 1))
+    ambient = Volume(torch.zeros(grid.shape), grid, attributes={"n_ambient": measurement.n_ambient})
+    derive(ambient, "temperature", gas)
+
+
+def _write(
+    out: ResultDirectory,
+    measurement: Measurement,
+    result: Reconstruction,
+    run: Run,
+    settings: dict[str, Any],
+    voxels: int,
+    monitor: Monitor,
+) -> None:
+    """Write what came out: the field first, it is the costliest; what only looks at it comes last."""
+    out.write_field(result)
+    out.write_history(result.history)
+    volumes = all_quantities(result, run.gas, voxels)
+    out.write_volumes(volumes)
+    for line in masked_lines(volumes):
+        monitor.say(line)
+    metrics: dict[str, Any] = {
+        "seconds": result.seconds,
+        "peak_memory_bytes": result.peak_memory_bytes,
+        "device": result.device,
+        "outcome": result.outcome.reason,
+        "message": result.outcome.message,
+        "measurement": settings.get("measurement"),
+    }
+    out.write_metrics(metrics)
+    out.write_settings(
+        settings, {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
+    )
+    with monitor.counting("re-projecting") as bar:
+        reprojection = reproject(result.field, measurement, run.hold_out, result.device, bar, result.model)
+    views = evaluate_views(reprojection)
+    out.write_metrics({"views": views, "reprojection": asdict(reprojection.accuracy), **metrics})
+    out.write_reprojection(reprojection)
+    for line in score_lines(views):
+        monitor.say(line)
+    monitor.say(f"re-projected by {reprojection.accuracy.how}")
+    monitor.say(
+        f"{out.path}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView"
+    )
+
+
+def _without(measurement: Measurement, names: tuple[str, ...]) -> Measurement:
+    for name in names:
+        if name not in measurement.names:
+            raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{name}'")
+    kept = [name for name in measurement.names if name not in names]
+    if not kept:
+        raise InputError("hold_out: every view is held out, so none is left to reconstruct from")
+    return measurement.select(kept)
+
+
+def _check_ensemble(run: Run, training: Measurement) -> None:
+    if run.ensemble:
+        Ensemble(run.ensemble)  # refuses a wrong number before the long work
+        if run.leave_one_out and len(training.cameras) < 2:
+            raise InputError("leave_one_out: expected two training views or more, got one, which cannot be left out")
+    elif run.leave_one_out:
+        raise InputError("leave_one_out: expected together with --ensemble K, got no ensemble")
+
+
+def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:
+    """Refuse what does not split its rays over the processes of torchrun."""
+    if not isinstance(reconstructor, NeRIF):
+        method = _method(reconstructor)
+        raise InputError(f"method: expected nerif under torchrun, got '{method}', which runs in one process")
+    if run.ensemble:
+        raise InputError("ensemble: expected none under torchrun; run the ensemble in one process")
+
+
+def _start(run: Run, measurement: Measurement) -> Field | None:
+    """The field to start from, if one is named."""
+    if run.start_from is None:
+        return None
+    start, box, _ = ResultDirectory(run.start_from).field()
+    if box != measurement.box:
+        raise InputError(
+            f"{run.start_from}: expected a reconstruction in the box of the measurement, "
+            f"{measurement.box.lower} to {measurement.box.upper} mm, got {box.lower} to {box.upper}"
+        )
+    return start
+
+
+def _method(reconstructor: Reconstructor) -> str:
+    return next(name for name, kind in METHODS.items() if isinstance(reconstructor, kind))
+
+
+def _settings(
+    run: Run, path: Path | None, reconstructor: Reconstructor, voxels: int, keep: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Settings that repeat the run, under the names of the flags."""
+    asked: dict[str, Any] = {**keep, **asdict(run), **asdict(reconstructor)}  # type: ignore[call-overload]
+    if run.start_from is not None:
+        asked["start_from"] = run.start_from.resolve()
+    found = None if path is None else str(path.resolve())
+    return {"measurement": found, "method": _method(reconstructor), "voxels": voxels, **asked}
+
+
+def _begin(out: ResultDirectory, settings: Mapping[str, Any], resume: bool) -> Callable[[Step | None], None]:
+    """Make the directory ready once the first step is done: input that is refused before leaves an old result alone."""
+    done: list[bool] = []
+
+    def prepare(step: Step | None) -> None:
+        if not done:
+            out.begin(settings, resume)
+            done.append(True)
+
+    return prepare
