@@ -12,9 +12,9 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions"),
+    ("atomic", "conventions", "netcdf"),
     ("geometry",),
-    ("measurement", "measurement_sequence", "volume", "volume_sequence", "vti", "exports", "reprojection"),
+    ("measurement_file", "measurement", "measurement_sequence", "volume", "volume_sequence", "vti", "exports", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),

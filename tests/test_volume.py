@@ -73,7 +73,7 @@ def test_n_stays_n_where_nobody_said_the_ambient_index(tmp_path):
 @pytest.mark.parametrize("value", [float("nan"), 0.00027, "air"])
 def test_ambient_index_that_cannot_be_one(tmp_path, value):
     write_netcdf(tmp_path / "n.nc", [Volume(VALUES, GRID, attributes={"n_ambient": value})])
-    with pytest.raises(InputError, match="n.nc: attribute n_ambient: expected a refractive index such as 1.00027, got"):
+    with pytest.raises(InputError, match=r"n\.nc: attribute n_ambient: expected a refractive index such as"):
         read_volume(tmp_path / "n.nc")
 
 

@@ -48,11 +48,13 @@ MOST_PIXELS = 1 << 32
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
     """Return how the maps are packed: chunks within one view, so that one view is read without the others."""
     packed = {}
-    for name in MAPS:
-        if name in dataset:
-            _, rows, columns, *rest = dataset[name].shape
+    for name, values in dataset.data_vars.items():
+        if values.dims[:3] == ("view", "row", "column"):
+            _, rows, columns, *rest = values.shape
             chunks = (1, min(rows, 256), min(columns, 256), *rest)
-            packed[name] = {"zlib": True, "complevel": 1, "shuffle": True, "chunksizes": chunks, "_FillValue": None}
+            packed[str(name)] = {
+                "zlib": True, "complevel": 1, "shuffle": True, "chunksizes": chunks, "_FillValue": None,
+            }  # fmt: skip
     return packed
 
 
@@ -137,7 +139,8 @@ def _check_variables(dataset: xr.Dataset) -> None:
             raise InputError(f"variable '{name}': expected numbers, got {variable.dtype}")
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
-        raise InputError(f"variable 'displacement': expected views of some megapixels, got {views} x {rows} x {columns}")
+        got = f"{views} x {rows} x {columns}"
+        raise InputError(f"variable 'displacement': expected views of some megapixels, got {got}")
 
 
 def _array(dataset: xr.Dataset, name: str) -> Tensor:
@@ -204,5 +207,6 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
 def _number(dataset: xr.Dataset, name: str, what: str) -> float:
     value = dataset.attrs.get(name)
     if not isinstance(value, int | float | np.number):
-        raise InputError(f"attribute {name}: expected a number ({what}), got {'none' if value is None else repr(value)}")
+        got = "none" if value is None else repr(value)
+        raise InputError(f"attribute {name}: expected a number ({what}), got {got}")
     return float(value)

@@ -12,7 +12,7 @@ from torch import Tensor
 from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.measurement import Measurement
-from nerif.measurement_file import VARIABLES
+from nerif.measurement_file import VARIABLES, encoding
 
 __all__ = ["Accuracy", "Reprojection"]
 
@@ -70,7 +70,7 @@ class Reprojection:
         more["measured"].attrs = {"units": "px", "long_name": "measured displacement"}
         with atomic(path) as part:
             predicted.write(part)
-            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding={"measured": PACKED})
+            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding=encoding(more))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Reprojection:

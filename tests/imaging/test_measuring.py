@@ -1,4 +1,4 @@
-"""From the folders of an experiment to measurements, in Python: what is left out, what is masked, how often files are read."""
+"""From the folders of an experiment to measurements: what is left out, what is masked, how often files are read."""
 
 from __future__ import annotations
 
@@ -156,10 +156,13 @@ def test_a_film_is_opened_once_and_each_page_read_once(tmp_path, monkeypatch):
 def test_a_view_is_measured_without_opening_its_files_again(recording, monkeypatch):
     resting = RestingView.of(recording, recording.views[0])
     opens: list[str] = []
-    tiff = tifffile.TiffFile.__init__
-    monkeypatch.setattr(
-        tifffile.TiffFile, "__init__", lambda self, file, *a, **k: (opens.append(file.name), tiff(self, file, *a, **k))[1]
-    )
+    opened = tifffile.TiffFile.__init__
+
+    def counted(self, file, *arguments, **more):
+        opens.append(file.name)
+        opened(self, file, *arguments, **more)
+
+    monkeypatch.setattr(tifffile.TiffFile, "__init__", counted)
     for number in range(3):
         resting.measure([number])
     assert not opens

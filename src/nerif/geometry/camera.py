@@ -88,7 +88,7 @@ class Camera:
                 f"got |R R^T - 1| = {error:.2g}, det = {determinant:.3g}; check for a swapped or mirrored axis"
             )
         k = self.intrinsics
-        if not (LEAST_FOCAL <= float(k[0, 0]) and LEAST_FOCAL <= float(k[1, 1])):
+        if not (float(k[0, 0]) >= LEAST_FOCAL and float(k[1, 1]) >= LEAST_FOCAL):
             raise InputError(
                 f"intrinsics of view '{self.name}': expected positive focal lengths in px, "
                 f"got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}"
@@ -98,7 +98,7 @@ class Camera:
                 f"intrinsics of view '{self.name}': expected K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; "
                 "a transposed K (MATLAB) has to be transposed back"
             )
-        if not (0 < min(self.image_size) and max(self.image_size) <= LARGEST_IMAGE):
+        if not (min(self.image_size) > 0 and max(self.image_size) <= LARGEST_IMAGE):
             raise InputError(
                 f"image_size of view '{self.name}': expected (height, width) between 1 and {LARGEST_IMAGE} px, "
                 f"got {self.image_size}"
@@ -157,7 +157,8 @@ class Camera:
         # k inner (R[:2] - ideal R[2]) / depth, one row of it after the other: small matrix products are slow in a batch
         (xx, xy), (yx, yy) = (row.unbind(-1) for row in inner.unbind(-2))
         rows = []
-        for along_x, along_y in ((k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy), (k[1, 1] * yx, k[1, 1] * yy)):
+        u, v = (k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy), (k[1, 1] * yx, k[1, 1] * yy)
+        for along_x, along_y in (u, v):
             rows += [along_x, along_y, -(along_x * ideal[..., 0] + along_y * ideal[..., 1])]
         jacobian = (torch.stack(rows, dim=-1) / depth).unflatten(-1, (2, 3)) @ self.rotation
         return pixels, jacobian
