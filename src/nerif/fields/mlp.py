@@ -57,7 +57,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 """Each gives the activation and its derivative."""
 
 
-ATTENUATION = 0.3  # of a signal by one layer with torch's initial weights, by which networks deeper than 4 are scaled up
+ATTENUATION = 0.3  # of a signal by one layer with torch's initial weights; deeper networks than 4 make up for it
 
 
 @dataclass(frozen=True)

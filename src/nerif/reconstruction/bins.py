@@ -44,12 +44,15 @@ def binned_rays(
         height, width = camera.image_size
         mask = usable[i, :height, :width]
         known = None if measurement.sigma is None else measurement.sigma[i, :height, :width]
-        weight = mask[..., None].expand(height, width, 2) * (1.0 if known is None else known.pow(-2).nan_to_num(0, 0, 0))
-        d = measurement.displacement[i, :height, :width].nan_to_num(0, 0, 0)
+        weight = mask[..., None].expand(height, width, 2).double()
+        if known is not None:
+            weight = torch.where(mask[..., None], known.double().pow(-2), 0.0)
+        d = torch.where(mask[..., None], measurement.displacement[i, :height, :width], 0.0)
         total = _sums(weight, edge)
-        both = _sums(weight.mean(-1, keepdim=True) * torch.cat([camera.pixel_grid(), torch.ones(height, width, 1)], -1), edge)
-        keep = (both[..., 2] > 0) & _inside(camera, measurement.box, edge, open_faces)
-        pixels = both[..., :2][keep] / both[..., 2:][keep]
+        mean = total.mean(-1, keepdim=True)
+        moment = _sums(weight.mean(-1, keepdim=True) * camera.pixel_grid(), edge)
+        keep = (mean[..., 0] > 0) & _inside(camera, measurement.box, edge, open_faces)
+        pixels = (moment / mean)[keep].to(camera.intrinsics.dtype)
         rays = camera.rays(pixels).clip(measurement.box)
         crosses = rays.crosses
         parts.append(rays[crosses].to(dtype=torch.float32))

@@ -29,8 +29,8 @@ def shuffled(first: int, length: int, count: int, seed: int) -> Int[Tensor, " n"
     """
     place = torch.arange(first, first + length)
     epochs = torch.div(place, count, rounding_mode="floor")
-    parts = [_permuted(place[epochs == e] % count, count, _hash(seed * MULTIPLIER + e)) for e in epochs.unique().tolist()]
-    return torch.cat(parts) if parts else place
+    keys = {epoch: _hash(seed * MULTIPLIER + epoch) for epoch in epochs.unique().tolist()}
+    return torch.cat([_permuted(place[epochs == epoch] % count, count, key) for epoch, key in keys.items()])
 
 
 def _permuted(x: Int[Tensor, " n"], count: int, key: int) -> Int[Tensor, " n"]:

@@ -278,8 +278,8 @@ class Training:
         if empty and (retries > RETRIES or self.budget.exhausted()):
             return Outcome(
                 "collapsed",
-                f"the field is empty: {why:.0%} of the measured displacement that noise leaves is not explained by it; "
-                "try a smaller --learning-rate, or look whether nerif check finds fault with the measurement",
+                f"no field was found: after {retries} attempt(s) {min(why, 9.99):.0%} of the squared displacement, noise "
+                "apart, is not explained; try a smaller --learning-rate, and nerif check on the measurement",
             )
         if retries > RETRIES:
             return Outcome(

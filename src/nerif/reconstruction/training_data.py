@@ -45,7 +45,8 @@ class TrainingData(ABC):
     """Mean square of the noise over that of what was measured; 0 where it is not known."""
 
     def refine(self, edge: int) -> None:
-        """Give bins of another edge, px, from now on; the data of which `coarsest` is 1 are pixels always."""
+        """Give bins of another edge, px, from now on."""
+        assert edge == 1, "these data are pixels always"
 
     @abstractmethod
     def __len__(self) -> int:
