@@ -20,8 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from flame import N_AMBIENT, machine
 
+from flame import N_AMBIENT, machine
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
@@ -66,10 +66,10 @@ def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> str:
     found = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
     assert result.state is not None
     edges = [bins.coarsest_edge(measurement)] + [int(r["bin_edge"]) for r in result.history if "bin_edge" in r]
+    last, steps = result.history[-1], " then ".join(map(str, edges))
     return (
-        f"| {measurement.displacement.shape[1]}² | {' then '.join(map(str, edges))} | {result.history[-1]['step']:.0f} | "
-        f"{result.history[-1]['epoch']:.2f} | {seconds:.0f} | {result.peak_memory_bytes / 2**30:.2f} | "
-        f"{found['l2']:.3%} | {found['l2_variation']:.2%} |"
+        f"| {measurement.displacement.shape[1]}² | {steps} | {last['step']:.0f} | {last['epoch']:.2f} | "
+        f"{seconds:.0f} | {result.peak_memory_bytes / 2**30:.2f} | {found['l2']:.3%} | {found['l2_variation']:.2%} |"
     )
 
 

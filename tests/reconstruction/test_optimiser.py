@@ -40,7 +40,8 @@ def test_muon_takes_the_matrices_and_turns_them_by_equal_amounts():
     net = network()
     optimiser = NetworkOptimiser("muon", net, (0.9, 0.99), 0.9)
     groups = optimiser.parts["muon"].param_groups
-    assert {p.shape for group in groups for p in group["params"]} == {(16, 15), (16, 16)}  # neither biases nor the single output
+    # neither biases nor the single output
+    assert {p.shape for group in groups for p in group["params"]} == {(16, 15), (16, 16)}
     before = net.layers[1].weight.detach().clone()
     take_steps(optimiser, net, 1)
     step = torch.linalg.svdvals(net.layers[1].weight.detach() - before) / (2e-2 * 0.2 * 128**0.5)

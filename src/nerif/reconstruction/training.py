@@ -127,7 +127,7 @@ class Training:
                 continue
             self._follow(values, means[-1])
             if self.watch.collapsed(outcome is not None):
-                outcome = self._take_back(empty=True)
+                outcome = self._take_back("the field was lost") or budget.exhausted()
                 continue
             speed = (budget.rays_done - rays_then) / max(time.perf_counter() - clock, 1e-9)
             if budget.step % LOG_EVERY == 0 or budget.step == 1 or outcome is not None:
@@ -256,8 +256,9 @@ class Training:
         """A running mean of the loss; squares are rooted so that ratios mean the same for both norms."""
         weights, squared = self.settings.weights, self.settings.norm == "squared"
         data = {name: getattr(weights, name) for name in ("automatic", "head", "numerical") if name in values}
-        q = sum(w * values[name] for name, w in data.items()) / sum(data.values()) / empty if empty else math.nan
-        self.watch.follow(q if squared else q * q, self.budget.step)
+        residual = sum(weight * values[name] for name, weight in data.items()) / sum(data.values())
+        power = 1 if squared else 2
+        self.watch.follow(residual**power, empty**power, self.budget.step)
         loss = math.sqrt(values["loss"]) if squared else values["loss"]
         if math.isnan(self.initial_loss):
             self.initial_loss = self.running = loss
@@ -267,24 +268,25 @@ class Training:
         """Whether the weights are: a finite loss can have a gradient that is not."""
         return all(bool(torch.isfinite(w).all()) for w in self.field.network.parameters())
 
-    def _take_back(self, empty: bool = False) -> Outcome | None:
-        """Return to the last good state, or from there to the first, with a third of the learning rate."""
-        retries, rate, seconds, why = self.retries + 1, self.rate / 3, self.budget.seconds, self.watch.left
-        self._restore(self.good if self.watch.found or not empty else self.first)
-        self.good = self.first
+    def _take_back(self, why: str = "loss turned non-finite") -> Outcome | None:
+        """Return to the last good state, or to the first if nothing was found since, with a third of the rate."""
+        retries, rate, seconds, left = self.retries + 1, self.rate / 3, self.budget.seconds, self.watch.left
+        empty = self.watch.collapsed(over=True) and not self.watch.found
+        self._restore(self.first if empty else self.good)
         self.budget.restore({**self.budget.used(), "seconds": seconds})
         self.retries, self.rate = retries, rate
         self._log({"taken_back": float(retries)})
         if empty and (retries > RETRIES or self.budget.exhausted()):
             return Outcome(
                 "collapsed",
-                f"no field was found: after {retries} attempt(s) {min(why, 9.99):.0%} of the squared displacement, noise "
-                "apart, is not explained; try a smaller --learning-rate, and nerif check on the measurement",
+                f"no field was found: after {retries} attempt(s) {min(left, 9.99):.0%} of the squared "
+                "displacement, noise apart, is not explained; try a smaller --learning-rate, and nerif check on the "
+                "measurement",
             )
         if retries > RETRIES:
             return Outcome(
                 "diverged",
-                f"loss turned non-finite {retries} times; kept the last good state of step {self.budget.step}; "
+                f"{why} {retries} times; kept the last good state of step {self.budget.step}; "
                 "try a smaller --learning-rate or --precision float32",
             )
         return None

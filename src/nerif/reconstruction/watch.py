@@ -1,13 +1,12 @@
 """Whether a training finds anything: its loss beside that of the empty field, index ambient everywhere.
 
-    q = |prediction - d|^2 / |d|^2        over a batch, each over sigma^2; 1 for the empty field
+    q = |prediction - d|^2 / |d|^2        over the last steps, each over sigma^2; 1 for the empty field
 
 A network that is stepped too far ends at the empty field, whose gradient is zero: q stays at 1.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 __all__ = ["Watch"]
@@ -19,7 +18,7 @@ MEMORY = 0.95  # of the running mean, a step
 
 
 class Watch:
-    """Running mean of q, and what it means.
+    """What is left of q when the noise is taken off, and what it means.
 
     Parameters
     ----------
@@ -28,37 +27,48 @@ class Watch:
 
     def __init__(self, noise: float) -> None:
         self.noise = noise
-        self.left, self.lowest, self.step, self.since = 1.0, 1.0, 0, 0
+        self.residual, self.empty = 0.0, 0.0  # running means
+        self.lowest, self.step, self.since = 1.0, 0, 0
 
-    def follow(self, q: float, step: int) -> None:
-        """Take in the q of a step; one without displacement, not a number, says nothing."""
-        if math.isfinite(q):
-            kept = MEMORY ** max(1, step - self.step)
-            left = max(0.0, (q - self.noise) / (1 - self.noise)) if self.noise < EMPTY else 0.0
-            self.left = kept * self.left + (1 - kept) * left
-            self.lowest = min(self.lowest, self.left)
-            self.since += max(1, step - self.step)
+    def follow(self, residual: float, empty: float, step: int) -> None:
+        """Take in the two means of a step; where nothing was measured there is nothing to explain."""
+        steps = max(1, step - self.step)
         self.step = step
+        if empty > 0:
+            kept = MEMORY**steps
+            self.residual = kept * self.residual + (1 - kept) * residual
+            self.empty = kept * self.empty + (1 - kept) * empty
+            self.since += steps
+            if self.since >= LEAST:
+                self.lowest = min(self.lowest, self.left)
+
+    @property
+    def left(self) -> float:
+        """What is not explained, and is not noise, as a share; 0 where there is nothing to explain."""
+        if not self.empty or self.noise >= EMPTY:
+            return 0.0
+        return max(0.0, (self.residual / self.empty - self.noise) / (1 - self.noise))
 
     @property
     def healthy(self) -> bool:
         """Whether what was found is still there."""
-        return self.left < self.lowest + LOSS
+        return self.since < LEAST or self.left < self.lowest + LOSS
 
     def collapsed(self, over: bool) -> bool:
-        """Whether nothing is found for long, or what was found is lost.
+        """Whether nothing is found for long, or most of what was found is lost.
 
         Parameters
         ----------
         over : whether the run is; then fewer steps must do
         """
-        long_enough = self.since >= (LEAST if over or self.found else PATIENCE)
-        return long_enough and self.left > EMPTY
+        if self.found:
+            return self.since >= LEAST and self.left > HALF
+        return self.since >= (LEAST if over else PATIENCE) and self.left > EMPTY
 
     @property
     def found(self) -> bool:
-        """Whether anything ever was."""
-        return self.lowest < HALF
+        """Whether a field ever was."""
+        return self.lowest < HALF / 2
 
     @property
     def remark(self) -> str:
@@ -69,7 +79,7 @@ class Watch:
 
     def kept(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""
-        return {name: getattr(self, name) for name in ("left", "lowest", "step", "since")}
+        return {name: getattr(self, name) for name in ("residual", "empty", "lowest", "step", "since")}
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Go on from what a checkpoint kept."""
