@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import multiprocessing
 import platform
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
 from nerif.atomic import atomic
 
-__all__ = ["Table", "add_write", "head", "machine"]
+__all__ = ["N_AMBIENT", "Table", "add_write", "alone", "machine"]
+
+N_AMBIENT = 1.00027
+
+T = TypeVar("T")
 
 
 def machine(device: str = "auto") -> str:
@@ -36,6 +43,12 @@ def head(more: str = "") -> list[str]:
         f"Date: {datetime.date.today().isoformat()}{more}",
         "",
     ]
+
+
+def alone(function: Callable[..., T], *values: object) -> T:
+    """Call a function in a process of its own, whose peak of memory is that of this call."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *values).result()
 
 
 def add_write(parser: argparse.ArgumentParser) -> None:

@@ -11,9 +11,6 @@ between the planes anywhere in the picture. `stated` is what nerif calibrate its
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -23,7 +20,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from flame import machine
+from bench import Table, add_write
 from nerif.experiment import Experiment, background_scale, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.calibration import CalibrationSettings, calibrate
@@ -33,10 +30,10 @@ COLUMNS = ("camera", "pictures", "rms [px]", "rotation [deg]", "stated", "transl
            "plane [mm]", "plane, rms [mm]")  # fmt: skip
 
 
-def rig(views: int, pixels: int, sensor: float, seed: int) -> tuple[Camera, ...]:
+def rig(views: int, arc: float, pixels: int, sensor: float, seed: int) -> tuple[Camera, ...]:
     """Cameras on a ring, none quite where it should be."""
     rng = np.random.default_rng(seed)
-    ring = Ring(views=views, pixel_pitch=sensor / pixels, image_size=(pixels * 4 // 5, pixels))
+    ring = Ring(views=views, arc=(0.0, arc), pixel_pitch=sensor / pixels, image_size=(pixels * 4 // 5, pixels))
 
     def turn(sigma: float) -> torch.Tensor:
         return torch.from_numpy(Rotation.from_rotvec(rng.normal(0, sigma, 3)).as_matrix())
@@ -75,16 +72,17 @@ def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--views", type=int, default=9)
+    parser.add_argument("--arc", type=float, default=170.0, help="from the first camera to the last, degrees")
     parser.add_argument("--pixels", type=int, default=640, help="width of the pictures")
     parser.add_argument("--sensor", type=float, default=20.0, help="width of the sensor, mm")
     parser.add_argument("--poses", type=int, default=40, help="target poses free in space")
     parser.add_argument("--backgrounds", type=int, default=5, help="pictures of the target on each background")
     parser.add_argument("--target", default="charuco")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
 
-    cameras = rig(arguments.views, arguments.pixels, arguments.sensor, arguments.seed)
+    cameras = rig(arguments.views, arguments.arc, arguments.pixels, arguments.sensor, arguments.seed)
     experiment = Experiment(
         target=arguments.target, columns=12, rows=9, poses=arguments.poses, backgrounds=arguments.backgrounds,
         references=1, seed=arguments.seed,
@@ -102,16 +100,13 @@ def main() -> None:
         start = time.perf_counter()
         result = calibrate(found, CalibrationSettings(world="0", axes=world_axes(cameras)))
         adjusted = time.perf_counter() - start
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}; {target.kind} of {target.columns} x {target.rows}, pitch "
-        f"{target.pitch:.1f} mm; rendered in {rendered:.0f} s, targets found in {detected:.0f} s, adjusted in "
-        f"{adjusted:.0f} s; rms {result.rms():.4f} px",
-        "",
-        "| " + " | ".join(COLUMNS) + " |",
-        "|" + "---|" * len(COLUMNS),
-    ]
+    table = Table(
+        "Calibration of a rendered rig",
+        COLUMNS,
+        arguments.write,
+        f"; {target.kind} of {target.columns} x {target.rows}, pitch {target.pitch:.1f} mm; rendered in "
+        f"{rendered:.0f} s, targets found in {detected:.0f} s, adjusted in {adjusted:.0f} s; rms {result.rms():.4f} px",
+    )
     worst = np.zeros(3)
     by_name = {c.name: c for c in cameras}
     for i, name in enumerate(result.names):
@@ -123,16 +118,10 @@ def main() -> None:
         off = between_planes(camera, np.array(plane.normal), plane.offset)
         worst = np.maximum(worst, (rotation, translation, np.abs(off).max()))
         used = sum(e.used for e in result.errors if e.camera == name)
-        lines.append(
-            f"| {name} | {used} | {result.rms(name):.4f} | {rotation:.4f} | {result.sigma_rotation[i]:.4f} | "
-            f"{translation:.3f} | {result.sigma_translation[i]:.3f} | {position:.3f} | {np.abs(off).max():.3f} | "
-            f"{np.sqrt((off**2).mean()):.3f} |"
-        )
-    lines += ["", f"Worst: rotation {worst[0]:.4f} deg, translation {worst[1]:.3f} mm, plane {worst[2]:.3f} mm."]
-    print("\n".join(lines), flush=True)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        arguments.write.write_text("# Calibration of a rendered rig\n\n" + "\n".join(lines) + "\n")
+        cells = [name, str(used), f"{result.rms(name):.4f}", f"{rotation:.4f}", f"{result.sigma_rotation[i]:.4f}"]
+        cells += [f"{translation:.3f}", f"{result.sigma_translation[i]:.3f}", f"{position:.3f}"]
+        table.row([*cells, f"{np.abs(off).max():.3f}", f"{np.sqrt((off**2).mean()):.3f}"])
+    table.text("", f"Worst: rotation {worst[0]:.4f} deg, translation {worst[1]:.3f} mm, plane {worst[2]:.3f} mm.")
 
 
 if __name__ == "__main__":

@@ -8,18 +8,14 @@ Ratios within one run are what counts: the machine may be shared.
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write
 from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame
@@ -29,8 +25,6 @@ from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import add_noise, simulate
 from nerif.volume import Volume
-
-POINTS = 8192
 
 
 def rate(work: Callable[[], None], points: int) -> float:
@@ -44,9 +38,9 @@ def rate(work: Callable[[], None], points: int) -> float:
     return points / statistics.median(seconds) / 1e3
 
 
-def steps(network: Network) -> dict[str, Callable[[], None]]:
-    """A training step's arithmetic: gradient at POINTS points, and its derivative in the weights."""
-    p = torch.rand(POINTS, 3) * 2 - 1
+def steps(network: Network, count: int) -> dict[str, Callable[[], None]]:
+    """A training step's arithmetic: gradient at so many points, and its derivative in the weights."""
+    p = torch.rand(count, 3) * 2 - 1
 
     def exact(bf16: bool) -> None:
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bf16):
@@ -68,42 +62,46 @@ def steps(network: Network) -> dict[str, Callable[[], None]]:
     }
 
 
-def sampling_rates(network: Network) -> dict[str, float]:
-    """Evaluation on a grid by size of chunk."""
+def sampling_rates(network: Network, count: int) -> dict[str, float]:
+    """Evaluation in chunks of so many points, and of eight times as many."""
     field = NeuralField(network, Box.cube(50.0), 1e-4)
-    points = torch.rand(1 << 17, 3) * 50 - 25
+    points = torch.rand(16 * count, 3) * 50 - 25
 
     def run(chunk: int) -> None:
         with torch.no_grad():
             for part in points.split(chunk):
                 field(part)
 
-    return {f"values, chunks of {c}": rate(lambda c=c: run(c), len(points)) for c in (8192, 65536)}  # type: ignore[misc]
+    return {f"values, chunks of {c}": rate(lambda c=c: run(c), len(points)) for c in (count, 8 * count)}  # type: ignore[misc]
+
+
+def speeds(network: Network, count: int) -> dict[str, float]:
+    """Thousand points a second of all that is timed, by name."""
+    return {name: rate(work, count) for name, work in steps(network, count).items()} | sampling_rates(network, count)
 
 
 def main() -> None:
     """Run and print both tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--points", type=int, default=8192, help="of a step, for its speed")
+    parser.add_argument("--pixels", type=int, default=64, help="of an edge of each view")
     parser.add_argument("--time-limit", type=float, default=45.0, help="seconds of training of each variant")
-    parser.add_argument("--write", type=Path)
+    add_write(parser)
     arguments = parser.parse_args()
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}",
-        "",
-        f"Network of 4 layers of 128, {POINTS} points a step, median of 7; thousand points a second.",
-        "",
-        "| | malloc as it is | freed memory kept | ratio |",
-        "|---|---|---|---|",
-    ]
+    table = Table(
+        "Choices behind the fast preset",
+        ("", "malloc as it is", "freed memory kept", "ratio"),
+        arguments.write,
+        f"\n\nNetwork of 4 layers of 128, {arguments.points} points a step, median of 7; thousand points a second.",
+    )
     network = Network(NetworkShape())
-    before = {k: rate(w, POINTS) for k, w in steps(network).items()} | sampling_rates(network)
+    before = speeds(network, arguments.points)
     keep_freed_memory()
-    after = {k: rate(w, POINTS) for k, w in steps(network).items()} | sampling_rates(network)
-    lines += [f"| {k} | {before[k]:.0f} | {after[k]:.0f} | {after[k] / before[k]:.2f} |" for k in before]
+    after = speeds(network, arguments.points)
+    for k in before:
+        table.row([k, f"{before[k]:.0f}", f"{after[k]:.0f}", f"{after[k] / before[k]:.2f}"])
 
-    cameras, box = paper_rig(64)
+    cameras, box = paper_rig(arguments.pixels)
     flame = Flame(box)
     grid = Grid.of_resolution(box, 64)
     truth = Volume(flame.sample(grid), grid)
@@ -121,23 +119,18 @@ def main() -> None:
         "central differences alone": replace(base, weights=LossWeights(numerical=1, automatic=0)),
         "mean length of residuals (the paper's norm)": replace(base, norm="l2"),
     }
-    lines += [
+    table.text(
         "",
-        f"Flame, 9 views of 64 x 64, noise 0.05, {arguments.time_limit:g} s of training each:",
+        f"Flame, 9 views of {arguments.pixels} x {arguments.pixels}, noise 0.05, "
+        f"{arguments.time_limit:g} s of training each:",
         "",
-        "| | steps | L2 | L2 of variation | CC |",
-        "|---|---|---|---|---|",
-    ]
-    print("\n".join(lines), flush=True)
+    )
+    table.begin(("", "steps", "L2", "L2 of variation", "CC"))
     for name, settings in variants.items():
         result = settings(measurement)
         m = evaluate_volume(result.field, truth, N_AMBIENT)
         steps_done = result.history[-1]["step"]
-        lines.append(f"| {name} | {steps_done:.0f} | {m['l2']:.3%} | {m['l2_variation']:.2%} | {m['cc']:.5f} |")
-        print(lines[-1], flush=True)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        arguments.write.write_text("# Choices behind the fast preset\n\n" + "\n".join(lines) + "\n")
+        table.row([name, f"{steps_done:.0f}", f"{m['l2']:.3%}", f"{m['l2_variation']:.2%}", f"{m['cc']:.5f}"])
 
 
 if __name__ == "__main__":

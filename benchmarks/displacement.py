@@ -9,17 +9,13 @@ The truth is the displacement of the pinhole camera by curved rays; errors are t
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
-import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write
 from nerif.conventions import Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
@@ -74,18 +70,15 @@ def main() -> None:
     parser.add_argument("--background", nargs="+", default=list(KINDS))
     parser.add_argument("--method", nargs="+", default=list(FLOWS))
     parser.add_argument("--dot", type=float, default=3.0, help="size of a dot, px")
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
 
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}",
-        "",
-        "| " + " | ".join(COLUMNS) + " |",
-        "|" + "---|" * len(COLUMNS),
-    ]
-    print("\n".join(lines), flush=True)
+    table = Table(
+        "Displacement by every method",
+        COLUMNS,
+        arguments.write,
+        f"\n\nRendered pairs, displacements up to {LARGEST:g} px, 12-bit noise.",
+    )
     inner = slice(EDGE, -EDGE)
     for pixels in arguments.pixels:
         for phantom in arguments.phantom:
@@ -100,16 +93,9 @@ def main() -> None:
                     error = (found.displacement - truth)[inner, inner]
                     length = np.hypot(error[..., 0], error[..., 1])
                     ratio = np.sqrt(np.mean((error / found.sigma[inner, inner]) ** 2))
-                    lines.append(
-                        f"| {pixels}² | {phantom} | {kind} | {method} | {np.median(length):.4f} | "
-                        f"{np.sqrt(np.mean(length**2)):.4f} | {ratio:.1f} | {found.valid[inner, inner].mean():.1%} | "
-                        f"{seconds:.2f} |"
-                    )
-                    print(lines[-1], flush=True)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        title = "# Displacement by every method\n\nRendered pairs, displacements up to 3 px, 12-bit noise.\n\n"
-        arguments.write.write_text(title + "\n".join(lines) + "\n")
+                    cells = [f"{pixels}²", phantom, kind, method, f"{np.median(length):.4f}"]
+                    cells += [f"{np.sqrt(np.mean(length**2)):.4f}", f"{ratio:.1f}"]
+                    table.row([*cells, f"{found.valid[inner, inner].mean():.1%}", f"{seconds:.2f}"])
 
 
 if __name__ == "__main__":

@@ -11,15 +11,12 @@ the ensemble knew all of would give 95 %.
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
-import sys
 import time
-from pathlib import Path
+from dataclasses import replace
 
 import torch
 
-from flame import machine
+from bench import N_AMBIENT, Table, add_write
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.measurement import Measurement
@@ -33,13 +30,11 @@ from nerif.volume import Volume
 
 BOX = Box.cube(50.0)
 GRID = Grid.of_resolution(BOX, 64)
-N_AMBIENT = 1.00027
+COLUMNS = ("L2", "L2 of mean", "std / error", "mean, all", "mean, flow", "reconstruction, all", "reconstruction, flow")
 
 
 def methods(steps: int) -> dict[str, Reconstructor]:
     """What is measured: the default preset cut to a number of steps, and total variation."""
-    from dataclasses import replace
-
     return {
         "NeRIF": replace(preset("fast"), max_steps=steps, epochs=1e9),
         "TV": TotalVariation(voxels=40),
@@ -84,12 +79,12 @@ def main() -> None:
     parser.add_argument("--noise", nargs="+", type=float, default=[0.05, 0.15])
     parser.add_argument("--methods", nargs="+", default=["NeRIF"], help="NeRIF, TV")
     parser.add_argument("--leave-one-out", nargs="+", choices=["no", "yes"], default=["no", "yes"])
-    parser.add_argument("--write", type=Path)
+    add_write(parser)
     arguments = parser.parse_args()
     keep_freed_memory()
     cameras = Ring(image_size=(64, 64), pixel_pitch=0.02 * 200 / 64).cameras()
-    columns: list[str] = []
-    rows = []
+    head = ("phantom", "noise", "method", "one view left out", *COLUMNS, "seconds")
+    table = Table("Ensemble: is the truth within two standard deviations?", head, arguments.write)
     for phantom in arguments.phantoms:
         field = make_phantom(phantom, BOX, 0, 0.0)
         truth = Volume(field.sample(GRID), GRID).values
@@ -101,20 +96,9 @@ def main() -> None:
                 for leave in (choice == "yes" for choice in arguments.leave_one_out):
                     started = time.perf_counter()
                     found = measure(method, measurement, truth, arguments.members, leave)
-                    columns = list(found)
-                    cells = [f"{found[c]:.2f}" if c == "std / error" else f"{found[c]:.2%}" for c in columns]
+                    cells = [f"{found[c]:.2f}" if c == "std / error" else f"{found[c]:.2%}" for c in COLUMNS]
                     seconds = f"{time.perf_counter() - started:.0f}"
-                    rows.append([phantom, f"{noise:g}", name, "yes" if leave else "no", *cells, seconds])
-                    print("  ".join(rows[-1]), flush=True)
-    head = ["phantom", "noise", "method", "one view left out", *columns, "seconds"]
-    lines = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows)]
-    command = f"python benchmarks/{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}"
-    text = "# Ensemble: is the truth within two standard deviations?\n\n"
-    text += f"Command: `{command}`  \nMachine: {machine()}  \nDate: {datetime.date.today()}\n\n"
-    text += "\n".join(lines) + "\n"
-    print(text)
-    if arguments.write:
-        arguments.write.write_text(text)
+                    table.row([phantom, f"{noise:g}", name, "yes" if leave else "no", *cells, seconds])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The paper's numerical study in small: flame (or any phantom) on the paper's rig at noise 0, 0.1 and 0.15.
 
-    python benchmarks/flame.py --device cuda --preset best fast --time-limit 8 30 --write results/flame-gpu.md
+    python benchmarks/flame.py --preset fast --time-limit 150 --write benchmarks/results/flame-cpu.md
 
 Needs nerif's core only (torch, NumPy, jaxtyping) and scikit-image. Truth and reconstruction meet only in the metrics.
 """
@@ -8,17 +8,14 @@ Needs nerif's core only (torch, NumPy, jaxtyping) and scikit-image. Truth and re
 from __future__ import annotations
 
 import argparse
-import datetime
 import itertools
-import platform
-import shlex
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
+from bench import N_AMBIENT, Table, add_write
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
@@ -28,16 +25,9 @@ from nerif.reconstruction.presets import PRESETS, preset
 from nerif.simulation import add_noise, simulate
 from nerif.volume import Volume
 
-N_AMBIENT = 1.00027
-
-
-def machine() -> str:
-    """One line on what this ran on."""
-    if torch.cuda.is_available():
-        return f"{torch.cuda.get_device_name()}, torch {torch.__version__}"
-    return f"{platform.machine()}, {torch.get_num_threads()} threads, {torch.backends.cpu.get_cpu_capability()}, " + (
-        f"torch {torch.__version__}"
-    )
+COLUMNS = (
+    "preset", "noise", "L2", "L2 of variation", "CC", "SSIM", "steps", "epochs", "seconds", "memory [GiB]", "outcome",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -51,7 +41,7 @@ def main() -> None:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--time-limit", type=float, nargs="+", default=[60.0], help="seconds of training")
     parser.add_argument("--voxels", type=int, default=100, help="of the truth the error is taken on")
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
 
     keep_freed_memory()
@@ -61,15 +51,12 @@ def main() -> None:
     truth = Volume(phantom.sample(grid), grid)
     start = time.perf_counter()
     clean = simulate(phantom, cameras, box, N_AMBIENT)
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}; simulated in {time.perf_counter() - start:.0f} s",
-        "",
-        "| preset | noise | L2 | L2 of variation | CC | SSIM | steps | epochs | seconds | memory [GiB] | outcome |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    print("\n".join(lines), flush=True)
+    table = Table(
+        f"{arguments.phantom} on the paper's rig",
+        COLUMNS,
+        arguments.write,
+        f"; simulated in {time.perf_counter() - start:.0f} s",
+    )
 
     def tell(step: Step) -> None:
         if step.step % 500 == 0:
@@ -85,15 +72,9 @@ def main() -> None:
         result = settings(measurement, tell)
         m = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
         last = result.history[-1]
-        lines.append(
-            f"| {name} | {noise:g} | {m['l2']:.3%} | {m['l2_variation']:.2%} | {m['cc']:.5f} | {m['ssim']:.4f} | "
-            f"{last['step']:.0f} | {last['epoch']:.1f} | {result.seconds:.0f} | "
-            f"{result.peak_memory_bytes / 2**30:.2f} | {result.outcome.reason} |"
-        )
-        print(lines[-1], flush=True)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        arguments.write.write_text(f"# {arguments.phantom} on the paper's rig\n\n" + "\n".join(lines) + "\n")
+        cells = [name, f"{noise:g}", f"{m['l2']:.3%}", f"{m['l2_variation']:.2%}", f"{m['cc']:.5f}", f"{m['ssim']:.4f}"]
+        cells += [f"{last['step']:.0f}", f"{last['epoch']:.1f}", f"{result.seconds:.0f}"]
+        table.row([*cells, f"{result.peak_memory_bytes / 2**30:.2f}", result.outcome.reason])
 
 
 if __name__ == "__main__":

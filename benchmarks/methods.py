@@ -8,18 +8,14 @@ Every row is a process of its own, so that the memory is that row's. Truth and r
 from __future__ import annotations
 
 import argparse
-import datetime
-import multiprocessing
-import shlex
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Literal
 
 import torch
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write, alone
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
@@ -40,7 +36,9 @@ COLUMNS = (
 )  # fmt: skip
 
 
-METHODS: tuple[tuple[str, VoxelReconstructor, str], ...] = (
+Basis = Literal["linear", "cubic"]
+
+METHODS: tuple[tuple[str, VoxelReconstructor, Basis], ...] = (
     ("Tikhonov", Tikhonov(), "linear"),
     ("Landweber", Landweber(), "linear"),
     ("TV", TotalVariation(), "cubic"),
@@ -68,25 +66,25 @@ def rows(arguments: argparse.Namespace) -> list[Row]:
         for noise in arguments.noise:
             found.append(Row(phantom, noise, f"NeRIF {arguments.preset}", "-", nerif))
             for name, method, fine_basis in METHODS:
-                for voxels, basis in ((40, "linear"), (arguments.voxels, fine_basis)):
+                grids: tuple[tuple[int, Basis], ...] = ((40, "linear"), (arguments.voxels, fine_basis))
+                for voxels, basis in grids:
                     settings = replace(method, voxels=voxels, basis=basis, device=device)
                     found.append(Row(phantom, noise, name, f"{voxels}³ {basis}", settings))
     return found
 
 
-def run(row: Row, clean: Measurement, threads: int) -> str:
-    """Reconstruct one case and return its line."""
+def run(row: Row, clean: Measurement, threads: int) -> list[str]:
+    """Reconstruct one case and return its row."""
     torch.set_num_threads(threads)
     keep_freed_memory()
     grid = Grid.of_resolution(clean.box, 100)
     truth = Volume(make_phantom(row.phantom, clean.box, 0).sample(grid), grid)
     result = row.method(add_noise(clean, row.noise, seed=1))
     m = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
-    return (
-        f"| {row.phantom} | {row.noise:g} | {row.name} | {row.grid} | {m['l2']:.2%} | {m['l2_variation']:.2%} | "
-        f"{m['cc']:.5f} | {m['ssim']:.4f} | {result.seconds:.0f} | {result.peak_memory_bytes / 2**30:.2f} | "
-        f"{result.history[-1]['step']:.0f} | {result.outcome.reason} |"
-    )
+    cells = [row.phantom, f"{row.noise:g}", row.name, row.grid, f"{m['l2']:.2%}", f"{m['l2_variation']:.2%}"]
+    cells += [f"{m['cc']:.5f}", f"{m['ssim']:.4f}", f"{result.seconds:.0f}"]
+    cells += [f"{result.peak_memory_bytes / 2**30:.2f}", f"{result.history[-1]['step']:.0f}"]
+    return [*cells, result.outcome.reason]
 
 
 def main() -> None:
@@ -100,34 +98,19 @@ def main() -> None:
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds for NeRIF")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--only", nargs="+", default=[], help="methods by name, e.g. TV Tikhonov")
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
 
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}",
-        "",
-        "| " + " | ".join(COLUMNS) + " |",
-        "|" + "---|" * len(COLUMNS),
-    ]
-    print("\n".join(lines), flush=True)
+    table = Table("Methods compared on the paper's rig", COLUMNS, arguments.write)
     threads = torch.get_num_threads()
-    spawn = multiprocessing.get_context("spawn")
     cameras, box = paper_rig(arguments.pixels)
     clean = {p: simulate(make_phantom(p, box, 0), cameras, box, N_AMBIENT) for p in arguments.phantom}
     for row in rows(arguments):
         if arguments.only and row.name.split()[0] not in arguments.only:
             continue
         start = time.perf_counter()
-        with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-            line = pool.submit(run, row, clean[row.phantom], threads).result()
-        lines.append(line)
-        print(line, file=sys.stdout, flush=True)
+        table.row(alone(run, row, clean[row.phantom], threads))
         print(f"  {time.perf_counter() - start:.0f} s in all", file=sys.stderr, flush=True)
-        if arguments.write:
-            arguments.write.parent.mkdir(parents=True, exist_ok=True)
-            arguments.write.write_text("# Methods compared on the paper's rig\n\n" + "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

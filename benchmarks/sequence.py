@@ -1,7 +1,7 @@
 """Frame by frame from nothing, frame by frame from the one before, and one network over space and time: error, seconds.
 
-    python benchmarks/sequence.py --write results/sequence-cpu.md
-    python benchmarks/sequence.py --device cuda --preset best --pixels 200 --write results/sequence-gpu.md
+    python benchmarks/sequence.py --write benchmarks/results/sequence-cpu.md
+    python benchmarks/sequence.py --device cuda --preset best --pixels 200 --write benchmarks/results/sequence-gpu.md
 
 A flame filmed from 9 and from 4 views. Seconds are those of a whole frame: training, sampling the volume, comparing
 with the views, writing. Errors and seconds are means over the last frames; warm starts reach them from a first frame
@@ -16,18 +16,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
 import itertools
-import platform
-import shlex
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
+from bench import N_AMBIENT, Table, add_write
 from nerif.commands.simulate import Simulate, instants
 from nerif.commands.simulate import run as simulate
 from nerif.geometry import Ring
@@ -43,14 +39,10 @@ from nerif.sequence.store import DONE, Frame, SequenceStore
 from nerif.simulation import Simulation
 from nerif.volume_sequence import VolumeSequence
 
-
-def machine() -> str:
-    """One line on what this ran on."""
-    if torch.cuda.is_available():
-        return f"{torch.cuda.get_device_name()}, torch {torch.__version__}"
-    return f"{platform.machine()}, {torch.get_num_threads()} threads, {torch.backends.cpu.get_cpu_capability()}, " + (
-        f"torch {torch.__version__}"
-    )
+COLUMNS = (
+    "views", "s between frames", "change", "how", "steps a frame", "seconds a frame", "L2", "L2 of variation", "CC",
+    "faster",
+)  # fmt: skip
 
 
 def film(folder: Path, views: int, frames: int, pixels: int, interval: float, noise: float, voxels: int) -> Path:
@@ -95,12 +87,13 @@ def run(
     assert all(store.status[i] == DONE for i in last), store.reasons
     errors = [
         volume_errors(
-            truth.volume(i, "index_excess").values.numpy(), store.volume(i, "index_excess").values.numpy(), 1.00027
+            truth.volume(i, "index_excess").values.numpy(), store.volume(i, "index_excess").values.numpy(), N_AMBIENT
         )
         for i in last
     ]
     seconds = float(np.mean([store.array("seconds")[i] for i in last]))
-    return (seconds, *(float(np.mean([e[k] for e in errors])) for k in ("l2", "l2_variation", "cc")))
+    l2, variation, cc = (float(np.mean([e[k] for e in errors])) for k in ("l2", "l2_variation", "cc"))
+    return seconds, l2, variation, cc
 
 
 def first_frame(film: Path, out: Path, cold: NeRIF, voxels: int) -> SequenceStore:
@@ -117,7 +110,7 @@ def change(film: Path) -> float:
     """How far each frame is from the next, in the truth: relative to its variation."""
     truth = VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
     frames = [truth.volume(i, "index_excess").values.numpy() for i in range(len(truth))]
-    return float(np.mean([volume_errors(b, a, 1.00027)["l2_variation"] for a, b in itertools.pairwise(frames)]))
+    return float(np.mean([volume_errors(b, a, N_AMBIENT)["l2_variation"] for a, b in itertools.pairwise(frames)]))
 
 
 def faster(seconds: float, error: float, cold: list[tuple[float, float]]) -> str:
@@ -149,19 +142,10 @@ def main() -> None:
     parser.add_argument("--warm-rate", type=float, nargs="*", default=[0.7])
     parser.add_argument("--joint", type=int, nargs="*", default=[120, 240], help="steps a frame of a joint network")
     parser.add_argument("--time-octaves", type=int, nargs="*", default=[3])
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
     keep_freed_memory()
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}",
-        "",
-        "| views | s between frames | change | how | steps a frame | seconds a frame | L2 | L2 of variation | CC | "
-        "faster |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    print("\n".join(lines), flush=True)
+    table = Table("A film of a flame", COLUMNS, arguments.write)
     base = replace(preset(arguments.preset), device=arguments.device, epochs=1e6)
     best = max([*arguments.cold, 1])
     kinds: list[tuple[str, int, NeRIF, dict[str, float]]] = []
@@ -182,7 +166,7 @@ def main() -> None:
             first = first_frame(
                 path, Path(folder) / "first.zarr", replace(base, max_steps=best), arguments.voxels
             ) if arguments.warm else None  # fmt: skip
-            about, from_nothing = f"| {views} | {interval:g} | {change(path):.0%}", []
+            about, from_nothing = [str(views), f"{interval:g}", f"{change(path):.0%}"], []
             for name, steps, cold, changes in kinds:
                 seconds, l2, variation, cc = run(
                     path, Path(folder) / "out.zarr", cold, arguments.voxels, arguments.compared,
@@ -191,13 +175,8 @@ def main() -> None:
                 if not changes:
                     from_nothing.append((seconds, l2))
                 gain = faster(seconds, l2, from_nothing) if changes else "1"
-                lines.append(
-                    f"{about} | {name} | {steps} | {seconds:.2f} | {l2:.3%} | {variation:.2%} | {cc:.5f} | {gain} |"
-                )
-                print(lines[-1], file=sys.stderr, flush=True)
-    print("\n".join(lines[6:]))
-    if arguments.write:
-        arguments.write.write_text("# A film of a flame\n\n" + "\n".join(lines) + "\n")
+                cells = [*about, name, str(steps), f"{seconds:.2f}", f"{l2:.3%}", f"{variation:.2%}"]
+                table.row([*cells, f"{cc:.5f}", gain])
 
 
 if __name__ == "__main__":

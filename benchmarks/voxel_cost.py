@@ -10,17 +10,12 @@ PyTorch (kernels_torch.py), what CUDA runs, timed here on one iteration.
 from __future__ import annotations
 
 import argparse
-import datetime
-import multiprocessing
-import shlex
-import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
+from typing import Literal
 
 import torch
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write, alone
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.measurement import Measurement
@@ -35,15 +30,24 @@ COLUMNS = (
     "memory above base [GiB]", "memory [GiB]", "estimate [GiB]",
 )  # fmt: skip
 
+Basis = Literal["linear", "cubic"]
 
-def run(measurement: Measurement, voxels: int, basis: str, iterations: int, device: str, threads: int) -> str:
-    """Measure one grid and return its line; 0 voxels measure the base."""
+
+def memory_of_data(measurement: Measurement, device: str) -> int:
+    """Peak memory (bytes) of a process that has the rays and does nothing with them."""
+    keep_freed_memory()
+    measurement.rays()
+    return peak_memory(resolve_device(device))
+
+
+def run(
+    measurement: Measurement, voxels: int, basis: Basis, iterations: int, device: str, threads: int, base: int
+) -> list[str]:
+    """Measure one grid and return the row without grid and basis."""
     torch.set_num_threads(threads)
     keep_freed_memory()
     where = resolve_device(device)
     rays, displacement, _ = measurement.rays()
-    if not voxels:
-        return str(peak_memory(where))
     settings = Tikhonov(
         voxels=voxels, basis=basis, iterations=iterations, tolerance=0, regularisation=1e-3,
         coarse_to_fine=False, device=device,
@@ -63,14 +67,12 @@ def run(measurement: Measurement, voxels: int, basis: str, iterations: int, devi
         times.append(time.perf_counter() - start)
     samples = int(operator._rays[-1].sum())
     estimate = settings.memory_bytes(measurement, grid) / 2**30
-    return (
-        f"{samples / 1e6:.1f} | {iterations} | {result.seconds:.1f} | "
-        f"{result.seconds / iterations / samples * 1e9:.1f} | "
-        f"{min(times) * iterations / result.seconds:.0%} | {{above}} | {memory} | {estimate:.2f} |"
-    )
+    cells = [f"{samples / 1e6:.1f}", str(iterations), f"{result.seconds:.1f}"]
+    cells += [f"{result.seconds / iterations / samples * 1e9:.1f}", f"{min(times) * iterations / result.seconds:.0%}"]
+    return [*cells, f"{(memory - base) / 2**30:.2f}", f"{memory / 2**30:.2f}", f"{estimate:.2f}"]
 
 
-def plain(measurement: Measurement, voxels: int, basis: str, threads: int) -> tuple[float, float]:
+def plain(measurement: Measurement, voxels: int, basis: Basis, threads: int) -> tuple[float, float]:
     """Seconds of one application and its adjoint by the compiled and the plain kernels on the CPU."""
     torch.set_num_threads(threads)
     keep_freed_memory()
@@ -97,44 +99,27 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=50)
     parser.add_argument("--pixels", type=int, default=200)
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
 
     threads = torch.get_num_threads()
-    spawn = multiprocessing.get_context("spawn")
-
-    def alone(function, *values):  # type: ignore[no-untyped-def]
-        with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-            return pool.submit(function, *values).result()
-
     cameras, box = paper_rig(arguments.pixels)
     measurement = simulate(make_phantom("flame", box, 0), cameras, box, N_AMBIENT, steps=40)
-    base = int(alone(run, measurement, 0, "linear", 0, arguments.device, threads))
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}; {len(measurement.rays()[0])} rays; base {base / 2**30:.2f} GiB",
-        "",
-        "| " + " | ".join(COLUMNS) + " |",
-        "|" + "---|" * len(COLUMNS),
-    ]
-    print("\n".join(lines), flush=True)
+    base = alone(memory_of_data, measurement, arguments.device)
+    table = Table(
+        "What the voxel operator costs",
+        COLUMNS,
+        arguments.write,
+        f"; {len(measurement.rays()[0])} rays; base {base / 2**30:.2f} GiB",
+    )
     for basis in arguments.basis:
         for voxels in arguments.voxels:
-            line = alone(run, measurement, voxels, basis, arguments.iterations, arguments.device, threads)
-            memory = int(line.split(" | ")[-2])
-            line = line.replace(f"| {memory} |", f"| {memory / 2**30:.2f} |")
-            line = line.format(above=f"{(memory - base) / 2**30:.2f}")
-            lines.append(f"| {voxels}³ | {basis} | {line}")
-            print(lines[-1], flush=True)
+            values = (measurement, voxels, basis, arguments.iterations, arguments.device, threads)
+            table.row([f"{voxels}³", basis, *alone(run, *values, base)])
     if not torch.cuda.is_available():
         for basis in arguments.basis:
             fast, slow = alone(plain, measurement, 64, basis, threads)
-            lines += ["", f"64³ {basis}, A and A^T once: compiled {fast:.2f} s, plain PyTorch {slow:.2f} s."]
-            print(lines[-1], flush=True)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        arguments.write.write_text("# What the voxel operator costs\n\n" + "\n".join(lines) + "\n")
+            table.text("", f"64³ {basis}, A and A^T once: compiled {fast:.2f} s, plain PyTorch {slow:.2f} s.")
 
 
 if __name__ == "__main__":

@@ -9,13 +9,9 @@ are looked at from outside and never reach the training.
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
-import sys
 from dataclasses import replace
-from pathlib import Path
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
@@ -26,6 +22,10 @@ from nerif.reconstruction.presets import preset
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.simulation import add_noise, simulate
 from nerif.volume import Volume
+
+COLUMNS = (
+    "start", "fit steps", "rate after it", "seconds of the start", "seconds in all", "L2", "L2 of variation", "CC",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--fit-steps", type=int, nargs="+", default=[400])
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
 
     keep_freed_memory()
@@ -48,24 +48,17 @@ def main() -> None:
     measurement = add_noise(simulate(flame, cameras, box, N_AMBIENT), arguments.noise, seed=1)
     grid = Grid.of_resolution(box, 80)
     truth = Volume(flame.sample(grid), grid)
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}; flame, {arguments.pixels} x {arguments.pixels} px, "
-        f"noise {arguments.noise:g}",
-        "",
-        "| start | fit steps | rate after it | seconds of the start | seconds in all | L2 | L2 of variation | CC |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    print("\n".join(lines), flush=True)
+    table = Table(
+        "Starting NeRIF from a classical volume",
+        COLUMNS,
+        arguments.write,
+        f"; flame, {arguments.pixels} x {arguments.pixels} px, noise {arguments.noise:g}",
+    )
 
     def add(name: str, fit: str, rate: str, before: float, seconds: float, field: Field, device: str) -> None:
         m = evaluate_volume(field, truth, N_AMBIENT, device)
-        lines.append(
-            f"| {name} | {fit} | {rate} | {before:.0f} | {seconds:.0f} | {m['l2']:.3%} | {m['l2_variation']:.2%} | "
-            f"{m['cc']:.5f} |"
-        )
-        print(lines[-1], flush=True)
+        cells = [name, fit, rate, f"{before:.0f}", f"{seconds:.0f}", f"{m['l2']:.3%}", f"{m['l2_variation']:.2%}"]
+        table.row([*cells, f"{m['cc']:.5f}"])
 
     tv = TotalVariation(voxels=arguments.voxels, basis="linear", device=arguments.device)
     tv(Measurement(**vars(measurement)))  # compiles what is compiled once
@@ -82,9 +75,6 @@ def main() -> None:
                 settings = replace(base, time_limit=seconds - start.seconds, fit_steps=fit, rate_after_fit=rate)
                 warm = settings(measurement, start=start.field)
                 add(f"TV {arguments.voxels}³", f"{fit}", f"{rate:g}", start.seconds, seconds, warm.field, warm.device)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        arguments.write.write_text("# Starting NeRIF from a classical volume\n\n" + "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 LAYERS = (
     ("atomic", "conventions", "netcdf"),
     ("geometry",),
-    ("measurement_file", "measurement", "measurement_sequence", "volume", "volume_sequence", "vti", "exports", "reprojection"),
+    ("measurement_file", "measurement", "measurement_sequence"),
+    ("volume", "volume_sequence", "vti", "exports", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),

@@ -44,6 +44,38 @@ def test_round_trip(volumes, tmp_path, ending):
     assert not list(tmp_path.glob("*.part"))
 
 
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended", "raw"])
+@pytest.mark.parametrize("compressor", ["None", "ZLib"])
+def test_images_as_vtk_writes_them(tmp_path, mode, compressor):
+    """Every way that VTK has of writing an image, with its corner not at index 0."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+    image = vtkImageData()
+    image.SetExtent(2, 5, 0, 2, 1, 5)
+    image.SetSpacing(1.0, 2.0, 0.5)
+    image.SetOrigin(-3.0, 1.0, 0.25)
+    array = numpy_to_vtk(VALUES.double().numpy().ravel(), deep=True)
+    array.SetName("index_excess")
+    image.GetPointData().AddArray(array)
+    writer = vtkXMLImageDataWriter()
+    writer.SetFileName(str(tmp_path / "i.vti"))
+    writer.SetInputData(image)
+    getattr(writer, f"SetDataModeTo{mode.replace('raw', 'Appended')}")()
+    writer.SetEncodeAppendedData(mode != "raw")
+    getattr(writer, f"SetCompressorTypeTo{compressor}")()
+    writer.Write()
+    volume = read_volume(tmp_path / "i.vti")
+    assert torch.allclose(volume.values, VALUES, rtol=1e-6)
+    assert volume.grid.box.lower == pytest.approx((-1.5, 0.0, 0.5))
+    assert volume.grid.box.upper == pytest.approx((2.5, 6.0, 3.0))
+    image.SetDirectionMatrix(0, 1, 0, 1, 0, 0, 0, 0, 1)
+    writer.Write()
+    with pytest.raises(InputError, match="along the axes"):
+        read_volume(tmp_path / "i.vti")
+
+
 def test_csv(volumes, tmp_path):
     export(tmp_path / "v.csv", volumes)
     with (tmp_path / "v.csv").open() as file:

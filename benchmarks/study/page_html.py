@@ -7,41 +7,38 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from markdown_it import MarkdownIt
+
+from nerif.report.html import ASSETS
+
 __all__ = ["render"]
 
 STYLE = """
-:root { --ink: #16202b; --soft: #46535f; --line: #d5dbe1; --ground: #f5f7f9; --accent: #0b5a9c; }
-* { box-sizing: border-box; }
-html { font: 17px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif;
-  color: var(--ink); background: #fff; color-scheme: light; -webkit-text-size-adjust: 100%; }
-body { margin: 0 auto; max-width: 1240px; padding: 18px 24px 60px; }
-h1 { font-size: 1.75rem; line-height: 1.2; margin: .2em 0 .5em; }
-h2 { font-size: 1.3rem; margin: 2.4em 0 .5em; padding-top: .5em; border-top: 2px solid var(--line); }
-h3 { font-size: 1.04rem; margin: 1.6em 0 .4em; }
+body { max-width: 1240px; padding-top: 18px; }
+h1 { margin: .2em 0 .5em; } h2 { margin: 2.4em 0 .5em; padding-top: .5em; border-top: 2px solid var(--line); }
 p, li { max-width: 62em; } a { color: var(--accent); }
 nav { background: var(--ground); border: 1px solid var(--line); border-radius: 8px; padding: 10px 16px;
   margin: 1.2em 0; }
 nav b { font-size: .9rem; } nav ul { margin: .3em 0; padding-left: 1.2em; columns: 3 17em; column-gap: 2.2em;
   font-size: .92rem; }
-.wide { overflow-x: auto; margin: .8em 0 1.2em; }
-table { border-collapse: collapse; font-size: .9rem; line-height: 1.35; font-variant-numeric: tabular-nums; }
-th, td { padding: 5px 11px; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
+.scroll { margin: .8em 0 1.2em; } table { margin: 0; }
+th, td { text-align: left; vertical-align: top; padding: 5px 11px; }
 thead th { background: var(--ground); border-bottom: 2px solid var(--line); vertical-align: bottom; }
 thead th:empty { padding: 0; }
-.wide:first-of-type td:first-child { white-space: nowrap; color: var(--soft); }
-#claims + p + .wide td:nth-child(3), #claims + p + .wide td:nth-child(5) { min-width: 20em; }
-#claims + p + .wide td:nth-child(4) { min-width: 9em; }
+.scroll:first-of-type td:first-child { white-space: nowrap; color: var(--soft); }
+#claims + p + .scroll td:nth-child(3), #claims + p + .scroll td:nth-child(5) { min-width: 20em; }
+#claims + p + .scroll td:nth-child(4) { min-width: 9em; }
 th.right, td.right { text-align: right; white-space: nowrap; } th.right { white-space: normal; }
 td.good, td.bad, td.open { font-weight: 600; white-space: nowrap; }
-td.good { color: #00634a; } td.bad { color: #a4161a; } td.open { color: var(--soft); }
-td strong { color: #8a4b00; }
+td.good { color: var(--good); } td.bad { color: var(--bad); } td.open { color: var(--soft); }
+td strong { color: var(--warning); }
 figure { margin: 1em 0 1.6em; overflow-x: auto; }
 figure img { display: block; max-width: 100%; min-width: 560px; height: auto; }
 figcaption { color: var(--soft); font-size: .9rem; margin-top: .3em; }
-@media (max-width: 700px) { html { font-size: 16px; } body { padding: 10px 14px 40px; } h1 { font-size: 1.4rem; }
-  th, td { padding: 4px 7px; } #claims + p + .wide td:nth-child(3) { min-width: 12em; } }
+@media (max-width: 900px) { #claims + p + .scroll td:nth-child(3) { min-width: 12em; } }
 @media print { nav { display: none; } h2 { break-after: avoid; } figure, tr { break-inside: avoid; } }
 """
+"""What the page has beside the style sheet of a report."""
 
 
 def render(text: str, pictures: Mapping[str, str]) -> str:
@@ -52,8 +49,6 @@ def render(text: str, pictures: Mapping[str, str]) -> str:
     text : Markdown; raw HTML in it is shown as it stands
     pictures : what to put in the place of the addresses of its images, data: URIs
     """
-    from markdown_it import MarkdownIt
-
     parser: Any = MarkdownIt("commonmark", {"html": False}).enable("table")
     parser.validateLink = lambda address: address.startswith(("https://arxiv.org/", "figures/"))
     tokens = parser.parse(text)
@@ -73,12 +68,13 @@ def render(text: str, pictures: Mapping[str, str]) -> str:
             if child.type == "image":
                 child.attrSet("src", pictures.get(str(child.attrGet("src")), ""))
     body: str = parser.renderer.render(tokens, parser.options, {})
-    return PAGE.format(title=html.escape(title), style=STYLE, body=_dress(body, "\n".join(contents)))
+    style = (ASSETS / "report.css").read_text() + STYLE
+    return PAGE.format(title=html.escape(title), style=style, body=_dress(body, "\n".join(contents)))
 
 
 def _dress(body: str, contents: str) -> str:
     """Wide tables scroll by themselves, figures get their captions, verdicts their colours; contents after the head."""
-    body = body.replace("<table>", '<div class="wide" tabindex="0"><table>').replace("</table>", "</table></div>")
+    body = body.replace("<table>", '<div class="scroll" tabindex="0"><table>').replace("</table>", "</table></div>")
     body = re.sub(
         r"<p>(<img [^>]*>)</p>\s*<p><em>(.*?)</em></p>", r"<figure>\1<figcaption>\2</figcaption></figure>", body
     )

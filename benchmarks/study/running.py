@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from nerif.conventions import InputError
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
@@ -91,6 +92,8 @@ def run_case(case: Case, folder: Path, on_progress: OnProgress = lambda what, sh
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
     result = case.reconstructor(measurement, follow)
+    if not result.history:
+        raise InputError(f"not a single step was made: {result.outcome.message}")
     on_progress("comparing", 1.0)
     grid = Grid.of_resolution(BOX, case.truth_voxels)
     truth = Volume(phantom.sample(grid), grid)

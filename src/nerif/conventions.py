@@ -14,6 +14,7 @@ __all__ = [
     "COMPONENTS",
     "DEFAULT_AMBIENT_FACES",
     "FACES",
+    "LARGEST_INDEX",
     "LARGEST_LENGTH",
     "InputError",
     "Mask",
@@ -35,6 +36,9 @@ FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
 """Where the index is taken as ambient when nothing else is said: the side faces (the gauge)."""
+
+LARGEST_INDEX = 4.0
+"""Of gases, liquids and glasses."""
 
 LARGEST_LENGTH = 1e7
 """Beyond ten kilometres (mm) a length is taken for a mistake of its unit."""
@@ -60,7 +64,7 @@ def ambient_index(value: object, name: str = "n_ambient") -> float:
     InputError
         If it is not a number between 0.9 and 4, as of gases, liquids and glasses.
     """
-    if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < 4:
+    if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < LARGEST_INDEX:
         raise InputError(f"{name}: expected a refractive index such as 1.00027, got {value}")
     return float(value)
 

@@ -6,7 +6,7 @@ The folder is one that nerif calibrate and nerif displacement read (imaging/view
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.geometry import Box, Camera
+from nerif.geometry import Box, Camera, Grid
 from nerif.imaging.background import Background
 from nerif.imaging.bundle import Pose
+from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.targets import CalibrationTarget
 from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
+from nerif.volume import Volume, write_netcdf
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "target_poses", "world_axes"]
 
@@ -65,14 +68,56 @@ class Experiment:
 
     def write(
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,
-        focal_length: float, on_picture: Callable[[], None] = lambda: None,
+        focal_length: float, truth_voxels: int = 100, on_picture: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
-        """Render all pictures into VIEW/{target,background,reference,flow}/."""
+        """Render all pictures into VIEW/{target,background,reference,flow}/, with settings to calibrate, and the truth.
+
+        Parameters
+        ----------
+        folder : to write; calibrate.toml, truth/calibration.toml and truth/volume.nc come with the pictures
+        cameras : of the rig
+        phantom, box : field of index excess, and the box that holds it
+        n_ambient : refractive index around it
+        focal_length : of the lenses, mm: with f_number it gives their aperture
+        truth_voxels : of the truth, along the longest edge of the box
+        on_picture : called after each picture (`pictures` of them in all)
+
+        Raises
+        ------
+        InputError
+            If truth_voxels, or a setting of target or background, can't be.
+        """
+        if truth_voxels < 1:
+            raise InputError(f"truth_voxels: expected at least 1, got {truth_voxels}")
+        self._write_truth(folder / "truth", cameras, phantom, box, n_ambient, truth_voxels)
+        self._write_settings(folder / "calibrate.toml", cameras)
         lens = Lens(diameter=focal_length / self.f_number) if self.f_number > 0 else None
         for i, camera in enumerate(cameras):
             self._background_pictures(folder / camera.name, camera, i, phantom, box, n_ambient, lens, on_picture)
         if self.poses:
             self.write_targets(folder, cameras, on_picture)
+
+    def _write_truth(
+        self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float, voxels: int
+    ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_cameras(folder / "calibration.toml", [CalibratedCamera.from_camera(c) for c in cameras])
+        grid = Grid.of_resolution(box, voxels)
+        volume = Volume(phantom.sample(grid), grid, attributes={"n_ambient": n_ambient})
+        write_netcdf(folder / "volume.nc", [volume])
+
+    def _write_settings(self, path: Path, cameras: Sequence[Camera]) -> None:
+        """Settings of nerif calibrate by which the rig's own world comes out."""
+        import tomli_w
+
+        settings = {
+            "world": "0",
+            "axes": world_axes(cameras),
+            "background_scale": background_scale(cameras),
+            "target": asdict(self.target_for(cameras)),
+        }
+        with atomic(path) as part:
+            part.write_text(tomli_w.dumps(settings))
 
     def write_targets(
         self, folder: Path, cameras: Sequence[Camera], on_picture: Callable[[], None] = lambda: None

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
 from nerif.geometry import Box, Camera, Plane
+from nerif.netcdf import values
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,8 +136,6 @@ def _check_variables(dataset: xr.Dataset) -> None:
         given = variable.attrs.get("units", unit)
         if not (isinstance(given, str) and given == unit):
             raise InputError(f"variable '{name}': expected units '{unit}', got '{given}'")
-        if variable.dtype.kind not in "fiub":
-            raise InputError(f"variable '{name}': expected numbers, got {variable.dtype}")
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
         got = f"{views} x {rows} x {columns}"
@@ -145,11 +144,10 @@ def _check_variables(dataset: xr.Dataset) -> None:
 
 def _array(dataset: xr.Dataset, name: str) -> Tensor:
     """A small variable in double precision, in the order of its dimensions, every number finite."""
-    values = dataset[name].transpose(*VARIABLES[name][0]).values.astype(np.float64)
-    if not np.isfinite(values).all():
-        bad = values[~np.isfinite(values)][0]
-        raise InputError(f"variable '{name}': expected finite numbers, got {bad}")
-    return torch.from_numpy(np.ascontiguousarray(values))
+    numbers = values(dataset[name].transpose(*VARIABLES[name][0])).astype(np.float64)
+    if not np.isfinite(numbers).all():
+        raise InputError(f"variable '{name}': expected finite numbers, got {numbers[~np.isfinite(numbers)][0]}")
+    return torch.from_numpy(np.ascontiguousarray(numbers))
 
 
 def _map(dataset: xr.Dataset, name: str) -> Tensor:
@@ -159,15 +157,15 @@ def _map(dataset: xr.Dataset, name: str) -> Tensor:
     measured = dimensions[-1] == "component"
     result = torch.empty(shape, dtype=torch.float32 if measured else torch.bool)
     for i in range(shape[0]):
-        values = variable.isel(view=i).transpose(*dimensions).values
+        numbers = values(variable.isel(view=i).transpose(*dimensions))
         if measured:
             with np.errstate(over="ignore"):  # too large for single precision is not a displacement either
-                values = values.astype(np.float32, copy=False)
-        elif np.isnan(values).any():
+                numbers = numbers.astype(np.float32, copy=False)
+        elif numbers.dtype.kind == "f" and np.isnan(numbers).any():
             raise InputError(f"variable '{name}': expected 0 or 1, got NaN")
         else:
-            values = values != 0
-        result[i] = torch.from_numpy(np.ascontiguousarray(values))
+            numbers = numbers != 0
+        result[i] = torch.from_numpy(np.ascontiguousarray(numbers))
     return result
 
 

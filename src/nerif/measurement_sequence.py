@@ -5,6 +5,7 @@ Each frame has chunks of its own, so frames are written and read one by one, by 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.measurement import Measurement
 from nerif.measurement_file import CONVENTIONS, MAPS, VARIABLES
+from nerif.netcdf import reading, values
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -59,6 +61,7 @@ class MeasurementSequence:
             If it is missing, foreign, or has no `time`.
         """
         path = Path(path)
+        _check_arrays(path)
         with _opened(path) as dataset:
             if dataset.attrs.get("Conventions") != CONVENTIONS:
                 found = dataset.attrs.get("Conventions")
@@ -67,9 +70,9 @@ class MeasurementSequence:
                 got = dataset["displacement"].dims if "displacement" in dataset else "none"
                 raise InputError(f"{path}: variable 'displacement': expected a leading dimension time, got {got}")
             count = dataset.sizes["time"]
-            times = dataset["time"].values.tolist() if "time" in dataset.coords else list(range(count))
-        times = tuple(float(t) for t in times)
-        if not times or any(not b > a for a, b in pairwise(times)):
+            given = values(dataset["time"]).tolist() if "time" in dataset.coords else range(count)
+        times = tuple(float(t) for t in given)
+        if not times or not math.isfinite(sum(times)) or any(not b > a for a, b in pairwise(times)):
             raise InputError(f"{path}: coordinate time: expected increasing instants in s, got {_short(times)}")
         return cls(path, times)
 
@@ -81,7 +84,7 @@ class MeasurementSequence:
         InputError
             If the frame breaks the contract of a measurement, such as a view with no valid pixel.
         """
-        with _opened(self.path) as dataset:
+        with _opened(self.path) as dataset, reading(f"{self.path}, frame {index}: cannot be read; is it damaged?"):
             one = dataset.isel(time=index).load() if "time" in dataset.dims else dataset.load()
         try:
             if tuple(one["displacement"].dims) == VARIABLES["displacement"][0]:
@@ -178,6 +181,16 @@ class MeasurementSequence:
         return (self.path / "displacement" / "c" / str(index)).is_dir()
 
 
+def _check_arrays(path: Path) -> None:
+    """Open every array by itself: of several opened at once, zarr prints the errors of all but the first."""
+    require_zarr()
+    import zarr
+
+    for metadata in sorted(path.glob("*/zarr.json")):
+        with reading(f"{path}: not a readable Zarr store: {metadata.parent.name}"):
+            zarr.open(metadata.parent, mode="r")
+
+
 def _opened(path: Path) -> xr.Dataset:
     """The store as a dataset of which nothing is read yet."""
     import xarray as xr
@@ -185,11 +198,8 @@ def _opened(path: Path) -> xr.Dataset:
     require_zarr()
     if not path.exists():
         raise InputError(f"{path}: no such store; expected a measurement sequence (Zarr, {CONVENTIONS})")
-    try:
-        return xr.open_dataset(path, engine="zarr", chunks=None, consolidated=False)
-    except (OSError, ValueError, KeyError, FileNotFoundError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: not a readable Zarr store ({reason})") from None
+    with reading(f"{path}: not a readable Zarr store"):
+        return xr.open_dataset(path, engine="zarr", chunks=None, consolidated=False, decode_times=False)
 
 
 def _short(times: Sequence[float]) -> str:

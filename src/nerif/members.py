@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import time
 from collections.abc import Collection, Mapping
@@ -26,6 +25,7 @@ from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction, Reconstructor
 from nerif.reconstruction.ensemble import Ensemble, Spread
 from nerif.reconstruction.files import FIELD
+from nerif.reconstruction.fingerprint import fingerprint
 from nerif.result import ResultDirectory
 from nerif.volume import Volume
 
@@ -120,7 +120,7 @@ class Members:
         """One member: read if it is there already, made by the same settings from the same data; else reconstructed."""
         directory = self.out.member(number)
         reconstructor, noisy = self.ensemble.member(number, self.reconstructor, self.training, noise)
-        made_of = self._fingerprint(reconstructor, noisy)
+        made_of = self._made_of(reconstructor, noisy)
         if directory.has(FIELD) and directory.has(ASKED) and (directory / ASKED).read_text() == made_of:
             try:
                 kept = Outcome("converged", "read from disc")
@@ -138,15 +138,10 @@ class Members:
                 part.write_text(made_of)
         return result
 
-    def _fingerprint(self, reconstructor: Reconstructor, data: Measurement) -> str:
+    def _made_of(self, reconstructor: Reconstructor, data: Measurement) -> str:
         """What a member was made by and from, as text: another one of either gives another text."""
-        seen = hashlib.sha256()
-        for values in (data.displacement, data.sigma, data.usable):
-            if values is not None:
-                seen.update(values.contiguous().numpy().tobytes())
         asked = {
-            "views": data.names,
-            "data": seen.hexdigest(),
+            "data": fingerprint(data),
             **self.made_of,
             **dataclasses.asdict(reconstructor),  # type: ignore[call-overload]
         }

@@ -1,4 +1,4 @@
-"""NetCDF-4 files that others wrote: opened lazily, and refused in words where they are damaged."""
+"""NetCDF-4 files and Zarr stores as they are found: opened lazily, and refused in words where they are damaged."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from nerif.conventions import InputError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["opened", "reason"]
+__all__ = ["opened", "reading", "values"]
 
 
 @contextmanager
@@ -35,20 +37,45 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected {expected}")
-    try:
-        h5py.File(path, "r").close()  # h5netcdf leaves a half-made object behind where this fails
+    with reading(f"{path}: not a readable NetCDF-4 file, or truncated"):
+        with h5py.File(path, "r") as file:
+            file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
         dataset = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
-    except Exception as error:  # the libraries raise whatever the damage leads them to
-        raise InputError(f"{path}: not a readable NetCDF-4 file, or truncated ({reason(error)})") from None
     with dataset:
         try:
             yield dataset
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-        except (OSError, RuntimeError) as error:
-            raise InputError(f"{path}: not a readable NetCDF-4 file, or truncated ({reason(error)})") from None
 
 
-def reason(error: Exception) -> str:
-    """Return the first line of what a library says, or at least the kind of its error."""
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
+def values(variable: xr.DataArray) -> np.ndarray:
+    """Read the numbers of a variable.
+
+    Raises
+    ------
+    InputError
+        If they are no numbers, or the file is damaged there.
+    """
+    with reading(f"variable '{variable.name}': cannot be read; is the file damaged?"):
+        read = np.asarray(variable.values)
+    if read.dtype.kind not in "fiub":
+        raise InputError(f"variable '{variable.name}': expected numbers, got {read.dtype}")
+    return read
+
+
+@contextmanager
+def reading(refusal: str) -> Iterator[None]:
+    """Refuse what a library cannot read: calls of it stand inside, and no others, since any error is taken for damage.
+
+    Raises
+    ------
+    InputError
+        With the refusal, and the first line of what the library says.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # libraries raise whatever the damage leads them to
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{refusal} ({said})") from None

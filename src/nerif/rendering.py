@@ -19,10 +19,9 @@ from nerif.conventions import InputError, Points
 from nerif.fields.base import Field
 from nerif.geometry import Box, Camera, Plane, Rays
 from nerif.physics.ray_tracing import trace
+from nerif.simulation import STEPS
 
 __all__ = ["Lens", "Sensor", "Texture", "background_texture", "render"]
-
-STEPS = 120  # Runge-Kutta steps through the box, as in simulation.py
 
 
 @dataclass(frozen=True)

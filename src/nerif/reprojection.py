@@ -12,7 +12,8 @@ from torch import Tensor
 from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.measurement import Measurement
-from nerif.measurement_file import VARIABLES, encoding
+from nerif.measurement_file import VARIABLES, encoding, from_dataset, to_dataset
+from nerif.netcdf import opened
 
 __all__ = ["Accuracy", "Reprojection"]
 
@@ -53,24 +54,17 @@ class Reprojection:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a measurement file of the predicted displacement, with `measured` and `held_out` in it, atomically."""
         import numpy as np
-        import xarray as xr
 
         predicted = replace(self.measurement, displacement=self.predicted, valid=self.measurement.usable)
+        dataset = to_dataset(predicted)
+        about = {"units": "px", "long_name": "measured displacement"}
+        dataset["measured"] = (VARIABLES["displacement"][0], self.measurement.displacement.float().numpy(), about)
         held = np.array([name in self.held_out for name in self.measurement.names], dtype=np.int8)
-        more = xr.Dataset(
-            {
-                "measured": (VARIABLES["displacement"][0], self.measurement.displacement.float().numpy()),
-                "held_out": (
-                    ("view",),
-                    held,
-                    {"units": "1", "long_name": "1 where the reconstruction has not seen it"},
-                ),
-            }
-        )
-        more["measured"].attrs = {"units": "px", "long_name": "measured displacement"}
+        about = {"units": "1", "long_name": "1 where the reconstruction has not seen it"}
+        dataset["held_out"] = (("view",), held, about)
+        dataset.attrs |= {"predicted_by": self.accuracy.how, "predicted_error_px": self.accuracy.error_px}
         with atomic(path) as part:
-            predicted.write(part)
-            more.to_netcdf(part, mode="a", engine="h5netcdf", encoding=encoding(more))
+            dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding(dataset))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Reprojection:
@@ -81,14 +75,12 @@ class Reprojection:
         InputError
             If it is missing, damaged, or holds no measured displacement.
         """
-        import xarray as xr
+        import numpy as np
 
-        predicted = Measurement.read(path)
-        with xr.open_dataset(path, engine="h5netcdf") as data:
+        with opened(path, "a re-projection") as data:
             if "measured" not in data or "held_out" not in data:
-                raise InputError(f"{path}: expected variables 'measured' and 'held_out', got a plain measurement")
-            measured = torch.from_numpy(data["measured"].values.astype("float32"))
-            held_out = tuple(
-                str(v) for v, held in zip(data["view"].values, data["held_out"].values, strict=True) if held
-            )
+                raise InputError("expected variables 'measured' and 'held_out', got a plain measurement")
+            predicted = Measurement(**from_dataset(data))
+            measured = torch.from_numpy(np.asarray(data["measured"].values, dtype=np.float32))
+            held_out = tuple(n for n, held in zip(predicted.names, data["held_out"].values, strict=True) if held)
         return cls(replace(predicted, displacement=measured), predicted.displacement, held_out)

@@ -5,14 +5,20 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.atomic import atomic
-from nerif.conventions import InputError, ambient_index
+from nerif.conventions import LARGEST_INDEX, InputError, ambient_index
 from nerif.geometry import Box, Grid
+from nerif.netcdf import opened, values
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["QUANTITIES", "Volume", "describe", "read_volume", "read_volumes", "write_netcdf"]
 
@@ -157,8 +163,11 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
             f"{path}: expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}"
         )
     volume = _volume(quantity, arrays[quantity], grid, attributes)
-    if "masked_voxels" not in volume.notes and not bool(torch.isfinite(volume.values).all()):
+    index = quantity in ("index_excess", "n")
+    if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
         raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
+    if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
+        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got numbers beyond {LARGEST_INDEX}")
     try:
         n_ambient = volume.n_ambient
     except InputError as error:
@@ -202,46 +211,52 @@ def _volume(quantity: str, values: Tensor, grid: Grid, attributes: dict[str, flo
 
 
 def _read_netcdf(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
-    import numpy as np
-    import xarray as xr
+    with opened(path, "a volume (.nc or .vti)") as dataset:
+        return _contents(dataset)
 
-    try:
-        dataset = xr.load_dataset(path, engine="h5netcdf")
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: not a readable NetCDF-4 file, or truncated ({error})") from None
+
+def _contents(dataset: xr.Dataset) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
     for axis in "zyx":
         if axis not in dataset.coords:
-            raise InputError(f"{path}: expected a volume with coordinates z, y, x in mm, got {list(dataset.coords)}")
-    lower, upper = [], []
-    for axis in "xyz":
-        centres = dataset[axis].values.astype(np.float64)
-        steps = np.diff(centres)
-        corners = [dataset.attrs[name] for name in ("box_lower_mm", "box_upper_mm") if name in dataset.attrs]
-        if len(corners) == 2:
-            ends = [float(corner["xyz".index(axis)]) for corner in corners]
-            edge = (ends[1] - ends[0]) / len(centres)
-            # a part cut out of the volume has the whole's attributes, but not its coordinates
-            if np.allclose(centres, ends[0] + (np.arange(len(centres)) + 0.5) * edge, rtol=0, atol=1e-3 * edge):
-                lower.append(ends[0])
-                upper.append(ends[1])
-                continue
-        if len(steps) == 0 or not np.allclose(steps, steps.mean(), rtol=1e-3) or steps.mean() <= 0:
-            raise InputError(f"{path}: expected equally spaced, rising voxel centres along {axis} (mm)")
-        lower.append(float(centres[0] - steps.mean() / 2))
-        upper.append(float(centres[-1] + steps.mean() / 2))
-    shape = (dataset.sizes["z"], dataset.sizes["y"], dataset.sizes["x"])
-    grid = Grid(Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])), shape)
-    arrays = {
-        str(name): torch.from_numpy(np.ascontiguousarray(v.transpose("z", "y", "x").values))
-        for name, v in dataset.data_vars.items()
-        if set(v.dims) == {"z", "y", "x"}
-    }
+            raise InputError(f"expected a volume with coordinates z, y, x in mm, got {list(dataset.coords)}")
+    ends = [_ends(dataset, axis) for axis in "xyz"]
+    lower, upper = zip(*ends, strict=True)
+    grid = Grid(Box(lower, upper), (dataset.sizes["z"], dataset.sizes["y"], dataset.sizes["x"]))
+    arrays = {}
+    for key, variable in dataset.data_vars.items():
+        name, unit = str(key), variable.attrs.get("units")
+        if set(variable.dims) == {"z", "y", "x"}:
+            expected = describe(name)[0]
+            if name in QUANTITIES and unit is not None and not (isinstance(unit, str) and unit == expected):
+                raise InputError(f"variable '{name}': expected units '{expected}', got '{unit}'")
+            numbers = values(variable.transpose("z", "y", "x"))
+            kind = np.float32 if numbers.dtype.itemsize <= 4 else np.float64
+            arrays[name] = torch.from_numpy(np.ascontiguousarray(numbers.astype(kind)))
     found = dict(dataset.attrs)
-    for name, variable in dataset.data_vars.items():
-        found |= {f"{name}.{k}": v for k, v in variable.attrs.items()}
+    for key, variable in dataset.data_vars.items():
+        found |= {f"{key}.{k}": v for k, v in variable.attrs.items()}
     attributes: dict[str, float | str] = {
         str(k): v if isinstance(v, str) else float(v)
         for k, v in found.items()
         if isinstance(v, str | int | float | np.number)
     }
     return arrays, grid, attributes
+
+
+def _ends(dataset: xr.Dataset, axis: str) -> tuple[float, float]:
+    """Where the box begins and ends along an axis, mm, by the attributes where they fit, else by the voxel centres."""
+    unit = dataset[axis].attrs.get("units", "mm")
+    if not (isinstance(unit, str) and unit == "mm"):
+        raise InputError(f"coordinate '{axis}': expected units 'mm', got '{unit}'")
+    centres = values(dataset[axis]).astype(np.float64)
+    corners = [np.asarray(dataset.attrs.get(name)) for name in ("box_lower_mm", "box_upper_mm")]
+    if len(centres) and all(c.shape == (3,) and c.dtype.kind in "fiu" for c in corners):
+        lower, upper = (float(c["xyz".index(axis)]) for c in corners)
+        edge = (upper - lower) / len(centres)
+        # a part cut out of the volume has the whole's attributes, but not its coordinates
+        if np.allclose(centres, lower + (np.arange(len(centres)) + 0.5) * edge, rtol=0, atol=1e-3 * abs(edge)):
+            return lower, upper
+    steps = np.diff(centres)
+    if len(steps) == 0 or not steps.mean() > 0 or not np.allclose(steps, steps.mean(), rtol=1e-3):
+        raise InputError(f"expected equally spaced, rising voxel centres along {axis} (mm)")
+    return float(centres[0] - steps.mean() / 2), float(centres[-1] + steps.mean() / 2)

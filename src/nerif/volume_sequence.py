@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Box, Grid
 from nerif.measurement_sequence import require_zarr
+from nerif.netcdf import reading
 from nerif.volume import REFERENCES, Volume, describe
 
 if TYPE_CHECKING:
+    import numpy as np
     import zarr
 
 __all__ = ["VolumeSequence", "add_frames"]
@@ -39,19 +41,20 @@ class VolumeSequence:
         self.path = Path(path)
         if not self.path.is_dir():
             raise InputError(f"{path}: no such store; expected volumes over time (Zarr)")
-        try:
+        with reading(f"{path}: expected volumes over time, written by nerif"):
             self.group: zarr.Group = zarr.open_group(self.path, mode="r+")
             self.attributes: dict[str, Any] = dict(self.group.attrs)
-            axes = [self.array(a).shape[0] for a in "zyx"]
-            self.times = tuple(float(t) for t in self.array("time")[:])
+        if missing := {"box_lower_mm", "box_upper_mm", "n_ambient"} - set(self.attributes):
+            raise InputError(
+                f"{path}: expected volumes over time, written by nerif, got a store without {min(missing)}; "
+                "nerif sequence makes volumes of measurements"
+            )
+        with reading(f"{path}: expected volumes over time, written by nerif"):
+            z, y, x = (self.array(a).shape[0] for a in "zyx")
+            self.times = tuple(float(t) for t in self.read("time", slice(None)))
             box = Box(tuple(self.attributes["box_lower_mm"]), tuple(self.attributes["box_upper_mm"]))
-            self.n_ambient = float(self.attributes["n_ambient"])
-        except (OSError, ValueError, KeyError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            if isinstance(error, KeyError):
-                reason = f"it has no {reason}; nerif sequence makes volumes of measurements"
-            raise InputError(f"{path}: expected volumes over time, written by nerif ({reason})") from None
-        self.grid = Grid(box, (axes[0], axes[1], axes[2]))
+            self.n_ambient = ambient_index(self.attributes["n_ambient"])
+            self.grid = Grid(box, (z, y, x))
 
     @classmethod
     def create(
@@ -101,7 +104,21 @@ class VolumeSequence:
 
     def array(self, name: str) -> Any:  # zarr's own types do not know what an index gives
         """Return one of the arrays (zarr.Array) of the store."""
-        return self.group[name]
+        with reading(f"{self.path}: '{name}': cannot be read; is it damaged?"):
+            return self.group[name]
+
+    def read(self, name: str, index: int | slice) -> np.ndarray:
+        """Return what one of the arrays holds of one frame, or of several.
+
+        Raises
+        ------
+        InputError
+            If it is missing or damaged.
+        """
+        import numpy as np
+
+        with reading(f"{self.path}: '{name}': cannot be read; is it damaged?"):
+            return np.asarray(self.array(name)[index])
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -125,12 +142,11 @@ class VolumeSequence:
         InputError
             If the store lacks the quantity.
         """
-        import numpy as np
         import torch
 
         if quantity not in self.quantities:
             raise InputError(f"{self.path}: expected one of {', '.join(self.quantities)}, got '{quantity}'")
-        values = torch.from_numpy(np.asarray(self.array(quantity)[index]))
+        values = torch.from_numpy(self.read(quantity, index))
         return Volume(values, self.grid, quantity, describe(quantity)[0], {"n_ambient": self.n_ambient})
 
 

@@ -59,7 +59,7 @@ def test_voxel_field_is_of_fourth_order():
     assert errors[0] / errors[1] > 8
 
 
-def hardness(flame: Flame, voxels: int = 40, samples: int = 4) -> float:
+def hardness(flame: Flame, voxels: int = 40, samples: int = 2) -> float:
     """What averaging onto voxels and interpolating back costs, relative to the variation."""
     n = voxels * samples
     fine = flame.sample(Grid(CUBE, (n, n, n)))

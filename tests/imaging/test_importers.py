@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from nerif.conventions import InputError
 from nerif.geometry import Camera, Plane
 from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
-from nerif.imaging.importers import ImportSettings, import_cameras
+from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
 
 PLANE = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -900.0)
 
@@ -567,3 +567,41 @@ def test_other_errors(tmp_path):
         import_cameras(odd)
     with pytest.raises(InputError, match="scale_mm"):
         ImportSettings(scale_mm=0.0)
+
+
+def test_calibrations_are_told_from_pictures(tmp_path):
+    opencv, pictures, both = (tmp_path / name for name in ("opencv", "pictures", "both"))
+    for folder in (opencv, pictures, both):
+        folder.mkdir()
+    for folder in (opencv, both):
+        (folder / "left.yml").touch()
+    (pictures / "views.toml").touch()
+    (both / "cam1").mkdir()
+    assert is_calibration(opencv)
+    assert is_calibration(opencv / "left.yml")
+    assert not is_calibration(pictures)
+    assert not is_calibration(both)
+
+
+def test_only_the_cameras_asked_for(tmp_path):
+    path = tmp_path / "c.toml"
+    write_cameras(path, [CalibratedCamera.from_camera(c) for c in (ONE, TWO)])
+    assert [c.name for c in import_cameras(path, only=("two",))] == ["two"]
+    with pytest.raises(InputError, match="views: expected some of one, two, got 'three'"):
+        import_cameras(path, only=("three",))
+
+
+def test_what_a_file_does_not_say_is_put_in(tmp_path):
+    path = tmp_path / "c.toml"
+    bare = CalibratedCamera("one", ONE.intrinsics, ONE.rotation, ONE.translation, ONE.distortion)
+    write_cameras(path, [bare])
+    (got,) = import_cameras(path, ImportSettings(background_distance=400.0, image_size=(160, 200)))
+    assert got.image_size == (160, 200)
+    assert got.background is not None
+    assert got.background.offset == -400.0
+    assert float(got.background.normal @ ONE.rotation[2]) == pytest.approx(-1)  # towards the camera
+    write_cameras(path, [CalibratedCamera.from_camera(ONE)])
+    (known,) = import_cameras(path, ImportSettings(background_distance=400.0, image_size=(9, 9)))
+    assert known.background is not None
+    assert known.background.offset == PLANE.offset
+    assert known.image_size == ONE.image_size

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from nerif.conventions import InputError
 from nerif.geometry import Box, Ring
 from nerif.imaging import workers
-from nerif.imaging.assembly import World
+from nerif.imaging.assembly import Scene
 from nerif.imaging.cameras_file import CalibratedCamera
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, RestingView, measure_instant
@@ -51,7 +51,7 @@ def write_experiment(folder, frames: int = 3, shift: int = 0, spot: bool = False
             path.parent.mkdir(parents=True, exist_ok=True)
             tifffile.imwrite(path, images, photometric="minisblack")
     calibrated = {c.name: CalibratedCamera.from_camera(c) for c in cameras}
-    return Recording(find_views(folder), calibrated, World(BOX, 1.00027))
+    return Recording(find_views(folder), calibrated, Scene(BOX))
 
 
 @pytest.fixture

@@ -72,7 +72,7 @@ def test_zero_field_moves_nothing(cameras, box):
 
 
 def test_curved_rays_converge_to_lever_arm_at_second_order(cameras, cube):
-    rays = rays_of(cameras, cube)
+    rays = rays_of(cameras, cube)[::4]
     differences = []
     for amplitude in (-4e-3, -2e-3, -1e-3):
         field = one_ball(amplitude, width=2.5)
@@ -84,7 +84,7 @@ def test_curved_rays_converge_to_lever_arm_at_second_order(cameras, cube):
 
 def test_curved_deflection_is_right_to_second_order(cameras, cube):
     """Bending the straight ray once leaves what is of third order."""
-    rays = rays_of(cameras, cube)
+    rays = rays_of(cameras, cube)[::4]
     differences = []
     for amplitude in (-1.6e-2, -8e-3, -4e-3):
         field = one_ball(amplitude, width=2.5)
@@ -120,8 +120,8 @@ def test_turning_rig_and_phantom_together_changes_nothing(cameras, ball, rotatio
     # the box does not turn: take one so wide that the balls are deep inside it both ways
     wide = Box((-20.0, -20.0, -20.0), (20.0, 20.0, 20.0))
     for model in (Deflection("lever_arm", 300), CurvedRays(200)):
-        before = model(ball, all_rays(cameras, wide))
-        after = model(moved, all_rays(tuple(turned(c, turn) for c in cameras), wide))
+        before = model(ball, all_rays(cameras, wide)[::4])
+        after = model(moved, all_rays(tuple(turned(c, turn) for c in cameras), wide)[::4])
         assert float((before - after).abs().max()) < 1e-5 * float(before.abs().max())
 
 

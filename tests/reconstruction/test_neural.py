@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from nerif.fields.mlp import Network, NetworkShape
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction import bins, training
-from nerif.reconstruction.base import Step
+from nerif.reconstruction.base import Reconstruction, Step
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.gauge import AmbientRegion
 from nerif.reconstruction.losses import LossWeights, numerical_displacement
@@ -37,14 +37,26 @@ SMALL = NeRIF(
 )
 
 
+@pytest.fixture(scope="module")
+def trained(measurement: Measurement) -> Reconstruction:
+    """A run of 150 steps."""
+    return replace(SMALL, max_steps=150)(measurement)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(measurement: Measurement) -> Reconstruction:
+    """A run of SMALL that nothing disturbs."""
+    return SMALL(measurement)
+
+
 def test_finds_the_balls_without_seeing_them(measurement, ball):
-    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=500, points_per_batch=4096)(
+    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=160, points_per_batch=2048)(
         measurement
     )
     grid = Grid.of_resolution(measurement.box, 30)
     truth = Volume(ball.sample(grid), grid)
     metrics = evaluate_volume(result.field, truth, measurement.n_ambient)
-    assert metrics["l2_variation"] < 0.12
+    assert metrics["l2_variation"] < 0.06
     assert metrics["cc"] > 0.99
     assert min(v["cc"] for v in evaluate_views(reproject(result.field, measurement))) > 0.99
     assert result.outcome.reason == "steps"
@@ -57,9 +69,8 @@ def test_three_terms_of_the_paper_agree_on_a_fitted_field(measurement):
         network=NetworkShape(depth=3, width=48, octaves=2, skip=2, head_width=16, gradient_head=True),
         weights=LossWeights(consistency=1, numerical=1, head=1, automatic=0),
         norm="l2",
-        max_steps=400,
+        max_steps=150,
         samples=(16, 24),
-        points_per_batch=2048,
     )
     result = settings(measurement)
     assert set(result.history[-1]) >= {"consistency", "numerical", "head", "gauge", "loss"}
@@ -76,9 +87,8 @@ def test_three_terms_of_the_paper_agree_on_a_fitted_field(measurement):
     assert float((automatic - heads).norm() / scale) < 0.35
 
 
-def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(measurement):
-    result = replace(SMALL, max_steps=60)(measurement)
-    field, (rays, _, _) = result.field, measurement.rays()
+def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(measurement, trained):
+    field, (rays, _, _) = trained.field, measurement.rays()
     rays = rays[:50]
     s = rays.near[:, None] + torch.linspace(0.05, 0.95, 9) * (rays.far - rays.near)[:, None]
     p = field.normalise(rays.at(s))
@@ -94,9 +104,7 @@ def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(
     assert 3.5 < errors[1] / errors[2] < 4.5
 
 
-def test_resumed_run_equals_one_that_was_not_interrupted(measurement, tmp_path):
-    whole = SMALL(measurement)
-
+def test_resumed_run_equals_one_that_was_not_interrupted(measurement, undisturbed, tmp_path):
     def stop_at_13(step: Step) -> bool:
         return step.step == 13
 
@@ -107,8 +115,17 @@ def test_resumed_run_equals_one_that_was_not_interrupted(measurement, tmp_path):
     second = SMALL(measurement, resume=read_state(tmp_path))
     assert second.outcome.reason == "steps"
     points = torch.rand(50, 3) * 10 - 5
-    assert torch.equal(whole.field(points), second.field(points))
-    assert not torch.equal(whole.field(points), first.field(points))
+    assert torch.equal(undisturbed.field(points), second.field(points))
+    assert not torch.equal(undisturbed.field(points), first.field(points))
+
+
+def test_a_resumed_run_keeps_its_history_and_counts_on(measurement):
+    seen: list[Step] = []
+    first = SMALL(measurement, on_step=lambda step: bool(seen.append(step)) or step.step == 21)
+    again = SMALL(measurement, resume=first.state)
+    assert [record["step"] for record in again.history] == [1, 20, 30]
+    assert again.history[-1]["epoch"] > first.history[-1]["epoch"] > 0
+    assert [step.step for step in seen] == list(range(1, 22))
 
 
 def test_same_seed_same_result_other_seed_another(measurement):
@@ -218,11 +235,10 @@ def test_each_limit_is_named(measurement):
     assert replace(SMALL, stop_ratio=0.9, max_steps=400)(measurement).outcome.reason == "converged"
 
 
-def test_ambient_is_ambient_on_the_faces(measurement):
-    result = replace(SMALL, max_steps=300)(measurement)
+def test_ambient_is_ambient_on_the_faces(measurement, trained):
     unit = torch.rand(500, 2)
     faces = torch.cat([measurement.box.face_points(f, unit) for f in measurement.ambient_faces])
-    values = result.field(faces)
+    values = trained.field(faces)
     assert abs(float(values.mean())) < 2e-6
     assert float(values.abs().max()) < 4e-5
 
@@ -234,8 +250,8 @@ def test_sigma_weighs_the_rays(measurement):
     sigma = measurement.sigma.clone()
     sigma[2] = 1e3
     honest = replace(measurement, displacement=wrong, sigma=sigma)
-    good = evaluate_views(reproject(replace(SMALL, max_steps=200)(honest).field, measurement))
-    blind = evaluate_views(reproject(replace(SMALL, max_steps=200)(replace(honest, sigma=None)).field, measurement))
+    good = evaluate_views(reproject(replace(SMALL, max_steps=100)(honest).field, measurement))
+    blind = evaluate_views(reproject(replace(SMALL, max_steps=100)(replace(honest, sigma=None)).field, measurement))
     others = [0, 1, 3, 4]
     assert max(good[i]["rms_px"] for i in others) < 0.5 * max(blind[i]["rms_px"] for i in others)
 
@@ -280,10 +296,13 @@ def test_no_displacement_gives_ambient(measurement):
     assert result.outcome.reason == "steps"  # there is nothing to find, and nothing was missed
 
 
-@pytest.mark.parametrize("precision", ["bf16", "tf32", "auto"])
-def test_other_precisions_train(measurement, precision):
-    result = replace(SMALL, precision=precision, max_steps=40)(measurement)
-    assert result.history[-1]["loss"] < result.history[0]["loss"]
+def test_bf16_gives_way_to_float32_at_the_end(measurement, undisturbed):
+    """Rounding to 8 bits changes a run, but not where it goes; tf32 is a matter of CUDA."""
+    result = replace(SMALL, precision="bf16")(measurement)
+    assert result.history[-1]["loss"] != undisturbed.history[-1]["loss"]
+    assert result.history[-1]["loss"] == pytest.approx(undisturbed.history[-1]["loss"], rel=0.2)
+    full = replace(SMALL, precision="bf16", full_precision_from=0.0)(measurement)
+    assert full.history[-1]["loss"] == undisturbed.history[-1]["loss"]
 
 
 COMPILED = """
@@ -332,7 +351,6 @@ def test_presets(measurement: Measurement):
     for name in PRESETS:
         quick = replace(preset(name), points_per_batch=300, max_steps=2, samples=(12, 14), device="cpu", compile="off")
         assert quick(measurement).outcome.reason == "steps"
-    assert asdict(preset("auto"))["network"]
     with pytest.raises(InputError, match="paper"):
         preset("papr")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from nerif.physics.quantities import GasSettings, derive
 from nerif.report import html, packing
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.summary import headline, number, trust
-from nerif.report.view_images import _shrink, view_images
+from nerif.report.view_images import _shrink, lattice_step, view_images
 from nerif.reprojection import Reprojection
 from nerif.result import Result, ResultDirectory
 from nerif.volume import Volume
@@ -88,6 +89,21 @@ def test_relations_are_those_of_the_files(quantity):
     found = packing.relation(quantity, derived.attributes)(volume.values.double().numpy())
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     np.testing.assert_allclose(found, expected, rtol=2e-6)
+
+
+def test_statistics_are_masked_on_the_page_where_they_are_in_the_file(tmp_path):
+    """A voxel masked in one member: its density has no standard deviation, though its index excess has one."""
+    excess = smooth((6, 5, 4))
+    density = derive(excess, "density", GasSettings())
+    spread = Volume(torch.full(excess.grid.shape, 1e-6), excess.grid, "index_excess_std")
+    std = Volume(torch.full(excess.grid.shape, 4e-3), excess.grid, "density_std", "kg m-3")
+    std.values[1, 2, 3] = float("nan")
+    found = {v.quantity: v for v in (excess, density, spread, replace(spread, quantity="index_excess_mean"), std)}
+    scene, arrays = html._scene(Result(tmp_path, volumes=found))
+    assert scene is not None
+    shown = packing.unpack({**scene["arrays"]["density_std"], "text": arrays["density_std"]}, excess.grid.shape)
+    np.testing.assert_array_equal(np.isnan(shown), np.isnan(std.values.numpy()))
+    assert "density_mean" not in scene["arrays"]  # nowhere masked: a function of the index excess
 
 
 def test_a_volume_of_128_stays_below_15_megabytes(tmp_path):
@@ -276,6 +292,24 @@ def test_residuals_are_those_of_every_ray_through_the_box(measurement):
     pixels = [int(seen[i].sum()) for i in range(len(scores))]
     rms = np.sqrt(sum(n * v["rms_over_sigma"] ** 2 for n, v in zip(pixels, scores, strict=True)) / sum(pixels))
     assert np.sqrt(np.mean(found**2)) == pytest.approx(rms, rel=1e-5)
+
+
+def test_of_many_pixels_a_regular_lattice_is_taken(measurement):
+    nothing = Reprojection(measurement, torch.zeros_like(measurement.displacement))
+    assert lattice_step(measurement, 10**6) == 1
+    assert lattice_step(measurement, measurement.displacement[..., 0].numel() // 9 + 1) == 3
+    seen = (measurement.usable & measurement.sees_box)[:, ::3, ::3]
+    some = residuals_over_sigma(nothing, measurement.displacement[..., 0].numel() // 9 + 1)
+    assert some.size == 2 * int(seen.sum())
+    expected = -(measurement.displacement / measurement.sigma)[:, ::3, ::3][seen]
+    np.testing.assert_allclose(np.sort(some), np.sort(expected.flatten().numpy()), rtol=1e-5)
+
+
+def test_the_pictures_of_many_views_stay_small(measurement, monkeypatch):
+    nothing = Reprojection(measurement, torch.zeros_like(measurement.displacement))
+    assert {v.shrunk for v in view_images(nothing, [])[0]} == {(1, 1)}
+    monkeypatch.setattr("nerif.report.view_images.ALL_PICTURES", 6 * 5 * 13**2)
+    assert {v.shrunk for v in view_images(nothing, [])[0]} == {(2, 2)}
 
 
 def test_pictures_of_narrow_and_large_views():

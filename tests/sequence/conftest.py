@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
 
-from sequence.films import simulated
+from sequence_films import simulated
 
 
 @pytest.fixture(scope="session")
@@ -17,7 +18,15 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulated(tmp_path_factory.mktemp("film") / "film.zarr", 24)
 
 
+@pytest.fixture(scope="session")
+def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five frames, and the truth beside them."""
+    return simulated(tmp_path_factory.mktemp("five") / "short.zarr", 5)
+
+
 @pytest.fixture
-def short(tmp_path: Path) -> Path:
-    """Five frames, to spoil."""
-    return simulated(tmp_path / "short.zarr", 5)
+def short(five: Path, tmp_path: Path) -> Path:
+    """A copy of the five frames, to spoil."""
+    for name in ("short.zarr", "short.truth.zarr"):
+        shutil.copytree(five.with_name(name), tmp_path / name)
+    return tmp_path / "short.zarr"

@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 
-from sequence.films import QUICK, blank, simulated
+from sequence_films import COLD, QUICK, blank, simulated
 
 pytest.importorskip("distributed", reason="pip install 'nerif[sequence]'")
 
@@ -165,12 +165,33 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     assert (progress.done, progress.failed) == (23, 1)
 
 
+def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(five, tmp_path, monkeypatch):
+    from distributed import Client
+
+    from nerif.sequence import run
+
+    plan, real = _plan(five, tmp_path / "out.zarr"), run.reconstruct_frames
+
+    def work(plan, first, last, event):
+        real(plan, first, min(last, 1), event)
+        if first == 0:
+            raise KeyError("layer 7")
+        real(plan, first, last, event)
+
+    monkeypatch.setattr(run, "reconstruct_frames", work)
+    with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
+        progress = run.run_sequence(client, plan, 3)
+    store = SequenceStore(plan.out)
+    assert store.status.tolist() == [DONE, FAILED, FAILED, DONE, DONE]
+    assert store.reasons[1] == "KeyError: 'layer 7'"
+    assert (progress.done, progress.failed) == (3, 2)
+
+
 def _plan(film: Path, out: Path):
     from dataclasses import replace
 
     from nerif.geometry import Grid
     from nerif.sequence.plan import SequencePlan
-    from sequence.test_frames import COLD
 
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.first_good().box, 10)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,21 +14,14 @@ import xarray as xr
 import zarr
 
 from nerif.conventions import InputError
-from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
-from nerif.reconstruction.neural import NeRIF
 from nerif.sequence import frames
 from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.plan import SequencePlan
 from nerif.sequence.run import chunks_of, outcome_table
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
-from sequence.films import blank
-
-COLD = NeRIF(
-    network=NetworkShape(depth=2, width=16, octaves=2), samples=(8, 12), sample_jitter=2, points_per_batch=400,
-    max_steps=30, epochs=1000, device="cpu", precision="float32",
-)  # fmt: skip
+from sequence_films import COLD, blank
 
 
 def begun(measurement: Path, out: Path, **changes: object) -> SequencePlan:
@@ -41,10 +35,16 @@ def begun(measurement: Path, out: Path, **changes: object) -> SequencePlan:
     return plan
 
 
-def test_every_frame_is_written_with_what_it_came_from(short, tmp_path):
-    plan = begun(short, tmp_path / "r.zarr")
-    told: list[dict] = []
+@pytest.fixture(scope="module")
+def undisturbed(five: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[SequencePlan, list[dict]]:
+    """Five frames reconstructed without disturbance, and what was told of them."""
+    plan, told = begun(five, tmp_path_factory.mktemp("whole") / "whole.zarr"), []
     reconstruct_frames(plan, 0, 5, told.append)
+    return plan, told
+
+
+def test_every_frame_is_written_with_what_it_came_from(undisturbed):
+    plan, told = undisturbed
     assert [t["what"] for t in told] == ["begun", "done"] * 5
     store = SequenceStore(plan.out)
     assert (store.status == DONE).all()
@@ -59,18 +59,21 @@ def test_every_frame_is_written_with_what_it_came_from(short, tmp_path):
         assert float(found["cc"].min()) > 0
         assert np.isfinite(found["rms_px"].values).all()
     assert "5 of 5 frames done" in outcome_table(store)
-    group = zarr.open_group(plan.out, mode="r+")
+
+
+def test_weights_of_another_version_are_refused(undisturbed, tmp_path):
+    copied = Path(shutil.copytree(undisturbed[0].out, tmp_path / "r.zarr"))
+    group = zarr.open_group(copied, mode="r+")
     group.attrs["network"] = {**group.attrs["network"], "gone": 0.0}
     with pytest.raises(InputError, match=r"another version of nerif \(.*gone.*reconstruct it again"):
-        SequenceStore(plan.out).field(0)
+        SequenceStore(copied).field(0)
 
 
-def test_a_warm_frame_begins_where_the_one_before_ended(short, tmp_path):
-    plan = begun(short, tmp_path / "r.zarr")
-    reconstruct_frames(plan, 0, 1)
+def test_a_warm_frame_begins_where_the_one_before_ended(undisturbed, five):
+    plan, _ = undisturbed
     before = SequenceStore(plan.out).field(0)
     one = replace(COLD, max_steps=1, rate_after_fit=1e-12)
-    after = one(MeasurementSequence.read(short).frame(1), start=before).field
+    after = one(MeasurementSequence.read(five).frame(1), start=before).field
     grid = SequenceStore(plan.out).grid
     x, y = before.sample(grid), after.sample(grid)
     assert after.index_scale != before.index_scale
@@ -78,9 +81,7 @@ def test_a_warm_frame_begins_where_the_one_before_ended(short, tmp_path):
     assert float((x - y - (x - y).mean()).abs().max()) < 1e-4 * float(x.abs().max())
 
 
-def test_going_on_gives_what_an_undisturbed_run_gives(short, tmp_path):
-    whole = begun(short, tmp_path / "whole.zarr")
-    reconstruct_frames(whole, 0, 5)
+def test_going_on_gives_what_an_undisturbed_run_gives(undisturbed, short, tmp_path):
     plan = begun(short, tmp_path / "parts.zarr")
 
     class Killed(BaseException):
@@ -96,7 +97,7 @@ def test_going_on_gives_what_an_undisturbed_run_gives(short, tmp_path):
     assert store.status.tolist() == [DONE, DONE, MISSING, MISSING, MISSING]
     reconstruct_frames(plan, 0, 5)
     for i in range(5):
-        a, b = (SequenceStore(p.out).volume(i, "index_excess").values for p in (whole, plan))
+        a, b = (SequenceStore(p.out).volume(i, "index_excess").values for p in (undisturbed[0], plan))
         assert torch.equal(a, b)
 
 

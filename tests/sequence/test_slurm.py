@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from sequence.films import QUICK
+from sequence_films import QUICK
 
 pytest.importorskip("dask_jobqueue", reason="pip install 'nerif[cluster]'")
 

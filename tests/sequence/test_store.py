@@ -18,7 +18,7 @@ from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
-from sequence.films import blank
+from sequence_films import blank
 
 
 def same(a: Measurement, b: Measurement) -> bool:

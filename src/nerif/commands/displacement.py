@@ -10,10 +10,10 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
+from nerif.commands.settings import Flat, Settings, read_settings
+from nerif.conventions import InputError
 from nerif.geometry import Box
-from nerif.imaging.assembly import World
+from nerif.imaging.assembly import Scene, Surroundings
 from nerif.imaging.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, measure_instant
@@ -58,25 +58,20 @@ class Displacement(Settings):
     """Most reference pictures to read; 0 for all."""
     mask: float = 0.0
     """Flow mask (for the visual hull) where |d| exceeds this many sigma; 0 for none. 4 is a good value."""
-    n_ambient: float = 1.00027
-    """Refractive index around the flow."""
-    wavelength_nm: float = 532.0
-    """Wavelength of the light, nm."""
-    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
-    """Faces of the box on which the index is ambient."""
     force: bool = False
     """Overwrite existing files."""
-    method: Annotated[DisplacementSettings, tyro.conf.arg(name="")] = field(default_factory=DisplacementSettings)
+    surroundings: Annotated[Surroundings, Flat] = field(default_factory=Surroundings)
+    method: Annotated[DisplacementSettings, Flat] = field(default_factory=DisplacementSettings)
 
     def recording(self) -> Recording:
         """Find the pictures and the cameras."""
         from nerif.imaging.importers import import_cameras
 
-        world = World(Box(self.lower, self.upper), self.n_ambient, self.wavelength_nm, self.ambient_faces)
+        scene = Scene(Box(self.lower, self.upper), self.surroundings)
         masks = MaskSettings(self.mask) if self.mask else None
         views = find_views(self.folder, self.views)
         cameras = {c.name: c for c in import_cameras(self.calibration)}
-        return Recording(views, cameras, world, self.method, masks, self.references)
+        return Recording(views, cameras, scene, self.method, masks, self.references)
 
 
 def run(settings: Displacement) -> Measurement:

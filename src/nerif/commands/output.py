@@ -73,7 +73,8 @@ def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[...,
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=total)
 
         def update(done: int, of: int | None = None) -> None:

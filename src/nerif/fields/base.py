@@ -29,11 +29,15 @@ class Field(ABC):
         """Return the gradient of the index (1/mm) at points (mm)."""
         return self.value_and_gradient(points)[1]
 
+    def to(self, device: torch.device | str) -> Field:
+        """Return the same field on a device; one whose parameters follow the points it is asked is on every device."""
+        return self
+
     @torch.no_grad()
     def sample(self, grid: Grid, device: torch.device | str = "cpu") -> Float[Tensor, "z y x"]:
         """Return the index excess at the voxel centres of a grid."""
-        points = grid.points().reshape(-1, 3)
-        values = [self(p.to(device)).cpu().to(torch.float32) for p in in_chunks(points)]
+        field, points = self.to(device), grid.points().reshape(-1, 3)
+        values = [field(p.to(device)).cpu().to(torch.float32) for p in in_chunks(points)]
         return torch.cat(values).reshape(grid.shape)
 
 

@@ -7,6 +7,7 @@ autograd, and the whole can be compiled (`torch.compile` cannot differentiate tw
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -210,6 +211,14 @@ class NeuralField(Field):
     def __init__(self, network: Network, box: Box, index_scale: float, offset: float = 0.0) -> None:
         self.network, self.box, self.index_scale, self.offset = network, box, index_scale, offset
         self.half_edge = max(box.edges) / 2
+
+    def to(self, device: torch.device | str) -> NeuralField:
+        """Return the same field on a device: a copy of the network, or the field itself where it is there already."""
+        if next(self.network.parameters()).device == torch.device(device):
+            return self
+        moved = copy.copy(self)
+        moved.network = copy.deepcopy(self.network).to(device)
+        return moved
 
     def normalise(self, points: Points) -> Points:
         """Map points in mm to the coordinates of the network."""

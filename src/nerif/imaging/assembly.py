@@ -14,28 +14,38 @@ from nerif.geometry import Box, Camera
 from nerif.imaging.displacement import DisplacementMap
 from nerif.measurement import Measurement
 
-__all__ = ["World", "join_views"]
+__all__ = ["Scene", "Surroundings", "join_views"]
 
 Mask = Bool[np.ndarray, "row column"]
 
 
 @dataclass(frozen=True)
-class World:
-    """What a measurement holds beside its views; see Measurement."""
+class Surroundings:
+    """The gas around the flow, and the light through it."""
+
+    n_ambient: float = 1.00027
+    """Refractive index around the flow."""
+    wavelength_nm: float = 532.0
+    """Wavelength of the light, nm."""
+    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
+    """Faces of the box on which the index is ambient."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a measurement holds beside its views: the box to reconstruct, and what is around the flow."""
 
     box: Box
-    n_ambient: float
-    wavelength_nm: float | None = None
-    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
+    surroundings: Surroundings = Surroundings()
 
 
-def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], world: World) -> Measurement:
+def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], scene: Scene) -> Measurement:
     """Return one measurement of all views; smaller pictures are padded.
 
     Parameters
     ----------
     views : camera, displacement and flow mask (or None) of each, held one at a time
-    world : box and surroundings
+    scene : box and surroundings
     """
     cameras: list[Camera] = []
     maps: dict[str, list[np.ndarray]] = {"displacement": [], "sigma": [], "valid": [], "flow_mask": []}
@@ -61,11 +71,11 @@ def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], wor
     return Measurement(
         cameras=tuple(cameras),
         displacement=stack("displacement"),
-        box=world.box,
-        n_ambient=world.n_ambient,
+        box=scene.box,
+        n_ambient=scene.surroundings.n_ambient,
         sigma=stack("sigma"),
         valid=stack("valid"),
         flow_mask=stack("flow_mask") if masked else None,
-        wavelength_nm=world.wavelength_nm,
-        ambient_faces=world.ambient_faces,
+        wavelength_nm=scene.surroundings.wavelength_nm,
+        ambient_faces=scene.surroundings.ambient_faces,
     )

@@ -226,7 +226,7 @@ def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
     if table.get("format") != FORMAT:
         raise InputError(f"{path}: expected format = '{FORMAT}', got {table.get('format')!r}")
     tables = table.get("camera", [])
-    if not isinstance(tables, list) or not tables:
+    if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise InputError(f"{path}: expected at least one table [[camera]], got none")
     cameras = tuple(_camera(t, i, str(path)) for i, t in enumerate(tables))
     names = [c.name for c in cameras]

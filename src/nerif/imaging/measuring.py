@@ -14,7 +14,7 @@ from jaxtyping import Bool
 
 from nerif.conventions import InputError
 from nerif.geometry import Camera
-from nerif.imaging.assembly import World, join_views
+from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.cameras_file import CalibratedCamera
 from nerif.imaging.displacement import AtRest, DisplacementMap, DisplacementSettings, measure_against
 from nerif.imaging.exposure import check_exposure
@@ -38,7 +38,7 @@ class Recording:
     ----------
     views : where the pictures are (views.find_views)
     cameras : calibrated, by the names of the views (importers.import_cameras, cameras_file.read_cameras)
-    world : box and surroundings of the measurement
+    scene : box and surroundings of the measurement
     method : of the displacements
     masks : of the flow, or None; views with a drawn mask have that
     references : most reference pictures to look at; 0 for all
@@ -46,7 +46,7 @@ class Recording:
 
     views: tuple[View, ...]
     cameras: Mapping[str, CalibratedCamera]
-    world: World
+    scene: Scene
     method: DisplacementSettings = field(default_factory=DisplacementSettings)
     masks: MaskSettings | None = None
     references: int = 100
@@ -200,7 +200,7 @@ def measure_instant(
         raise InputError(f"displacement: no view could be used; the first: {lost[0]}")
     order = sorted(found)
     noise = {views[i].name: found[i][1].noise_from for i in order}
-    return join_views((found.pop(i) for i in order), recording.world), noise
+    return join_views((found.pop(i) for i in order), recording.scene), noise
 
 
 def _view(recording: Recording, task: tuple[View, Sequence[int]]) -> tuple[Found | InputError, list[str]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.conventions import InputError
-from nerif.imaging.assembly import World, join_views
+from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.measuring import Recording, RestingView
 from nerif.imaging.views import View
 from nerif.imaging.workers import work
@@ -26,11 +26,11 @@ class RestingRecording:
     Parameters
     ----------
     views : with their references
-    world : box and surroundings
+    scene : box and surroundings
     """
 
     views: tuple[RestingView, ...]
-    world: World
+    scene: Scene
 
     @classmethod
     def of(
@@ -52,7 +52,7 @@ class RestingRecording:
                 raise resting
             found[i] = resting
             on_view(len(found))
-        return cls(tuple(found[i] for i in sorted(found)), recording.world)
+        return cls(tuple(found[i] for i in sorted(found)), recording.scene)
 
     def measure(self, number: int) -> tuple[Measurement, list[str]]:
         """Return the measurement of one flow picture, and what is wrong with the views it had to do without.
@@ -70,7 +70,7 @@ class RestingRecording:
                 lost.append(f"view '{resting.view.name}': {error}")
         if not found:
             raise InputError(lost[0])
-        return join_views(found, self.world), lost
+        return join_views(found, self.scene), lost
 
 
 def _rest(recording: Recording, view: View) -> tuple[RestingView | InputError, list[str]]:

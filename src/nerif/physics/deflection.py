@@ -114,7 +114,7 @@ def project(
     if chunk is None:  # arrays that stay in the cache of a CPU, and fill a GPU
         chunk = 32 if torch.device(device).type == "cpu" else 4096
     result = torch.zeros(len(rays), 2, dtype=rays.origin.dtype)
-    index = rays.crosses.nonzero()[:, 0]
+    index, field = rays.crosses.nonzero()[:, 0], field.to(device)
     for part in torch.split(index, chunk):
         result[part] = model(field, rays[part].to(device)).to(result)
     return result

@@ -126,7 +126,11 @@ class Reconstruction:
 
 
 class Reconstructor(ABC):
-    """A method of reconstruction: a frozen record of its settings, called with the data."""
+    """A method of reconstruction: a frozen record of its settings, called with the data.
+
+    A record can be kept, compared and called again; a call leaves it as it is. Settings that cannot be right are
+    refused when the record is made.
+    """
 
     @abstractmethod
     def __call__(
@@ -136,4 +140,28 @@ class Reconstructor(ABC):
         resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:
-        """Reconstruct the field of a measurement: from nothing, from an earlier State, or from another field."""
+        """Reconstruct the field of a measurement: from nothing, from an earlier State, or from another field.
+
+        A run that a limit, the callback or a failure stops returns the best field it has, and says why in its outcome.
+
+        Parameters
+        ----------
+        measurement : Measurement; usable pixels whose rays cross the box are to be met, weighed by sigma if it is known
+        on_step : called after each step or iteration (on a GPU: after some of them) with a Step; None for no callback.
+            Where it returns True the run stops with outcome "interrupted"
+        resume : State of an earlier run of the same method and settings on the same data, to go on as if it had not
+            stopped; limits (time, steps, iterations) may be raised. None to begin anew
+        start : Field to begin from, in the box of the measurement and on any device; None for the ambient index.
+            Without effect when resuming
+
+        Returns
+        -------
+        Reconstruction
+            Field, history, outcome, and the State to resume from.
+
+        Raises
+        ------
+        InputError
+            If nothing in the measurement fixes the ambient index, no ray is left, the device does not exist or has too
+            little memory, or `resume` is of another method, other settings or other data.
+        """

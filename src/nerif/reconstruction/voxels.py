@@ -25,6 +25,7 @@ from nerif.measurement import Measurement
 from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
+from nerif.reconstruction.fingerprint import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import check_gauge, visual_hull
 from nerif.reconstruction.operator import MODELS, DeflectionOperator
 from nerif.reconstruction.problem import Iterate, Problem
@@ -194,6 +195,7 @@ class _Run:
         self.chosen = ""
         self.x: Tensor | None = None
         self.spent, self.started = 0.0, time.perf_counter()
+        self.fingerprint = fingerprint(measurement, settings.open_faces)
         if resume is not None:
             self._restore(resume)
 
@@ -333,11 +335,12 @@ class _Run:
         assert self.x is not None
         scalars: dict[str, Any] = {name: getattr(self, name) for name in ("level", "done", "total", "weight", "chosen")}
         scalars |= {"method": type(self.settings).__name__, "seconds": self.seconds, "history": list(self.history)}
+        scalars["fingerprint"] = self.fingerprint
         return State({"x": self.x.detach().clone()}, scalars)
 
     def _restore(self, state: State) -> None:
-        scalars = dict(state.scalars)
-        shapes = [g.shape for g in self.grids]
+        scalars, shapes = dict(state.scalars), [g.shape for g in self.grids]
+        check_fingerprint(scalars.pop("fingerprint", None), self.fingerprint)
         level = scalars.get("level", -1)
         if (
             scalars.pop("method", None) != type(self.settings).__name__

@@ -49,7 +49,7 @@ def fit_network(
     points_per_batch: int,
     learning_rate: float,
     generator: torch.Generator,
-    on_step: Callable[[int, float], bool] = lambda step, loss: False,
+    on_step: Callable[[int, float], bool] | None = None,
 ) -> None:
     """Fit the network of a field to another field, values and gradients, by Adam.
 
@@ -57,13 +57,14 @@ def fit_network(
     ----------
     field : whose network is fitted, in its own scale
     network : evaluates that network (in the precision that the run asks for)
-    start : Field to fit to; evaluated where the points are, in chunks
+    start : Field to fit to, on any device
     steps, points_per_batch, learning_rate : of the fit; the rate falls to a tenth by a cosine
     generator : draws the points
     on_step : called with the step and the loss; True ends the fit
     """
     adam = torch.optim.Adam(field.network.parameters(), lr=learning_rate)
     device = next(field.network.parameters()).device
+    start = start.to(device)
     lower, edges = torch.tensor(field.box.lower), torch.tensor(field.box.edges)
     for step in range(steps):
         points = (lower + edges * torch.rand(points_per_batch, 3, generator=generator)).to(device)
@@ -82,5 +83,5 @@ def fit_network(
         adam.zero_grad()
         loss.backward()
         adam.step()
-        if on_step(step + 1, float(loss.detach())):
+        if on_step is not None and on_step(step + 1, float(loss.detach())):
             break

@@ -102,6 +102,12 @@ def run_sequence(
         progress.failed += told["what"] == "failed"
         on_progress(progress)
 
+    def fail(frames: list[int], reason: str, attempts: int) -> None:
+        for i in frames:
+            store.fail(i, reason, attempts)
+        progress.failed += len(frames)
+        on_progress(progress)
+
     def submit(first: int, last: int) -> Future:
         key = f"frames-{first}-{last}-{uuid.uuid4()}"
         future = client.submit(_in_worker, plan, first, last, topic, key=key, pure=False, priority=-first)
@@ -115,19 +121,20 @@ def run_sequence(
         queue = as_completed([submit(*c) for c in chunks_of(missing, length, len(status))])
         for future in queue:
             first, last = chunk.pop(str(future.key))
-            try:
-                future.result()
-            except KilledWorker:
-                left = [i for i in range(first, last) if store.status[i] == MISSING]
-                if left and begun.get(left[0], 0) > deaths.get(left[0], 0):
-                    deaths[left[0]] = deaths.get(left[0], 0) + 1
-                    if deaths[left[0]] >= ATTEMPTS:
-                        reason = f"its worker died {ATTEMPTS} times; out of memory? see the worker's log"
-                        store.fail(left.pop(0), reason, ATTEMPTS)
-                        progress.failed += 1
-                        on_progress(progress)
-                if left:
-                    queue.add(submit(first, last))
+            if future.status != "error":
+                future.result()  # raises where the cluster was lost, not the work
+                continue
+            left, error = [i for i in range(first, last) if store.status[i] == MISSING], future.exception()
+            if not isinstance(error, KilledWorker):
+                fail(left, f"{type(error).__name__}: {error}", 1)
+                continue
+            if left and begun.get(left[0], 0) > deaths.get(left[0], 0):
+                deaths[left[0]] = deaths.get(left[0], 0) + 1
+                if deaths[left[0]] >= ATTEMPTS:
+                    reason = f"its worker died {ATTEMPTS} times; out of memory? see the worker's log"
+                    fail([left.pop(0)], reason, ATTEMPTS)
+            if left:
+                queue.add(submit(first, last))
     finally:
         client.unsubscribe_topic(topic)
     return progress

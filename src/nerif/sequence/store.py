@@ -7,6 +7,7 @@ half-written counts as missing and is done again.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.netcdf import reading
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence, add_frames
 
@@ -128,12 +130,12 @@ class SequenceStore(VolumeSequence):
     @property
     def status(self) -> np.ndarray:
         """(time,) MISSING, DONE or FAILED, as it is on disc now."""
-        return np.asarray(self.array("status")[:])
+        return self.read("status", slice(None))
 
     @property
     def reasons(self) -> list[str]:
         """(time,) why a frame failed, or nothing."""
-        return [str(r) for r in self.array("reason")[:]]
+        return [str(r) for r in self.read("reason", slice(None))]
 
     def write_frame(self, index: int, frame: Frame) -> None:
         """Write a frame; it counts as done when the last of it is written."""
@@ -165,22 +167,25 @@ class SequenceStore(VolumeSequence):
 
     def field(self, index: int) -> NeuralField:
         """Return the field of a frame that is done."""
-        if int(self.array("status")[index]) != DONE:
+        if int(self.read("status", index)) != DONE:
             raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
-        try:
+        with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
             network = _network(self.attributes)
-        except TypeError as error:
-            raise InputError(f"{self.path}: made by another version of nerif ({error}); reconstruct it again") from None
-        weights, at = torch.from_numpy(np.asarray(self.array("weights")[index])), 0
+            length = int(self.attributes["chunk"]) if isinstance(network, SpaceTimeNetwork) else 1
+        weights, at = torch.from_numpy(self.read("weights", index)), 0
+        scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
+        parameters = list(network.parameters())
+        if len(weights) != sum(p.numel() for p in parameters) or not bool(torch.isfinite(weights).all()):
+            raise InputError(f"{self.path}: frame {index}: expected finite weights of its network; is it damaged?")
+        if not math.isfinite(scale + offset):
+            raise InputError(f"{self.path}: frame {index}: expected finite index_scale and offset; is it damaged?")
         with torch.no_grad():
-            for parameter in network.parameters():
+            for parameter in parameters:
                 parameter.copy_(weights[at : at + parameter.numel()].reshape(parameter.shape))
                 at += parameter.numel()
         network.eval().requires_grad_(False)
-        scale, offset = (float(self.array(name)[index]) for name in ("index_scale", "offset"))
         if not isinstance(network, SpaceTimeNetwork):
             return NeuralField(network, self.grid.box, scale, offset)
-        length = int(self.attributes["chunk"])
         first = index // length * length
         tau = chunk_tau(self.times, index, first, min(first + length, len(self)))
         return SpaceTimeField(network, self.grid.box, tau, scale, offset)

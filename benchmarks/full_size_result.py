@@ -1,0 +1,125 @@
+"""What follows the training of a full-size measurement: seconds and memory of re-projection, files and report.
+
+    python benchmarks/full_size_result.py --views 12 --pixels 1024
+
+A network is fitted to a flame, not trained on views, since only what comes after the training is looked at. What was
+measured is the prediction plus noise of 5 %. Every stage is a process of its own, so that its peak memory is its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+
+from nerif.evaluation import evaluate_views
+from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Ring
+from nerif.measurement import Measurement
+from nerif.members import all_quantities
+from nerif.physics.quantities import GasSettings
+from nerif.prediction import reproject
+from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.reconstruction.warm_start import fit_network
+from nerif.reprojection import Reprojection
+from nerif.result import ResultDirectory
+from nerif.workflow import write_report
+
+BOX, N_AMBIENT, NOISE = Box.cube(50.0), 1.00027, 0.05
+STAGES = ("prepare", "volume", "reproject", "score", "write", "report")
+
+
+def prepare(out: ResultDirectory, measured: Path, views: int, pixels: int, steps: int) -> None:
+    """Fit the network, and make the measurement of it."""
+    torch.manual_seed(0)
+    network = Network(NetworkShape())
+    field = NeuralField(network, BOX, 1e-4)
+    flame = make_phantom("flame", BOX, 0, 0.0)
+    fit_network(field, network, flame, steps, 4096, 2e-3, torch.Generator().manual_seed(0))
+    network.eval().requires_grad_(False)
+    result = Reconstruction(field, BOX, N_AMBIENT, [], Outcome("time_limit", "fitted"), {"model": "lever_arm"})
+    out.begin({"method": "nerif", "measurement": str(measured)})
+    out.write_field(result)
+    out.write_metrics({"outcome": "time_limit", "message": "fitted", "seconds": 0.0})
+    cameras = Ring(views=views, image_size=(pixels, pixels), pixel_pitch=0.02 * 200 / pixels).cameras()
+    empty = Measurement(cameras, torch.zeros(views, pixels, pixels, 2), BOX, N_AMBIENT)
+    predicted = reproject(field, empty).predicted
+    sigma = NOISE * float(predicted.square().mean().sqrt())
+    noisy = predicted + sigma * torch.randn(predicted.shape, generator=torch.Generator().manual_seed(1))
+    replace(empty, displacement=noisy, sigma=torch.full_like(noisy, sigma)).write(measured)
+
+
+def stage(name: str, folder: Path, views: int, pixels: int, steps: int) -> str:
+    """Do one stage, and return a row of the table."""
+    out, measured, kept = ResultDirectory(folder / "result"), folder / "m.nc", folder / "views.pt"
+    note, data, views_seen = "", None, None
+    if name in ("reproject", "score", "write"):
+        data = Measurement.read(measured)
+    if name in ("score", "write"):
+        views_seen = Reprojection(data, torch.load(kept)) if data else None
+    began, before = time.perf_counter(), _cpu()
+    if name == "prepare":
+        prepare(out, measured, views, pixels, steps)
+    elif name == "volume":
+        field, box, n_ambient = out.field()
+        result = Reconstruction(field, box, n_ambient, [], Outcome("time_limit", "fitted"), {"model": "lever_arm"})
+        out.write_volumes(all_quantities(result, GasSettings(), 100))
+    elif name == "reproject" and data is not None:
+        found = reproject(out.field()[0], data)
+        rms = float(found.predicted.square().mean().sqrt())
+        sigma = NOISE * rms
+        error = found.accuracy.error_px
+        note = f"error {error:.2g} px = {error / rms:.2%} of rms d = {error / sigma:.3f} sigma"
+        torch.save(found.predicted, kept)
+    elif name == "score" and views_seen is not None:
+        scores = evaluate_views(views_seen)
+        out.add_metrics({"views": scores})
+        note = f"rms over sigma {max(v['rms_over_sigma'] for v in scores):.4f}"
+    elif name == "write" and views_seen is not None:
+        out.write_reprojection(views_seen)
+        note = f"{(out / 'reprojection.nc').stat().st_size / 2**20:.0f} MiB"
+    elif name == "report":
+        note = f"page of {write_report(out.path).stat().st_size / 1e6:.1f} MB"
+    seconds, busy = time.perf_counter() - began, _cpu() - before
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return f"| {name} | {seconds:.1f} | {busy:.1f} | {peak:.2f} | {note} |"
+
+
+def _cpu() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def main() -> None:
+    """Run the stages one after the other and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", type=int, default=12)
+    parser.add_argument("--pixels", type=int, default=1024)
+    parser.add_argument("--steps", type=int, default=300, help="of the fit of the network")
+    parser.add_argument("--folder", type=Path, help="where the files are kept; default: a temporary one")
+    parser.add_argument("--stage", choices=STAGES, help="this one only, on the files of an earlier call")
+    given = parser.parse_args()
+    if given.stage:
+        print(stage(given.stage, given.folder, given.views, given.pixels, given.steps), flush=True)
+        return
+    folder = given.folder or Path(tempfile.mkdtemp())
+    machine = f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
+    print(f"{given.views} views of {given.pixels} x {given.pixels}; {machine}; {datetime.now(UTC):%Y-%m-%d}\n")
+    print("| stage | seconds | of CPU | peak GiB | |\n|---|---|---|---|---|", flush=True)
+    same = ["--folder", str(folder), "--views", str(given.views), "--pixels", str(given.pixels)]
+    for name in STAGES:
+        subprocess.run([sys.executable, __file__, *same, "--steps", str(given.steps), "--stage", name], check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""Every script of benchmarks/ runs, at its smallest, and writes its table."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+SMALLEST = {
+    "calibration": "--views 2 --arc 20 --pixels 320 --poses 8 --backgrounds 2",
+    "choices": "--points 256 --pixels 12 --time-limit 5",
+    "displacement": "--pixels 64 --phantom gaussians --background dots --method correlation",
+    "ensemble": "--members 2 --steps 5 --phantoms gaussians --noise 0.05 --leave-one-out no",
+    "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 5 --voxels 12",
+    "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",
+    "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5 --joint 5",
+    "voxel_cost": "--voxels 8 --basis linear --iterations 1 --pixels 12",
+    "warm_start": "--pixels 12 --seconds 8 --voxels 12 --fit-steps 5",
+}
+SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem != "bench")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_script(name, tmp_path):
+    table = tmp_path / "results" / "table.md"
+    words = [*SMALLEST[name].split(), "--write", str(table)] if name in SMALLEST else ["--help"]
+    command = [sys.executable, str(FOLDER / f"{name}.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    if name in SMALLEST:
+        lines = table.read_text().splitlines()
+        assert lines[0].startswith("# ")
+        assert lines[2].startswith(f"Command: `python benchmarks/{name}.py --")
+        rule = next(i for i, line in enumerate(lines) if line.startswith("|---"))
+        head, row = lines[rule - 1], lines[rule + 1]
+        assert head.count("|") == row.count("|") > 3
+        assert "nan" not in row

@@ -1,0 +1,119 @@
+"""An index excess is counted from an ambient: truths and phantoms over another one are converted, or refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerif.cli import main
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate
+from nerif.fields.grid import VoxelField
+from nerif.geometry import Grid
+from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.result import ResultDirectory
+from nerif.simulation import Simulation, simulate
+from nerif.volume import Volume, write_netcdf
+
+N_AMBIENT = 1.00027
+
+
+@pytest.fixture(scope="module")
+def truth(ball, box) -> Volume:
+    """The balls over air."""
+    grid = Grid(box, (12, 14, 16))
+    return Volume(ball.sample(grid), grid, attributes={"n_ambient": N_AMBIENT})
+
+
+@pytest.fixture
+def perfect(truth, tmp_path) -> ResultDirectory:
+    """A result whose field is the truth."""
+    field = VoxelField.through(truth.values, truth.grid)
+    out = ResultDirectory(tmp_path / "r")
+    out.begin({"method": "tikhonov"})
+    out.write_field(Reconstruction(field, truth.grid.box, N_AMBIENT, [], Outcome("converged", ""), {}))
+    return out
+
+
+def over_vacuum(truth: Volume) -> Volume:
+    """The same n, counted from 1."""
+    return replace(truth, values=truth.values + (N_AMBIENT - 1), attributes={"n_ambient": 1.0})
+
+
+def test_an_excess_is_converted_to_another_ambient(truth):
+    other = over_vacuum(truth)
+    assert other.relative_to(N_AMBIENT).n_ambient == N_AMBIENT
+    torch.testing.assert_close(other.relative_to(N_AMBIENT).values, truth.values, atol=1e-9, rtol=0)
+    n = Volume(truth.values.double() + N_AMBIENT, truth.grid, "n")
+    torch.testing.assert_close(n.relative_to(N_AMBIENT).values, truth.values, atol=1e-9, rtol=0)
+    assert truth.relative_to(N_AMBIENT) is truth
+    with pytest.raises(InputError, match="attribute n_ambient"):
+        replace(truth, attributes={}).relative_to(N_AMBIENT)
+    with pytest.raises(InputError, match="index_excess or n, got 'density'"):
+        replace(truth, quantity="density").relative_to(N_AMBIENT)
+
+
+def test_a_perfect_field_scores_so_against_a_truth_over_another_ambient(truth, perfect, tmp_path):
+    path = tmp_path / "t.nc"
+    write_netcdf(path, [over_vacuum(truth)])
+    metrics = evaluate(perfect.path, truth=path)
+    assert metrics["l2_variation"] < 1e-3
+    assert perfect.metrics()["l2"] == metrics["l2"]
+    result = replace(perfect.read(), volumes={})
+    assert result.truth is not None
+    perfect.write_volumes([truth])
+    shown = perfect.read().truth
+    assert shown is not None
+    torch.testing.assert_close(shown.values, truth.values, atol=1e-9, rtol=0)
+
+
+def test_a_truth_over_an_unknown_ambient_is_refused(truth, perfect, tmp_path, capsys):
+    path = tmp_path / "t.nc"
+    write_netcdf(path, [replace(truth, attributes={})])
+    assert main(["evaluate", str(perfect.path), "--truth", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "t.nc" in said
+    assert "n_ambient" in said
+
+
+def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_path):
+    pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
+    from nerif.fields.mlp import Network, NetworkShape, NeuralField
+    from nerif.measurement_sequence import MeasurementSequence
+    from nerif.sequence.evaluation import evaluate_sequence
+    from nerif.sequence.store import Frame, SequenceStore
+    from nerif.volume_sequence import VolumeSequence
+
+    shape, grid = NetworkShape(2, 8, 1), Grid(measurement.box, (6, 7, 8))
+    sequence = MeasurementSequence.create(tmp_path / "m.zarr", [0.0], measurement)
+    sequence.write_frame(0, measurement)
+    store = SequenceStore.begin(tmp_path / "r.zarr", sequence, grid, ("index_excess",), shape, {})
+    field = NeuralField(Network(shape), measurement.box, 1e-4)
+    excess = Volume(field.sample(grid), grid)
+    store.write_frame(0, Frame(field, [excess], {}, {}, 0.0, 0))
+    truth = VolumeSequence.create(tmp_path / "t.zarr", [0.0], grid, ("index_excess",), 1.0)
+    truth.write(0, [replace(excess, values=excess.values + (N_AMBIENT - 1))])
+    assert evaluate_sequence(store.path, truth.path)["mean"]["l2_variation"] < 1e-3
+
+
+@pytest.mark.parametrize("n_ambient", [N_AMBIENT, None])
+def test_a_phantom_is_what_its_file_says(truth, cameras, tmp_path, n_ambient):
+    """Over the ambient that is asked for, or else that of the file."""
+    path: Path = tmp_path / "own.nc"
+    own = over_vacuum(truth) if n_ambient else truth
+    write_netcdf(path, [own])
+    quick = Simulation(phantom=str(path), n_ambient=n_ambient, steps=12, truth_voxels=16)
+    measurement, made = quick(cameras[:2])
+    field = VoxelField.through(truth.values, truth.grid)
+    expected = simulate(field, cameras[:2], truth.grid.box, N_AMBIENT, steps=12)
+    assert measurement.n_ambient == N_AMBIENT
+    error = (measurement.displacement - expected.displacement).norm() / expected.displacement.norm()
+    assert float(error) < 1e-3
+    assert float((made.values - field.sample(made.grid)).abs().max()) < 1e-3 * float(truth.values.abs().max())
+    write_netcdf(path, [replace(own, attributes={})])
+    with pytest.raises(InputError, match=r"own\.nc: expected the attribute n_ambient"):
+        quick(cameras[:2])
