@@ -32,7 +32,10 @@ VERBS = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Run the command line and return its exit code.
+
+    0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted.
+    """
     words = sys.argv[1:] if arguments is None else list(arguments)
     if not words or words[0] in ("-h", "--help"):
         print("usage: nerif VERB [options]      (nerif VERB --help tells all options, units and defaults)\n")

@@ -36,12 +36,18 @@ class Outcome:
 
     Parameters
     ----------
-    reason : one word: converged, discrepancy, epochs, steps, iterations, time_limit, interrupted or diverged
+    reason : one word: converged, discrepancy, epochs, steps, iterations, time_limit, interrupted, diverged or
+        collapsed (the field explains nothing of what was measured)
     message : one sentence, with the remedy where there is one
     """
 
     reason: str
     message: str
+
+    @property
+    def failed(self) -> bool:
+        """Whether no field was found."""
+        return self.reason in ("diverged", "collapsed")
 
 
 @dataclass(frozen=True)

@@ -161,6 +161,8 @@ def _of_outcome(result: Result) -> list[Statement]:
         return []
     if outcome == "diverged":
         return [Statement("bad", f"The run diverged. {message}".strip())]
+    if outcome == "collapsed":
+        return [Statement("bad", f"The run found no field. {message}".strip())]
     if outcome == "interrupted":
         return [Statement("warning", f"The run was interrupted; --resume continues it. {message}".strip())]
     if outcome in ("time_limit", "steps"):
