@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import study
+from benchmarks.study_records import record
 from nerif import __version__
 from nerif.conventions import InputError
 from nerif.fields.base import Field
@@ -195,11 +196,13 @@ class OnMeta(Tikhonov):
     """A method whose field is on the device "meta"."""
 
     field: Elsewhere = dataclass_field(default_factory=Elsewhere)
+    steps: int = 1
 
     def __call__(self, measurement, *arguments, **more):
         return Reconstruction(
-            self.field, measurement.box, measurement.n_ambient, [{}], Outcome("steps", ""), {}, device="meta"
-        )
+            self.field, measurement.box, measurement.n_ambient, [{}] * self.steps, Outcome("steps", "too soon"), {},
+            device="meta",
+        )  # fmt: skip
 
 
 def test_everything_asks_the_field_where_it_is(tmp_path):
@@ -207,6 +210,12 @@ def test_everything_asks_the_field_where_it_is(tmp_path):
     method = OnMeta(voxels=8)
     run_case(small("o", method, phantom="octahedron", noise=0.0), tmp_path)
     assert method.field.asked == {"meta"}
+
+
+def test_a_run_without_a_step_is_no_result(tmp_path):
+    (tmp_path / "data").mkdir()
+    with pytest.raises(InputError, match="not a single step was made: too soon"):
+        run_case(small("none", OnMeta(voxels=8, steps=0)), tmp_path)
 
 
 def test_help_tells_the_values_that_are_used():
@@ -224,22 +233,83 @@ def test_the_folder_runs_as_a_program():
     assert done.stderr.startswith("study: only: expected sections out of tables")
 
 
-def test_the_command(tmp_path, capsys):
+WORDS = ("--quick", "--pixels", "12", "--device", "cpu", "--only", "sampling")
+
+
+@pytest.mark.slow
+def test_the_command_reconstructs(tmp_path, capsys):
+    assert main(["-o", str(tmp_path), *WORDS, "--time-limit", "5"]) == 0
+    assert "3 of 3 reconstructions" in capsys.readouterr().out
+    assert f"| {__version__} | " in (tmp_path / "study.md").read_text()
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Records are made up instead of computed, but for those whose keys are in the list: "fails" or "interrupted"."""
+    special: dict[str, str] = {}
+
+    def run_cases(todo, folder, tell):
+        (folder / "cases").mkdir(parents=True, exist_ok=True)
+        for i, case in enumerate(todo):
+            if special.get(case.key) == "interrupted":
+                raise KeyboardInterrupt
+            found = {"failed": "no memory"} if special.get(case.key) == "fails" else record(case)
+            tell(i + 1, case.key, 0.0)
+            yield write_record(folder, case, found)
+
+    monkeypatch.setattr("study.command.run_cases", run_cases)
+    return special
+
+
+def test_the_command_writes_the_page(made, tmp_path, capsys):
     out = tmp_path / "study"
-    words = ["-o", str(out), "--quick", "--pixels", "12", "--time-limit", "0.2", "--device", "cpu"]
-    assert main([*words, "--only", "sampling"]) == 0
+    assert main(["-o", str(out), *WORDS]) == 0
     assert "3 of 3 reconstructions" in capsys.readouterr().out
     page = (out / "study.md").read_text()
-    assert f"| {__version__} | " in page
     assert "Random against regular sampling" in page
+    assert f"| {__version__} | " in page
     assert (out / "study.html").read_text().startswith("<!DOCTYPE html>")
-    assert main([*words, "--only", "sampling", "--page-only"]) == 0
+    (out / "study.md").unlink()
+    assert main(["-o", str(out), *WORDS, "--page-only"]) == 0
+    assert (out / "study.md").read_text() == page
 
-    assert main([*words, "--only", "tabels"]) == 2
-    assert "only: expected sections" in capsys.readouterr().err
-    assert main(["-o", str(out), "--pixels", "3"]) == 2
-    assert main(["-o", str(out), "--device", "cuda:9"]) == 2
-    assert main(["-o", str(out), "--preset", "nonsense"]) == 2
+
+def test_the_command_tells_what_failed_and_what_is_of_another_version(made, tmp_path, capsys, monkeypatch):
+    made["sampling-random"] = "fails"
+    assert main(["-o", str(tmp_path), *WORDS]) == 1
+    said = capsys.readouterr().out
+    assert "2 of 3 reconstructions" in said
+    assert "failed: sampling-random: no memory" in said
+    monkeypatch.setattr("study.records.__version__", "9.9")
+    monkeypatch.setattr("study.cases.__version__", "9.9")
+    assert main(["-o", str(tmp_path), *WORDS, "--page-only"]) == 0
+    assert f"another version of nerif ({__version__})" in (tmp_path / "study.md").read_text()
+    made.clear()
+    assert main(["-o", str(tmp_path), *WORDS]) == 0
+    assert f"made by another version of nerif ({__version__}), and so made again: " in capsys.readouterr().out
+
+
+def test_an_interrupted_command_leaves_a_page(made, tmp_path, capsys):
+    made["sampling-regular"] = "interrupted"
+    assert main(["-o", str(tmp_path), *WORDS]) == 130
+    assert "the same command goes on from here" in capsys.readouterr().out
+    assert "**2 of 3 reconstructions are done; 1 are still to come" in (tmp_path / "study.md").read_text()
+
+
+def test_bad_input_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    for words, said in (
+        (["--only", "tabels"], "only: expected sections"),
+        (["--pixels", "3"], "pixels: expected at least 8, got 3"),
+        (["--time-limit", "0"], "time_limit: expected seconds above 0"),
+        (["--device", "cuda:9"], "cuda:9"),
+        (["--preset", "nonsense"], "nonsense"),
+        (["-o", str(tmp_path / "file")], "expected a directory for --out"),
+    ):
+        assert main(["-o", str(tmp_path / "out"), *words]) == 2
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ def undisturbed(measurement: Measurement) -> Reconstruction:
 
 
 def test_finds_the_balls_without_seeing_them(measurement, ball):
-    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=160, points_per_batch=2048)(
+    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=250, points_per_batch=2048)(
         measurement
     )
     grid = Grid.of_resolution(measurement.box, 30)
@@ -230,7 +230,7 @@ def test_open_faces_drop_their_rays(measurement):
 def test_no_displacement_gives_ambient(measurement):
     still = replace(measurement, displacement=torch.zeros_like(measurement.displacement), sigma=None)
     result = SMALL(still)
-    assert float(result.field(torch.rand(50, 3)).abs().max()) < 1e-5
+    assert float(result.field(torch.rand(50, 3)).abs().max()) < 1e-7  # of a moving field: 4e-6
 
 
 def test_bf16_gives_way_to_float32_at_the_end(measurement, undisturbed):
