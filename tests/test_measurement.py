@@ -151,3 +151,44 @@ def test_normal_that_is_no_unit_vector(full, tmp_path):
     dataset.to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
     with pytest.raises(InputError, match="background_normal of view '60deg'"):
         Measurement.read(tmp_path / "x.nc")
+
+
+def test_sigma_and_displacement_that_no_camera_measures_are_left_out(full):
+    """Extreme sigma would weigh one pixel against all others, and overflow in single precision."""
+    sigma, d = full.sigma.clone(), full.displacement.clone()
+    sigma[0, 1, 1], sigma[0, 1, 2], d[0, 1, 3] = 1e-30, 1e30, 1e30
+    m = replace(full, sigma=sigma, displacement=d, valid=None)
+    assert m.bad_pixels == 3
+    assert not bool(m.usable[0, 1, 1:4].any())
+    with pytest.raises(InputError, match="no valid pixel"):
+        replace(full, sigma=torch.full_like(sigma, 1e-30))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0, 1e300])
+def test_image_size_that_is_no_size(full, tmp_path, value):
+    dataset = full.to_dataset()
+    dataset["image_size"] = dataset["image_size"].astype(float)
+    dataset["image_size"].values[1] = value
+    with pytest.raises(InputError, match="image_size"):
+        Measurement.from_dataset(dataset)
+
+
+def test_units_are_checked_and_axes_are_known_by_their_names(full):
+    dataset = full.to_dataset()
+    turned = dataset.assign(displacement=dataset["displacement"].transpose("row", "component", "view", "column"))
+    assert torch.equal(Measurement.from_dataset(turned).displacement.nan_to_num(), full.displacement.nan_to_num())
+    for name, unit in (("translation", "m"), ("background_normal", "deg"), ("box", np.array([1.0, 2.0]))):
+        other = full.to_dataset()
+        other[name].attrs["units"] = unit
+        with pytest.raises(InputError, match=f"variable '{name}': expected units"):
+            Measurement.from_dataset(other)
+
+
+def test_truncated_file_is_refused_in_silence(full, tmp_path, capfd):
+    full.write(tmp_path / "m.nc")
+    content = (tmp_path / "m.nc").read_bytes()
+    for share in (0.2, 0.6, 0.95):
+        (tmp_path / "cut.nc").write_bytes(content[: int(share * len(content))])
+        with pytest.raises(InputError, match=r"cut.nc: not a readable NetCDF-4 file, or truncated"):
+            Measurement.read(tmp_path / "cut.nc")
+    assert capfd.readouterr().err == ""

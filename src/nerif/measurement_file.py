@@ -138,8 +138,8 @@ def _check_variables(dataset: xr.Dataset) -> None:
             raise InputError(f"variable '{name}': expected units '{unit}', got '{given}'")
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
-        got = f"{views} x {rows} x {columns}"
-        raise InputError(f"variable 'displacement': expected views of some megapixels, got {got}")
+        shape = f"{views} x {rows} x {columns}"
+        raise InputError(f"variable 'displacement': expected views of some megapixels, got {shape}")
 
 
 def _array(dataset: xr.Dataset, name: str) -> Tensor:
@@ -170,8 +170,8 @@ def _map(dataset: xr.Dataset, name: str) -> Tensor:
 
 
 def _box(dataset: xr.Dataset) -> Box:
-    lower, upper = (tuple(corner) for corner in _array(dataset, "box").tolist())
-    return Box(lower, upper)
+    lower, upper = _array(dataset, "box").tolist()
+    return Box(tuple(lower), tuple(upper))
 
 
 def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:

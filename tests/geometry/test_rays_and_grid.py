@@ -104,3 +104,21 @@ def test_ring_settings():
     for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
         with pytest.raises(InputError, match=name):
             Ring(**{name: -1})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("views", 0), ("distance", -1.0), ("focal_length", math.inf), ("elevation", math.nan)]
+)
+def test_rings_that_cannot_be(name, value, unchecked):
+    with pytest.raises(InputError, match=f"{name}: expected"):
+        Ring(**{name: value})
+
+
+def test_boxes_and_grids_that_cannot_be(unchecked):
+    for lower, upper in (((0, 0, 0), (1, 1, math.nan)), ((1e6, 0, 0), (1e6 + 1, 1, 1)), ((0, 0, 0), (1e9, 1, 1))):
+        with pytest.raises(InputError, match="box: expected lower < upper"):
+            Box(lower, upper)
+    with pytest.raises(InputError, match="voxels: expected at least 1"):
+        Grid.of_resolution(Box.cube(1.0), 0)
+    with pytest.raises(InputError, match="grid: expected three positive"):
+        Grid(Box.cube(1.0), (1.5, 2, 2))

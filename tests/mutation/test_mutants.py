@@ -40,7 +40,8 @@ BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))
 QUICK = 40
 """Mutants of each kind in `make test`."""
 MANY = {
-    "m.nc": 3600, "v.nc": 1600, "v.vti": 900, "c.toml": 1200, "c.csv": 400, "c.json": 500, "m.zarr": 1000, "r.zarr": 800,
+    "m.nc": 3600, "v.nc": 1600, "v.vti": 900, "c.toml": 1200, "c.csv": 400, "c.json": 500, "m.zarr": 1000,
+    "r.zarr": 800,
 }  # fmt: skip
 """Mutants of each kind in `make test-all`: ten thousand."""
 BLOCK = 200
@@ -113,7 +114,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     reconstruction = NETWORK(m)
     excess = Volume(reconstruction.field.sample(grid), grid)
     film = MeasurementSequence.read(folder / "m.zarr")
-    result = SequenceStore.begin(folder / "r.zarr", film, grid, ("index_excess",), NETWORK.network, {"temporal": "warm"})
+    about = {"temporal": "warm"}
+    result = SequenceStore.begin(folder / "r.zarr", film, grid, ("index_excess",), NETWORK.network, about)
     for i in range(2):
         result.write_frame(i, Frame(reconstruction.field, [excess], {}, {}, seconds=1.0, steps=2))
     return folder

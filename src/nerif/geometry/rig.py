@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from nerif.conventions import InputError
@@ -39,8 +40,11 @@ class Ring:
 
     def __post_init__(self) -> None:
         for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("arc", "extra_angles", "elevation"):
+            if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
+                raise InputError(f"{name}: expected degrees, got {getattr(self, name)}")
         if min(self.image_size) < 1:
             raise InputError(f"image_size: expected (height, width) > 0 px, got {self.image_size}")
 
