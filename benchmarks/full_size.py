@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, machine
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig

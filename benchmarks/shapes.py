@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from flame import N_AMBIENT, machine
+from bench import N_AMBIENT, machine
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
