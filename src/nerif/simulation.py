@@ -155,9 +155,15 @@ class Simulation:
         InputError
             If there is no such phantom, or a volume file is none.
         """
+        return self._with_noise(self.seed, cameras, on_view)
+
+    def _with_noise(
+        self, seed: int, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None
+    ) -> tuple[Measurement, Volume]:
+        """The same phantom, with the noise of another seed."""
         field, box, n_ambient = self._field()
         measurement = simulate(
-            field, cameras, box, n_ambient, self.noise, self.seed, self.steps, self.wavelength_nm, self.ambient_faces,
+            field, cameras, box, n_ambient, self.noise, seed, self.steps, self.wavelength_nm, self.ambient_faces,
             on_view,
         )  # fmt: skip
         grid = Grid.of_resolution(box, self.truth_voxels)
@@ -182,7 +188,7 @@ class Simulation:
         if self.phantom not in MOVING:
             raise InputError(f"times: expected a phantom that moves (flame, 2-7), got '{self.phantom}'")
         for i, time in enumerate(times):
-            measurement, volume = replace(self, time=time, seed=self.seed + i)(cameras)
+            measurement, volume = replace(self, time=time)._with_noise(self.seed + i, cameras)
             if i == 0:
                 sequence = MeasurementSequence.create(out, times, measurement, force)
                 store = VolumeSequence.create(truth, times, volume.grid, ("index_excess",), measurement.n_ambient)
