@@ -67,7 +67,6 @@ class Training:
             raise InputError(
                 f"torchrun: expected at least a ray a process, got {len(data)} rays for {self.ranks.size}"
             )
-        self.budget = Budget(settings, len(data), self.ranks, self.device)
         self.generator = torch.Generator().manual_seed(settings.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -76,6 +75,7 @@ class Training:
         self.density = SamplingDensity(self.field)
         self.optimiser = NetworkOptimiser(settings.optimiser, network, settings.betas, settings.momentum)
         self.network = MixedPrecision(network, self.device, settings.precision, settings.compile)
+        self.budget = Budget(settings, len(data), self.ranks, self.device)  # its clock begins here: imports are no training
         self.history: list[dict[str, float]] = []
         self.order = torch.empty(0, dtype=torch.long)
         self.retries, self.rate = 0, 1.0
