@@ -35,8 +35,7 @@ nerif("calibrate", pictures, "--config", pictures / "calibrate.toml", "-o", out 
 nerif("displacement", pictures, "--calibration", out / "calibration.toml", "--lower", -25, -25, -25,
       "--upper", 25, 25, 25, "-o", out / "measurement.nc", "--force")  # fmt: skip
 
-# Swapped components, flipped signs, mirrored and exchanged views would be named here. It does find that the flow seems
-# to go on beyond the top and bottom of the box: this rendered flame is cut there, which the optical flow smears.
+# Swapped components, flipped signs, mirrored and exchanged views would be named here, and flow that leaves the box.
 nerif("check", out / "measurement.nc")
 
 nerif("reconstruct", out / "measurement.nc", "-o", out / "result", "--time-limit", 30, "--voxels", 64, "--force")

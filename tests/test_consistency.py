@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from nerif.cli import main
-from nerif.consistency import binned, check_consistency
+from nerif.consistency import _fit, _open_faces, binned, check_consistency
 from nerif.fields.phantoms import make_phantom
-from nerif.geometry import Box, Ring
+from nerif.geometry import Box, Ring, paper_rig
 from nerif.measurement import Measurement
 from nerif.simulation import simulate
 
@@ -111,6 +112,22 @@ def test_no_false_alarm(phantom, seed, noise):
     assert found.findings == ()
     assert all(v.verdict == "" for v in found.views)
     assert any("lighter" in r for r in found.remarks)
+
+
+@pytest.fixture(scope="module")
+def cut() -> Measurement:
+    """A flame that ends at the top and bottom of the box, all of which the pictures show, without noise."""
+    cameras, box = paper_rig(32)
+    return simulate(make_phantom("flame", box, 0), cameras[::2], box, 1.00027, steps=30)
+
+
+@pytest.mark.parametrize("smeared", [0.0, 1.0])
+def test_a_flame_that_ends_at_the_box_does_not_go_on_beyond_it(cut, smeared):
+    """Optical flow smears the edges at the ends over its window."""
+    d = torch.from_numpy(gaussian_filter(cut.displacement.numpy(), (0, smeared, smeared, 0)))
+    small = replace(cut, displacement=d)
+    field, _ = _fit(small, 24, 3e-3)
+    assert _open_faces(field, small) == []
 
 
 def test_a_flipped_sign_of_everything_shows_as_a_denser_flow(clean):

@@ -13,8 +13,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = (
-    "index", "tutorial", "images", "sequences", "choosing", "limits", "conventions", "method", "formats", "benchmarks",
-    "api", "architecture", "changelog", "api/geometry", "api/reconstruction",
+    "index", "tutorial", "images", "sequences", "python", "choosing", "limits", "conventions", "method", "formats",
+    "benchmarks", "api", "contributing", "architecture", "changelog", "api/geometry", "api/reconstruction",
     "repository/benchmarks/results/methods-cpu", "repository/examples/own_data",
 )  # fmt: skip
 DRAWINGS = ("axes", "displacement", "volume", "lever_arm")
@@ -107,3 +107,18 @@ def test_links_of_a_page_lead_somewhere_on_a_forge_too(page: str) -> None:
         if not re.match(r"[a-z]+:", link):
             file = link.split("#")[0]
             assert not file or (ROOT / "docs" / file).exists(), link
+
+
+def test_the_page_of_python_runs(tmp_path: Path) -> None:
+    """Every block in order, in one namespace, as in a notebook."""
+    page = (ROOT / "docs" / "python.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    assert len(blocks) >= 8
+    held_out = "\nassert scores['cc'] > 0.9, scores\nassert losses[-1] < losses[0], losses\n"
+    shown = "".join(f"\n{noun}._repr_html_()" for noun in ("measurement", "result", "temperature"))
+    script = tmp_path / "page.py"
+    script.write_text("\n".join(blocks) + held_out + shown)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {p.name for p in tmp_path.iterdir()} >= {"flame.nc", "flame.vti", "flame_volume.nc", "truth.nc", "flame"}
+    assert (tmp_path / "flame" / "report.html").is_file()

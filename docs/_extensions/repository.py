@@ -4,7 +4,7 @@ Pages link to files as a forge wants it, relative to themselves: ../benchmarks/r
 a page for the file, the link is turned to that page:
 
     docs/*.md                                the page itself
-    README.md, CHANGELOG.md                  index, changelog
+    README.md, CHANGELOG.md, CONTRIBUTING.md index, changelog, contributing
     benchmarks/**/*.md, examples/*.py        pages made here, in docs/repository (not under version control)
     src/nerif/**/*.py                        the module in the API reference
 
@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 LINK = re.compile(r"(!?)\[([^\]\n]*(?:\n[^\]\n]*)?)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
-PAGES = {"README.md": "index", "CHANGELOG.md": "changelog", "benchmarks/README.md": "benchmarks", "LICENSE": None}
+PAGES = {"README.md": "index", "CHANGELOG.md": "changelog", "CONTRIBUTING.md": "contributing"}
+PAGES |= {"benchmarks/README.md": "benchmarks"}
 MODULE = "## {0}\n\n```{{eval-rst}}\n.. automodule:: {0}\n```\n"
 INTERNAL = {"nerif.cli", "nerif.reconstruction.kernels_numba", "nerif.reconstruction.kernels_torch"}
 

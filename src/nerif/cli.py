@@ -10,20 +10,20 @@ from nerif import __version__
 __all__ = ["main"]
 
 VERBS = {
-    "design": "before the rig is built: expected displacement, sensitivity, blur and resolution",
-    "pattern": "print-ready backgrounds and calibration targets",
-    "calibrate": "target pictures, or another program's file, to calibrated cameras; draws the rig",
-    "displacement": "pictures of all views to a measurement",
-    "mask": "flow masks of a measurement, by threshold or drawn",
-    "check": "find swapped, flipped, mirrored and exchanged views of a measurement",
-    "render": "pictures of a rendered experiment, with its truth",
+    "design": "before the rig is built: the displacement, sensitivity, blur and resolution to expect",
+    "pattern": "make print-ready backgrounds and calibration targets",
+    "calibrate": "calibrate cameras from images of a target, or import a calibration; draw the rig",
+    "displacement": "turn the images of all views into a measurement",
+    "mask": "add flow masks to a measurement, by threshold or drawn by hand",
+    "check": "find swapped, flipped, mirrored and exchanged views in a measurement",
+    "render": "render the images of an experiment, with its truth",
     "simulate": "trace curved rays through a phantom and write a measurement, with its truth",
     "reconstruct": "reconstruct the refractive-index field of a measurement",
-    "project": "predict the displacement that any camera would see of a reconstruction",
+    "project": "predict the displacement any camera would see through a reconstruction",
     "evaluate": "compare a reconstruction with a truth, or with measured views",
     "sequence": "reconstruct every frame of a recording, on one machine or a cluster",
-    "movie": "draw volumes over time, isosurface or slices, as .mp4 or .gif",
-    "report": "write a page that shows a result, and says whether it can be trusted",
+    "movie": "draw volumes over time, as isosurface or slices, to .mp4 or .gif",
+    "report": "write a page that shows a result and says whether it can be trusted",
     "figures": "write every figure of a result as PDF and PNG at journal widths",
     "export": "write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid",
     "info": "print what a measurement, volume or result holds",
@@ -32,7 +32,10 @@ VERBS = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Run the command line and return its exit code.
+
+    0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted.
+    """
     words = sys.argv[1:] if arguments is None else list(arguments)
     if not words or words[0] in ("-h", "--help"):
         print("usage: nerif VERB [options]      (nerif VERB --help tells all options, units and defaults)\n")

@@ -26,7 +26,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 
 __all__ = ["Consistency", "ViewAgreement", "binned", "check_consistency"]
 
-LONGEST = 48  # px along the longer edge of the pictures that are compared
+LONGEST = 48  # px along the longer edge of the pictures that are compared, whatever the size of the sensor
 BETTER = 0.97  # a mistake is one if undoing it brings the objective of the joint fit below this share
 SHORTLIST = 0.95  # worth a joint fit: undoing it brings the disagreement with the other views below this share
 NO_EXCHANGE = 1.15  # two views are not worth a joint fit if they fit each other's prediction so much worse
@@ -35,8 +35,9 @@ BETTER_EVERYWHERE = 0.8  # and below this if it is to have happened to all views
 FEW, BETTER_OF_FEW = 9, 0.9  # with fewer views, neighbours are further apart, and an exchange needs stronger evidence
 UNLIKE = 0.5  # a view that agrees less than this share of the median, for no reason that is known
 GAIN = 1.6  # a view whose displacements are this many times too large or too small
-OPEN = (0.4, 2.0, 0.3)  # rays through a face beyond which the flow goes on: at least this share of d is not explained,
-# this many times that of the others, and their d is at least this share of the others'
+OPEN = (0.4, 2.0)  # flow goes on beyond a face: what is not explained of rays through it is at least this share of the
+# displacement of the others, and this many times theirs as a share of its own. Rays through an end cross a corner of
+# the box and carry little: flow that ends at the box leaves a large share of that unexplained, but of a small thing
 SPIKE = 6.0  # times the 95th percentile: rays along a sharp edge, which no coarse reconstruction follows
 
 
@@ -88,7 +89,9 @@ def check_consistency(
     on_step : called with the number of reconstructions done, and of those in this round
     """
     small = _without_spikes(binned(measurement, LONGEST))
-    remarks = _looks(measurement, small)
+    pixels = measurement.usable.flatten(1).sum(dim=1).tolist()
+    valid = [n / (c.image_size[0] * c.image_size[1]) for n, c in zip(pixels, measurement.cameras, strict=True)]
+    remarks = _looks(measurement, small, valid)
     names = small.names
     if len(names) < 3:
         return Consistency((), (), (*remarks, "fewer than three views: they cannot be compared with one another"))
@@ -115,10 +118,7 @@ def check_consistency(
             )
         if verdict and not own:
             findings.append(f"view {names[i]}: {verdict}")
-        good = float(measurement.usable[i].float().sum()) / (
-            measurement.cameras[i].image_size[0] * measurement.cameras[i].image_size[1]
-        )
-        views.append(ViewAgreement(names[i], good, agreement, gain, verdict))
+        views.append(ViewAgreement(names[i], valid[i], agreement, gain, verdict))
     if not any(v.verdict for v in views) or found:  # a view that does not fit has rays through every face
         findings += _open_faces(everything, small)
     mean = float(everything.sample(Grid.of_resolution(small.box, voxels)).mean())
@@ -139,16 +139,18 @@ def binned(measurement: Measurement, longest: int) -> Measurement:
         height, width = (max(1, n // bins) for n in camera.image_size)
         cameras.append(replace(camera, intrinsics=k, image_size=(height, width)))
     rows, columns = (n // bins for n in measurement.displacement.shape[1:3])
-    good = measurement.usable[:, : rows * bins, : columns * bins].reshape(-1, rows, bins, columns, bins)
-    d = measurement.displacement[:, : rows * bins, : columns * bins].nan_to_num(0.0, 0.0, 0.0)
-    parts = d.reshape(-1, rows, bins, columns, bins, 2) * good[..., None]
-    count = good.sum(dim=(2, 4))
-    mean = parts.sum(dim=(2, 4)) / count.clamp_min(1)[..., None] / bins
-    enough = count * 2 >= bins * bins
+    inside = (slice(0, rows * bins), slice(0, columns * bins))
+    maps = []
+    for d, usable in zip(measurement.displacement, measurement.usable, strict=True):
+        good = usable[inside].reshape(rows, bins, columns, bins)
+        parts = torch.where(good[..., None], d[inside].reshape(rows, bins, columns, bins, 2), 0.0)
+        count = good.sum(dim=(1, 3))[..., None]
+        mean = parts.sum(dim=(1, 3)) / count.clamp_min(1) / bins
+        maps.append(torch.where(count * 2 >= bins * bins, mean, torch.nan))
     return replace(
         measurement,
         cameras=tuple(cameras),
-        displacement=torch.where(enough[..., None], mean, torch.full_like(mean, float("nan"))),
+        displacement=torch.stack(maps),
         sigma=None,
         valid=None,
         flow_mask=None,
@@ -288,8 +290,8 @@ def _open_faces(field: Field, small: Measurement) -> list[str]:
         if len(own) < 20 or len(usual) < 20:
             continue
         left, left_usual = (float((g[:, 0].sum() / g[:, 1].sum()).sqrt()) for g in (own, usual))
-        size = float((own[:, 1].mean() / usual[:, 1].mean()).sqrt())
-        if left > max(OPEN[0], OPEN[1] * left_usual) and size > OPEN[2]:
+        unexplained = float((own[:, 0].mean() / usual[:, 1].mean()).sqrt())
+        if unexplained > OPEN[0] and left > OPEN[1] * left_usual:
             findings.append(
                 f"face {face}: {left:.0%} of the displacement of rays through it is not explained, {left_usual:.0%} of "
                 f"the others; the flow seems to go on beyond it: give --open-faces {face}, or a larger box"
@@ -297,14 +299,12 @@ def _open_faces(field: Field, small: Measurement) -> list[str]:
     return findings
 
 
-def _looks(measurement: Measurement, small: Measurement) -> list[str]:
+def _looks(measurement: Measurement, small: Measurement, valid: Sequence[float]) -> list[str]:
     """What the displacements themselves tell."""
     remarks = []
-    for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
-        height, width = camera.image_size
-        share = float(measurement.usable[i, :height, :width].float().mean())
-        if share < 0.5:
-            remarks.append(f"view {name}: only {share:.0%} of its pixels can be used")
+    for i, name in enumerate(measurement.names):
+        if valid[i] < 0.5:
+            remarks.append(f"view {name}: only {valid[i]:.0%} of its pixels can be used")
         rows, columns = small.cameras[i].image_size
         d = small.displacement[i, :rows, :columns]
         rim = torch.ones(rows, columns, dtype=torch.bool)

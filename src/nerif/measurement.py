@@ -216,6 +216,44 @@ class Measurement:
             flow_mask=pick(self.flow_mask),
         )
 
+    def summary(self, held_out: int = 0) -> list[tuple[str, str]]:
+        """Return what was measured as names and values with units; `held_out` of the views were not used."""
+        from nerif.notebook import number
+
+        usable = self.usable
+        count = max(int(usable.sum()), 1)
+        squares, noise, largest = 0.0, 0.0, 0.0
+        for i, mask in enumerate(usable):  # view by view: pictures may be large
+            d = self.displacement[i][mask].double()
+            squares, largest = squares + float(d.square().sum()), max(largest, float(d.abs().max()))
+            if self.sigma is not None:
+                noise += float(self.sigma[i][mask].double().square().sum())
+        rms, sigma = (number((total / (2 * count)) ** 0.5, 3) for total in (squares, noise))
+        sizes = sorted({c.image_size for c in self.cameras})
+        inside = sum(height * width for height, width in (c.image_size for c in self.cameras))
+        held = f", of which {held_out} held out" if held_out else ""
+        light = f" at {self.wavelength_nm:g} nm" if self.wavelength_nm else ""
+        return [
+            ("Views", f"{len(self.cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
+            ("Displacement", f"rms {rms} px, up to {number(largest, 3)} px"),
+            ("Noise σ", "not known" if self.sigma is None else f"rms {sigma} px"),
+            ("Usable pixels", f"{count / inside:.1%}"),
+            ("Volume", " × ".join(f"{e:g}" for e in self.box.edges) + " mm (x, y, z)"),
+            ("Ambient index", f"{self.n_ambient:.7g}{light}"),
+        ]
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: u and v of the views, and the summary."""
+        from nerif.notebook import PIXELS, panel, show_views
+
+        maps, usable = [], self.usable
+        for i, (height, width) in enumerate(c.image_size for c in self.cameras):
+            step = -(-max(height, width) // PIXELS)
+            part = i, slice(0, height, step), slice(0, width, step)
+            maps.append(torch.where(usable[part][..., None], self.displacement[part], torch.nan).numpy())
+        picture = show_views(self.names, maps)
+        return panel("Measurement", self.summary(), picture, "Displacement u and v of each view, in px")
+
     # -- files ---------------------------------------------------------------------------------------------------
 
     def write(self, path: str | os.PathLike[str]) -> None:

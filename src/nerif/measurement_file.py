@@ -49,9 +49,9 @@ MOST_PIXELS = 1 << 32
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
     """Return how the maps are packed: chunks within one view, so that one view is read without the others."""
     packed = {}
-    for name, values in dataset.data_vars.items():
-        if values.dims[:3] == ("view", "row", "column"):
-            _, rows, columns, *rest = values.shape
+    for name, variable in dataset.data_vars.items():
+        if variable.dims[:3] == ("view", "row", "column"):
+            _, rows, columns, *rest = variable.shape
             chunks = (1, min(rows, 256), min(columns, 256), *rest)
             packed[str(name)] = {
                 "zlib": True, "complevel": 1, "shuffle": True, "chunksizes": chunks, "_FillValue": None,

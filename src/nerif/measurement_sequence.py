@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["MeasurementSequence", "require_zarr"]
 
+WRITTEN = "written"
+"""Variable (time,) that is 1 where a frame is complete; stores of other programs may lack it."""
+
 
 def require_zarr() -> None:
     """Raise InputError, with the remedy, where zarr is not installed."""
@@ -85,12 +88,14 @@ class MeasurementSequence:
             If the frame breaks the contract of a measurement, such as a view with no valid pixel.
         """
         with _opened(self.path) as dataset, reading(f"{self.path}, frame {index}: cannot be read; is it damaged?"):
+            if WRITTEN in dataset and not bool(dataset[WRITTEN][index]):
+                raise InputError(f"{self.path}, frame {index}: nothing was measured then, or not to its end")
             one = dataset.isel(time=index).load() if "time" in dataset.dims else dataset.load()
         try:
             if tuple(one["displacement"].dims) == VARIABLES["displacement"][0]:
                 seeing = one["displacement"].notnull().all("component").any(("row", "column")).values
                 one = one.isel(view=seeing) if seeing.any() else one
-            return Measurement.from_dataset(one.drop_vars("time", errors="ignore"))
+            return Measurement.from_dataset(one.drop_vars(["time", WRITTEN], errors="ignore"))
         except InputError as error:
             raise InputError(f"{self.path}, frame {index}: {error}") from None
 
@@ -149,10 +154,14 @@ class MeasurementSequence:
                         name, shape=(len(times), *v.shape), chunks=(1, *v.shape), dtype=v.dtype, fill_value=fill,
                         dimension_names=["time", *map(str, v.dims)], attributes=dict(v.attrs),
                     )  # fmt: skip
+            group.create_array(
+                WRITTEN, shape=(len(times),), chunks=(1,), dtype="int8", fill_value=0, dimension_names=["time"],
+                attributes={"long_name": "written last: the frame is complete"},
+            )  # fmt: skip
         return cls(path, tuple(float(t) for t in times))
 
     def write_frame(self, index: int, measurement: Measurement) -> None:
-        """Write one frame, the displacement last; cameras and box are those the store was made with.
+        """Write one frame, `written` last; cameras and box are those the store was made with.
 
         Views that the measurement lacks have measured nothing then.
         """
@@ -166,19 +175,28 @@ class MeasurementSequence:
             if name not in names:
                 raise InputError(f"{self.path}, frame {index}: expected views out of {', '.join(names)}, got '{name}'")
         places = [names.index(name) for name in measurement.names]
-        for name in reversed(MAPS):
+        for name in MAPS:
             if (name in dataset) != (name in group):
                 has = "with" if name in group else "without"
                 raise InputError(f"{self.path}, frame {index}: expected a measurement {has} '{name}' as the others")
-            if name in dataset:
-                values = dataset[name].values
-                whole = np.full(group[name].shape[1:], group[name].fill_value, dtype=values.dtype)
-                whole[places, : values.shape[1], : values.shape[2]] = values
-                group[name][index] = whole
+        if WRITTEN in group:
+            group[WRITTEN][index] = 0
+        for name in (name for name in reversed(MAPS) if name in dataset):
+            values = dataset[name].values
+            whole = np.full(group[name].shape[1:], group[name].fill_value, dtype=values.dtype)
+            whole[places, : values.shape[1], : values.shape[2]] = values
+            group[name][index] = whole
+        if WRITTEN in group:
+            group[WRITTEN][index] = 1
 
     def is_written(self, index: int) -> bool:
-        """Whether a frame has been written, to its end."""
-        return (self.path / "displacement" / "c" / str(index)).is_dir()
+        """Whether a frame has been written, to its end: as `written` says, in stores that have it."""
+        import zarr
+
+        group: Any = zarr.open_group(self.path, mode="r")
+        if WRITTEN in group:
+            return bool(group[WRITTEN][index])
+        return any(p.is_file() for p in (self.path / "displacement" / "c" / str(index)).rglob("*"))
 
 
 def _check_arrays(path: Path) -> None:

@@ -32,7 +32,6 @@ from nerif.volume import Volume
 __all__ = ["Members", "all_quantities"]
 
 ASKED = "asked.json"
-FAILED = ("diverged", "collapsed")
 
 
 def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
@@ -77,7 +76,7 @@ class Members:
             if result.outcome.reason == "interrupted":
                 say(f"ensemble: interrupted after {spread.count} of {self.ensemble.members} members; --resume goes on")
                 break
-            if result.outcome.reason in FAILED:
+            if result.outcome.failed:
                 say(f"ensemble: member {number} {result.outcome.reason} and is left out: {result.outcome.message}")
                 diverged.append(number)
                 continue
@@ -131,7 +130,7 @@ class Members:
         out = "".join(f", without {name}" for name in self.ensemble.left_out(number, self.training))
         with self.monitor.training(f"member {number} of {self.ensemble.members}{out}") as told:
             result = reconstructor(noisy, told, None, self.start)
-        if result.outcome.reason not in ("interrupted", *FAILED):
+        if result.outcome.reason != "interrupted" and not result.outcome.failed:
             directory.path.mkdir(parents=True, exist_ok=True)
             (directory / ASKED).unlink(missing_ok=True)
             directory.write_field(dataclasses.replace(result, state=None))

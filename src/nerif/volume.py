@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.atomic import atomic
-from nerif.conventions import LARGEST_INDEX, InputError, ambient_index
+from nerif.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError, ambient_index
 from nerif.geometry import Box, Grid
 from nerif.netcdf import opened, values
 
@@ -102,6 +102,27 @@ class Volume:
             self, values=values, quantity="index_excess", attributes={**self.attributes, "n_ambient": n_ambient}
         )
 
+    def summary(self) -> list[tuple[str, str]]:
+        """Return what it holds as names and values with units."""
+        from nerif.drawing import shown
+        from nerif.notebook import span
+
+        shape = " × ".join(str(n) for n in self.grid.shape[::-1])
+        edges = " × ".join(f"{e:g}" for e in self.grid.box.edges)
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        name = "n − 1" if self.quantity == "n" else self.quantity.replace("_", " ").capitalize()
+        rows = [(name, span(shown(self), unit)), ("Voxels", f"{shape} (x, y, z)"), ("Volume", f"{edges} mm (x, y, z)")]
+        if self.n_ambient is not None:
+            rows.append(("Ambient index", f"{self.n_ambient:.7g}"))
+        return rows
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the three middle slices, and the summary."""
+        from nerif.notebook import panel, show_slices
+
+        title = describe(self.quantity)[1].capitalize()
+        return panel(title, self.summary(), show_slices(self), f"{title} in the three middle slices")
+
 
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid to a NetCDF-4 file by the CF conventions, coordinates in mm, atomically."""
@@ -167,7 +188,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
         raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
     if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
-        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got numbers beyond {LARGEST_INDEX}")
+        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got some beyond {LARGEST_INDEX}")
     try:
         n_ambient = volume.n_ambient
     except InputError as error:
@@ -249,6 +270,8 @@ def _ends(dataset: xr.Dataset, axis: str) -> tuple[float, float]:
     if not (isinstance(unit, str) and unit == "mm"):
         raise InputError(f"coordinate '{axis}': expected units 'mm', got '{unit}'")
     centres = values(dataset[axis]).astype(np.float64)
+    if not (np.abs(centres) <= LARGEST_LENGTH).all():
+        raise InputError(f"coordinate '{axis}': expected voxel centres in mm, got {centres.tolist()[:4]} ...")
     corners = [np.asarray(dataset.attrs.get(name)) for name in ("box_lower_mm", "box_upper_mm")]
     if len(centres) and all(c.shape == (3,) and c.dtype.kind in "fiu" for c in corners):
         lower, upper = (float(c["xyz".index(axis)]) for c in corners)

@@ -117,7 +117,8 @@ class _Image:
         arrays, attributes = {}, dict[str, float | str]()
         for element in pieces[0].findall("PointData/DataArray"):
             if int(element.get("NumberOfComponents", "1")) == 1:
-                values = np.frombuffer(self.data(element), self.kind(element)).astype(self.kind(element).newbyteorder("="))
+                kind = self.kind(element)
+                values = np.frombuffer(self.data(element), kind).astype(kind.newbyteorder("="))
                 name = str(element.get("Name"))
                 if values.size != nx * ny * nz:
                     raise InputError(f"array '{name}': expected {nx} x {ny} x {nz} numbers, got {values.size}")

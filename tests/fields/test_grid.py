@@ -73,6 +73,7 @@ def test_single_precision_and_another_device_keep_the_field():
     field = VoxelField(Boundary().extend(random(*GRID.shape).float(), 2), GRID, 3)
     assert field(GRID.points()).dtype == torch.float32
     assert torch.equal(field.to("cpu")(GRID.points()), field(GRID.points()))
+    assert field.to("meta").coefficients.device.type == "meta"
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -12,7 +12,6 @@ from nerif.conventions import InputError
 from nerif.imaging.background import Background
 from nerif.imaging.correlation import normalised_median_outliers, window_correlation
 from nerif.imaging.displacement import DisplacementSettings, displacement, measure
-from nerif.imaging.masks import MaskSettings, flow_mask, read_mask
 from nerif.imaging.optical_flow import FLOWS
 from nerif.imaging.shake import border, remove_shake
 from nerif.imaging.warping import warp
@@ -216,32 +215,3 @@ def test_outliers_stand_out():
     assert bad[4, 7]
     assert bad[9, 0]
     assert bad.mean() < 0.06
-
-
-def test_flow_mask_holds_the_flow_and_little_else(truth):
-    rng = np.random.default_rng(0)
-    sigma = np.full((*SHAPE, 2), 0.05, dtype=np.float32)
-    d = (truth + 0.05 * rng.standard_normal(truth.shape)).astype(np.float32)
-    d[2, 3] = np.nan
-    mask = flow_mask(d, sigma)
-    strong = np.linalg.norm(truth, axis=-1)
-    assert mask[strong > 0.25].all()
-    assert mask[strong < 0.005].mean() < 0.02
-    assert flow_mask(d, sigma, MaskSettings(grow=8)).sum() > mask.sum()
-    assert flow_mask(0 * d, sigma).sum() == np.isnan(d).any(-1).sum()
-    with pytest.raises(InputError, match="threshold"):
-        MaskSettings(threshold=-1.0)
-
-
-def test_drawn_masks_are_read(tmp_path):
-    import imageio.v3 as iio
-
-    image = np.zeros((30, 40), np.uint8)
-    image[5:10, 20:30] = 255
-    iio.imwrite(tmp_path / "cam1.png", image)
-    assert np.array_equal(read_mask(tmp_path / "cam1.png", (30, 40)), image > 0)
-    with pytest.raises(InputError, match=r"cam1.png: expected a mask of 40 x 30 px"):
-        read_mask(tmp_path / "cam1.png", (40, 30))
-    iio.imwrite(tmp_path / "black.png", 0 * image)
-    with pytest.raises(InputError, match="one grey"):
-        read_mask(tmp_path / "black.png", (30, 40))

@@ -17,6 +17,7 @@ from nerif.geometry import Box, Ring
 from nerif.imaging import workers
 from nerif.imaging.assembly import Scene
 from nerif.imaging.cameras_file import CalibratedCamera
+from nerif.imaging.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, RestingView, measure_instant
 from nerif.imaging.over_time import RestingRecording, measure_recording
@@ -51,7 +52,7 @@ def write_experiment(folder, frames: int = 3, shift: int = 0, spot: bool = False
             path.parent.mkdir(parents=True, exist_ok=True)
             tifffile.imwrite(path, images, photometric="minisblack")
     calibrated = {c.name: CalibratedCamera.from_camera(c) for c in cameras}
-    return Recording(find_views(folder), calibrated, Scene(BOX))
+    return Recording(find_views(folder), calibrated, Scene(BOX), DisplacementSettings("dis"))  # the fastest
 
 
 @pytest.fixture

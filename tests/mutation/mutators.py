@@ -7,6 +7,7 @@ bytes. `make(kind, number, folder)` writes it; `Broken` says what was done.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import random
 import re
@@ -20,7 +21,8 @@ import numpy as np
 import tomli_w
 import xarray as xr
 
-EXTREME = (float("nan"), float("inf"), float("-inf"), 0.0, -1.0, 1e-300, 1e-30, 1e-9, 1e9, 1e30, 1e300, -1e30, 255.0, 0.5)
+EXTREME = (float("nan"), float("inf"), float("-inf"), 0.0, -1.0, 0.5, 255.0)
+EXTREME += (1e-300, 1e-30, 1e-9, 1e9, 1e30, -1e30, 1e300)
 FACTORS = (-1.0, 0.0, 1e-6, 1e-3, 0.1, 10.0, 1e3, 1e6, 1e12, 180 / np.pi)
 VALUES = (
     *EXTREME, "", "air", "x- x+", "nan", b"1.00027", True, 5, np.array([1.0, 2.0]), np.array([1.00027]), np.array([]),
@@ -121,26 +123,30 @@ def names(data: xr.Dataset, rng: random.Random) -> tuple[xr.Dataset, str]:
     """Give the views other names: equal, empty, numbers, bytes."""
     coordinate = "view" if "view" in data.coords else rng.choice(list(data.coords))
     n = data.sizes.get(coordinate, 0)
-    other = rng.choice((["a"] * n, [""] * n, list(range(n)), [np.nan] * n, [b"a", b"b", b"c"] * n, [f"{i}\n/" for i in range(n)]))
+    lines = [f"{i}\n/" for i in range(n)]
+    other: list[Any] = rng.choice((["a"] * n, [""] * n, list(range(n)), [np.nan] * n, [b"a", b"b", b"c"] * n, lines))
     return data.assign_coords({coordinate: (coordinate, np.array(other[:n]))}), f"{coordinate} named {other[:3]}"
 
 
 STRUCTURE: tuple[Callable[[xr.Dataset, random.Random], tuple[xr.Dataset, str]], ...] = (
-    spoil_numbers, spoil_numbers, spoil_numbers, drop, transpose, rename, resize, units, types, attributes, attributes, names,
+    spoil_numbers, spoil_numbers, spoil_numbers, drop, transpose, rename, resize, units, types, attributes, attributes,
+    names,
 )  # fmt: skip
 
 
 def write_netcdf(data: xr.Dataset, path: Path, rng: random.Random) -> str:
     """Write the file with mistakes of structure; those that the libraries do not write are not made."""
-    done = []
+    changed, done = data, []
     for _ in range(rng.choice((1, 1, 2, 3))):
         with contextlib.suppress(Exception):
-            changed, what = rng.choice(STRUCTURE)(data, rng)
-            changed.to_netcdf(path, engine="h5netcdf")
-            data = changed
+            changed, what = rng.choice(STRUCTURE)(changed, rng)
             done.append(what)
-    if not done:
+    try:
+        changed.to_netcdf(path, engine="h5netcdf")
+    except Exception:
+        path.unlink(missing_ok=True)
         data.to_netcdf(path, engine="h5netcdf")
+        return "nothing"
     return ", ".join(done)
 
 
@@ -150,7 +156,8 @@ def write_netcdf(data: xr.Dataset, path: Path, rng: random.Random) -> str:
 def spoil_bytes(path: Path, rng: random.Random) -> str:
     """Flip, cut, blank, double or add bytes."""
     content = bytearray(path.read_bytes())
-    what, at = rng.choice(("flip", "flip", "flip", "cut", "blank", "double", "add", "head")), rng.randrange(len(content) or 1)
+    what = rng.choice(("flip", "flip", "flip", "cut", "blank", "double", "add", "head"))
+    at = rng.randrange(len(content) or 1)
     if what == "flip":
         for _ in range(rng.choice((1, 3, 10, 100))):
             if content:
@@ -171,7 +178,8 @@ def spoil_bytes(path: Path, rng: random.Random) -> str:
 
 
 NUMBER = re.compile(rb"-?\d+\.?\d*(?:e[+-]?\d+)?")
-WORDS = (b"nan", b"inf", b"-1", b"0", b"1e300", b"1e-300", b"99999999999", b"true", b'"text"', b"[]", b"{}", b"", b"null", b"[1, 2]")
+WORDS = (b"nan", b"inf", b"-1", b"0", b"1e300", b"1e-300", b"99999999999", b"true", b'"text"')
+WORDS += (b"[]", b"{}", b"", b"null", b"[1, 2]")
 
 
 def spoil_text(path: Path, rng: random.Random) -> str:
@@ -230,7 +238,9 @@ def spoil_json(path: Path, rng: random.Random) -> str:
 
 
 def spoil_store(path: Path, rng: random.Random) -> str:
-    """Spoil the metadata or a chunk of a Zarr store, or lose it."""
+    """Spoil numbers, the metadata or a chunk of a Zarr store, or lose it."""
+    if rng.random() < 0.5:
+        return spoil_array(path, rng)
     files = sorted(p for p in path.rglob("*") if p.is_file())
     metadata = [p for p in files if p.name == "zarr.json"]
     file = rng.choice(metadata if rng.random() < 0.6 else files)
@@ -244,14 +254,32 @@ def spoil_store(path: Path, rng: random.Random) -> str:
     return f"{file.relative_to(path)}: {what}"
 
 
+def spoil_array(path: Path, rng: random.Random) -> str:
+    """Set numbers of an array of a Zarr store to something extreme."""
+    import zarr
+
+    array: Any = zarr.open(rng.choice(sorted(p.parent for p in path.glob("*/zarr.json"))), mode="r+")
+    values = np.array(array[...])
+    where: Any = tuple(rng.randrange(n) for n in values.shape)[: rng.choice((0, 1, 9))]
+    with np.errstate(all="ignore"):
+        values[where] = np.float64(rng.choice(EXTREME)).astype(values.dtype)
+    array[...] = values
+    return f"{array.name}[{where}] = {values[where]}"[:80]
+
+
 # -- kinds ----------------------------------------------------------------------------------------------------------
 
 
+@functools.cache
+def loaded(good: Path) -> xr.Dataset:
+    return xr.load_dataset(good, engine="h5netcdf")
+
+
 def netcdf(good: Path, path: Path, rng: random.Random) -> str:
-    if rng.random() < 0.3:
+    if rng.random() < 0.4:
         shutil.copy(good, path)
         return spoil_bytes(path, rng)
-    return write_netcdf(xr.load_dataset(good, engine="h5netcdf"), path, rng)
+    return write_netcdf(loaded(good).copy(deep=True), path, rng)
 
 
 def text(good: Path, path: Path, rng: random.Random) -> str:
@@ -265,7 +293,7 @@ def store(good: Path, path: Path, rng: random.Random) -> str:
     shutil.copytree(good, path)
     done = []
     for _ in range(rng.choice((1, 1, 2))):
-        with contextlib.suppress(ValueError, IndexError):
+        with contextlib.suppress(Exception):
             done.append(spoil_store(path, rng))
     return ", ".join(done)
 

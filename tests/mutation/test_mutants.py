@@ -14,6 +14,7 @@ import torch
 from mutation.mutators import make
 from nerif.cli import main
 from nerif.conventions import InputError
+from nerif.exports import export
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
@@ -24,7 +25,6 @@ from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.exports import export
 from nerif.sequence.store import Frame, SequenceStore
 from nerif.simulation import simulate
 from nerif.volume import Volume, read_volume, write_netcdf

@@ -39,11 +39,12 @@ def test_every_weight_moves_and_the_loss_falls(kind):
 def test_muon_takes_the_matrices_and_turns_them_by_equal_amounts():
     net = network()
     optimiser = NetworkOptimiser("muon", net, (0.9, 0.99), 0.9)
-    (group,) = optimiser.parts["muon"].param_groups
-    assert {p.shape for p in group["params"]} == {(16, 15), (16, 16)}  # neither biases nor the single output
+    groups = optimiser.parts["muon"].param_groups
+    # neither biases nor the single output
+    assert {p.shape for group in groups for p in group["params"]} == {(16, 15), (16, 16)}
     before = net.layers[1].weight.detach().clone()
     take_steps(optimiser, net, 1)
-    step = torch.linalg.svdvals(net.layers[1].weight.detach() - before) / (2e-2 * 0.2 * 16**0.5)
+    step = torch.linalg.svdvals(net.layers[1].weight.detach() - before) / (2e-2 * 0.2 * 128**0.5)
     gradient = torch.linalg.svdvals(net.layers[1].weight.grad)
     assert 0.7 < float(step[0]) < 1.3
     assert float(step[4] / step[0]) > 5 * float(gradient[4] / gradient[0])
@@ -73,3 +74,47 @@ def test_a_checkpoint_of_another_optimiser_is_refused(made_by, asked):
     take_steps(other, net, 1)
     with pytest.raises(InputError, match="--optimiser"):
         NetworkOptimiser(asked, net, (0.9, 0.99), 0.9).restore(other.tensors())
+
+
+def test_the_reference_steps_as_torch_has_it():
+    """Muon in float32 and one group a matrix: the steps of torch.optim.Muon, up to the rounding of bf16."""
+    torch.manual_seed(0)
+    net = Network(NetworkShape())
+    matrices = [layer.weight for layer in net.layers]
+    twins = [m.detach().clone().requires_grad_() for m in matrices]
+    optimiser = NetworkOptimiser("muon", net, (0.9, 0.99), 0.9)
+    of_torch = torch.optim.Muon(
+        twins, lr=2e-2, weight_decay=0.0, momentum=0.9, ns_steps=5, adjust_lr_fn="match_rms_adamw"
+    )
+    before = [m.detach().clone() for m in matrices]
+    p = torch.rand(200, 3) * 2 - 1
+    for _ in range(3):
+        optimiser.zero_grad()
+        (net(p) - p.sum(1).sin()).square().mean().backward()
+        for matrix, twin in zip(matrices, twins, strict=True):
+            twin.grad = matrix.grad.clone()
+        optimiser.step({"adam": 1e-2, "muon": 2e-2})
+        of_torch.step()
+    for start, matrix, twin in zip(before, *([w.detach() for w in part] for part in (matrices, twins)), strict=True):
+        assert float((matrix - twin).norm() / (twin - start).norm()) < 0.05
+    assert {group["share"] for group in optimiser.parts["adam"].param_groups} == {1.0}
+
+
+@pytest.mark.parametrize("width", [32, 512])
+def test_rates_follow_the_width(width):
+    """Source: Yang et al., Tensor Programs V; Yang, Simon & Bernstein, A spectral condition for feature learning."""
+
+    def shares(shape: NetworkShape, kind: str) -> dict[str, float]:
+        net = Network(shape)
+        optimiser = NetworkOptimiser(kind, net, (0.9, 0.99), 0.9)
+        names = {id(p): name for name, p in net.named_parameters()}
+        groups = [group for part in optimiser.parts.values() for group in part.param_groups]
+        return {names[id(p)]: group["share"] for group in groups for p in group["params"]}
+
+    wide, reference = shares(NetworkShape(width=width), "muon"), shares(NetworkShape(), "muon")
+    assert wide["layers.1.weight"] == pytest.approx(reference["layers.1.weight"])  # square: the same spectral norm
+    assert wide["layers.0.weight"] / reference["layers.0.weight"] == pytest.approx((width / 128) ** 0.5)
+    assert wide["outputs.0.weight"] / reference["outputs.0.weight"] == pytest.approx(128 / width)
+    adam = shares(NetworkShape(width=width), "adam")
+    assert adam["layers.1.weight"] == adam["outputs.0.weight"] == pytest.approx(128 / width)
+    assert adam["layers.0.weight"] == adam["layers.1.bias"] == 1

@@ -101,3 +101,33 @@ def drag(driver: Any, selector: str, x: int, y: int) -> None:
     element = driver.find_element("css selector", selector)
     driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
     ActionChains(driver).move_to_element(element).click_and_hold().move_by_offset(x, y).release().perform()
+
+
+def middle(driver: Any, selector: str) -> dict[str, int]:
+    """Bring an element to the middle of the window and return where its own middle is then, px."""
+    driver.execute_script(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
+    box = driver.execute_script(f"return document.querySelector('{selector}').getBoundingClientRect().toJSON()")
+    return {"x": round(box["x"] + box["width"] / 2), "y": round(box["y"] + box["height"] / 2)}
+
+
+def tap(driver: Any, selector: str) -> None:
+    """Touch the middle of an element with a finger, briefly."""
+    swipe(driver, selector, 0, 0)
+
+
+def swipe(driver: Any, selector: str, x: int, y: int) -> float:
+    """Draw a finger by (x, y) px over an element and return how far the page has scrolled by that, px."""
+    at = middle(driver, selector)
+    before = driver.execute_script("return scrollY")
+    moves = [{"x": at["x"] + x * i / 10, "y": at["y"] + y * i / 10} for i in range(1, 11)] if x or y else []
+    _touch(driver, "touchStart", at)
+    for move in moves:
+        _touch(driver, "touchMove", move)
+        time.sleep(0.02)
+    _touch(driver, "touchEnd")
+    time.sleep(0.3)
+    return float(driver.execute_script("return scrollY")) - before
+
+
+def _touch(driver: Any, kind: str, *points: dict[str, float]) -> None:
+    driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": list(points)})

@@ -23,6 +23,8 @@ from report.browsing import (
     press,
     requests,
     show,
+    swipe,
+    tap,
     text,
     wait_for,
 )
@@ -148,6 +150,23 @@ def test_it_fits_on_a_phone(browser, whole):
         ".filter(e => e.offsetParent).map(e => e.getBoundingClientRect().height))"
     )
     assert smallest >= 28  # px, for a thumb
+
+
+def test_a_finger_scrolls_past_the_stage_until_a_tap_gives_it_the_finger(browser, whole):
+    browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
+    try:
+        show(browser, whole / "report.html", 390, 844)
+        before = picture(browser, "#space")
+        assert swipe(browser, "#space", 0, -150) > 100
+        assert np.array_equal(picture(browser, "#space"), before)
+        tap(browser, "#space")
+        assert swipe(browser, "#space", 0, -150) == 0
+        assert (np.abs(picture(browser, "#space") - before).max(axis=-1) > 12).mean() > 0.02
+        tap(browser, "#space")
+        assert swipe(browser, "#space", 0, -150) > 100
+        assert errors(browser) == []
+    finally:
+        browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
 
 
 def test_a_broken_result_opens_without_an_error(browser, copy):

@@ -10,11 +10,12 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from nerif import drawing
 from nerif.cli import main
 from nerif.geometry import Box, Grid
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
-from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, style
+from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices
 from nerif.result import Result, ResultDirectory
 from nerif.volume import Volume
 
@@ -31,7 +32,7 @@ def test_every_figure_is_whole(whole):
     """The names expected; nothing beyond the edge of the paper; a unit on every axis and colour bar; no empty panel."""
     result = ResultDirectory(whole).read()
     names = []
-    with style():
+    with drawing.style():
         for name, figure in figures_of(result, *JOURNALS["elsevier"]):
             FigureCanvasAgg(figure).draw()
             names.append(name)
@@ -70,8 +71,8 @@ def test_functions_give_back_the_axes_they_take(volume, whole):
     assert result.reprojection is not None
     figure = Figure()
     for draw, *data in (
-        (figures.draw_slice, volume, "y"),
-        (figures.draw_displacement, np.zeros((3, 4)), 1.0),
+        (drawing.draw_slice, volume, "y"),
+        (drawing.draw_displacement, np.zeros((3, 4)), 1.0),
         (figures.draw_history, result.history, "nerif"),
         (figures.draw_slice_scores, result.metrics["slices"]),
         (figures.draw_view_scores, result.metrics["views"]),
@@ -85,7 +86,7 @@ def test_functions_give_back_the_axes_they_take(volume, whole):
 
 def test_a_slice_is_the_middle_one_the_right_way_up(volume):
     axes = Figure().subplots()
-    figures.draw_slice(axes, volume, "z")
+    drawing.draw_slice(axes, volume, "z")
     image = axes.images[0]
     np.testing.assert_array_equal(image.get_array(), volume.values[6].double().numpy())
     assert image.get_extent() == [-5.0, 5.0, -4.0, 4.0]
@@ -141,10 +142,10 @@ def test_a_flat_volume_has_no_surface_and_no_error():
 
 def test_colours_do_not_go_to_a_few_outliers(volume):
     values = volume.values.double().numpy().copy()
-    assert figures.colour_range(values) == (values.min(), values.max())
+    assert drawing.colour_range(values) == (values.min(), values.max())
     values[0, 0, 0] = 1.0
     values[0, 0, 1] = np.nan
-    low, high = figures.colour_range(values)
+    low, high = drawing.colour_range(values)
     assert low == pytest.approx(-2e-4, rel=0.2)
     assert high < 1e-6
     page = slices(Volume(torch.from_numpy(values), volume.grid), 190)
@@ -164,4 +165,4 @@ def test_colours_do_not_go_to_a_few_outliers(volume):
     ],
 )
 def test_labels_carry_units(quantity, label):
-    assert figures.label_of(quantity) == label
+    assert drawing.label_of(quantity) == label

@@ -15,10 +15,11 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views
 from nerif.geometry import Box, Grid
+from nerif.notebook import number
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import html, packing
 from nerif.report.pages import residuals_over_sigma
-from nerif.report.summary import headline, number, trust
+from nerif.report.summary import headline, trust
 from nerif.report.view_images import _shrink, lattice_step, view_images
 from nerif.reprojection import Reprojection
 from nerif.result import Result, ResultDirectory
@@ -214,6 +215,8 @@ def view(held_out: bool, cc: float, noise: float | None) -> dict:
         ({"views": [view(False, 0.99, 0.6), view(False, 0.3, 12.0), view(True, 0.99, 1.0)]}, "bad", "12.0 times"),
         ({"views": [view(False, 0.99, 0.6), view(False, 0.3, 2.0), view(True, 0.99, 1.0)]}, "warning", "follows noise"),
         ({"views": [view(True, 0.1, 30.0)]}, "bad", "poorly"),
+        ({"views": [view(True, 0.99, 1.8)]}, "note", "No training view"),
+        ({"views": [view(True, 0.99, None)]}, "note", "No training view"),
         ({}, "warning", "not compared with any view"),
         ({"views": [view(False, 0.99, 1.0), view(True, 0.99, 1.0)], "cc": 0.5, "l2_variation": 0.9}, "bad", "90.0%"),
         ({"views": [view(False, 0.99, 1.0)], "ensemble": {"members": 3, "diverged": [2]}}, "warning", "Members 2"),

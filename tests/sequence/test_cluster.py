@@ -108,7 +108,7 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(film, tmp_path):
     process.send_signal(signal.SIGINT)
     text, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
-    assert "missing; the same command does them" in text
+    assert "missing; the same command again does them" in text
     assert "Traceback" not in errors
     assert (status_of(out) == DONE).sum() >= 2
 

@@ -288,7 +288,7 @@ def test_each_frame_of_a_joint_network_is_found_within_its_own_masks(moving, tmp
 
 def test_the_command_reconstructs_jointly(short, tmp_path, capsys):
     out = tmp_path / "r.zarr"
-    arguments = ["sequence", str(short), "-o", str(out), *QUICK, "--temporal", "joint", "--joint-steps", "20"]
+    arguments = ["sequence", str(short), "-o", str(out), *QUICK, "--temporal", "joint", "--joint-steps", "8"]
     assert main([*arguments, "--chunk", "3", "--workers", "1"]) == 0
     assert "5 of 5 frames done" in capsys.readouterr().out
     truth = short.with_name("short.truth.zarr")

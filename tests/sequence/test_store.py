@@ -38,6 +38,57 @@ def test_frames_come_back_as_they_were_written(short, tmp_path):
     assert torch.equal(copy.frame(1).sigma, last.sigma)
 
 
+def test_a_frame_killed_between_directory_and_chunk_is_not_written(short, tmp_path):
+    frame = MeasurementSequence.read(short).frame(0)
+    store = MeasurementSequence.create(tmp_path / "film.zarr", [0.0, 1.0], frame)
+    (store.path / "displacement" / "c" / "1" / "0" / "0" / "0").mkdir(parents=True)
+    assert not store.is_written(1)
+    store.write_frame(1, frame)
+    assert store.is_written(1)
+    assert not store.is_written(0)
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_frame_killed_at_any_of_its_arrays_is_not_written(short, tmp_path, monkeypatch, again):
+    import zarr
+
+    frame = MeasurementSequence.read(short).frame(0)
+    write = zarr.Array.__setitem__
+    for name in ("sigma", "displacement", "written"):
+        store = MeasurementSequence.create(tmp_path / f"{name}.zarr", [0.0, 1.0], frame)
+        if again:
+            store.write_frame(1, frame)
+
+        def killed(self, at, value, name=name):
+            if self.basename == name and np.any(value):
+                raise KeyboardInterrupt
+            write(self, at, value)
+
+        monkeypatch.setattr(zarr.Array, "__setitem__", killed)
+        with pytest.raises(KeyboardInterrupt):
+            store.write_frame(1, frame)
+        monkeypatch.setattr(zarr.Array, "__setitem__", write)
+        assert not store.is_written(1)
+        with pytest.raises(InputError, match="frame 1: nothing was measured then, or not to its end"):
+            store.frame(1)
+        store.write_frame(1, frame)
+        assert same(store.frame(1), frame)
+
+
+def test_stores_without_the_variable_written_are_read_and_gone_on_with(short, tmp_path):
+    import zarr
+
+    frame = MeasurementSequence.read(short).frame(0)
+    store = MeasurementSequence.create(tmp_path / "film.zarr", [0.0, 1.0, 2.0], frame)
+    store.write_frame(1, frame)
+    del zarr.open_group(store.path, mode="r+")["written"]
+    (store.path / "displacement" / "c" / "0" / "0" / "0" / "0").mkdir(parents=True)
+    assert [store.is_written(i) for i in range(3)] == [False, True, False]
+    assert same(store.frame(1), frame)
+    store.write_frame(2, frame)
+    assert store.is_written(2)
+
+
 def test_a_view_that_saw_nothing_is_left_out_and_an_empty_frame_refused(short):
     blank(short, 1, view=0)
     blank(short, 2)

@@ -71,10 +71,11 @@ def interruptible() -> Iterator[list[bool]]:
 def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """Show a bar that goes away when done: a callable that is told how many are done, and out of how many."""
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import MofNCompleteColumn, Progress
 
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())  # title, bar, percent, time left; m/n
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=total)
 
         def update(done: int, of: int | None = None) -> None:

@@ -67,4 +67,5 @@ def main(arguments: list[str]) -> None:
         # settings of a file are complete: there the preset has had its say already
         chosen |= {"preset": name, "reconstructor": preset(name)}
     default = RECORDS[method](measurement=tyro.MISSING, out=tyro.MISSING, **chosen)
-    run(read_settings(default, arguments, "reconstruct", file))
+    if run(read_settings(default, arguments, "reconstruct", file)).outcome.failed:
+        raise SystemExit(1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -57,6 +58,9 @@ ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 """Each gives the activation and its derivative."""
 
 
+ATTENUATION = 0.3  # of a signal by one layer with torch's initial weights; deeper networks than 4 make up for it
+
+
 @dataclass(frozen=True)
 class NetworkShape:
     """Size of the network."""
@@ -66,7 +70,7 @@ class NetworkShape:
     width: int = 128
     """Neurons per hidden layer (paper: 256)."""
     octaves: int = 5
-    """N of the sinusoidal encoding."""
+    """N of the sinusoidal encoding; octaves beyond the fifth are weighted down, see Network."""
     skip: int = 0
     """The encoding is joined to the output of this layer (paper: 4); 0 for none."""
     head_width: int = 0
@@ -87,7 +91,11 @@ class NetworkShape:
 
 
 class Network(nn.Module):
-    """Maps coordinates in [-1, 1] to the scaled index excess and, by its own heads, the scaled gradient."""
+    """Maps coordinates in [-1, 1] to the scaled index excess and, by its own heads, the scaled gradient.
+
+    Octave k of the encoding is given to the first layer times 2^(-k octave_decay), and from the sixth on (k > 4) times
+    4^(4 - k) as well: its slope grows like 2^k, and is noise until the octaves below have found the field.
+    """
 
     gains: Tensor
 
@@ -101,7 +109,16 @@ class Network(nn.Module):
         hidden_heads = outputs if shape.head_width else 0
         self.heads = nn.ModuleList(nn.Linear(inputs[-1], shape.head_width) for _ in range(hidden_heads))
         self.outputs = nn.ModuleList(nn.Linear(shape.head_width or inputs[-1], 1) for _ in range(outputs))
-        self.register_buffer("gains", 2.0 ** (-shape.octave_decay * torch.arange(shape.octaves)), persistent=False)
+        octave = torch.arange(shape.octaves)
+        even = NetworkShape.octaves  # so many count alike; those above would be steeper than the field itself
+        beyond = 4.0 ** -(octave - (even - 1)).clamp(min=0)
+        self.register_buffer("gains", beyond * 2.0 ** (-shape.octave_decay * octave))
+        if shape.depth > NetworkShape.depth:
+            # a signal passes with the strength it has after the layers of the network of reference
+            lost = (shape.depth - NetworkShape.depth) / (shape.depth - 1)
+            with torch.no_grad():
+                for layer in self.layers[1:]:
+                    _linear(layer).weight.mul_(ATTENUATION**-lost)
 
     def forward(self, p: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
         """Return the scaled index excess."""
@@ -132,9 +149,15 @@ class Network(nn.Module):
             cotangent = cotangent + to_encoding
         return value, self._pull_back(encoded, cotangent), self._gradient_heads(h) if heads else None
 
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
+        """Weights without gains are of networks whose octaves count alike but for octave_decay."""
+        alike = 2.0 ** (-self.shape.octave_decay * torch.arange(self.shape.octaves))
+        state_dict.setdefault(f"{prefix}gains", alike)
+        super()._load_from_state_dict(state_dict, prefix, *others)
+
     def _encode(self, p: Tensor) -> Tensor:
         """What the first layer is given of a point."""
-        return encode(p, self.shape.octaves, self.gains.to(p) if self.shape.octave_decay else None)
+        return encode(p, self.shape.octaves, self.gains.to(p))
 
     def _pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
         """From the slope along what the first layer is given to that along x, y, z."""

@@ -40,7 +40,7 @@ class SpaceTimeNetwork(Network):
     def _encode(self, p: Float[Tensor, "n 4"]) -> Tensor:
         place, tau = p[:, :3], p[:, 3:]
         octaves = self.shape.octaves
-        gains = self.gains.to(p) if self.shape.octave_decay else None
+        gains = self.gains.to(p)
         angle = math.pi * tau * 2.0 ** torch.arange(self.time_octaves, device=p.device, dtype=p.dtype)
         carried = place - tau * self.drift.to(p)
         return torch.cat(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import difflib
+import math
 import tomllib
 from pathlib import Path
 
@@ -79,7 +80,10 @@ def read_csv(path: Path) -> list[CalibratedCamera]:
 
         def number(key: str, default: float | None = None, given: dict = given, line: int = i + 2) -> float:
             try:
-                return float(given[key]) if key in given or default is None else default
+                value = float(given[key]) if key in given or default is None else default
+                if not math.isfinite(value):
+                    raise ValueError
+                return value
             except (KeyError, ValueError):
                 raise InputError(
                     f"{path}: line {line}: '{key}': expected a number, got '{given.get(key, '')}'"

@@ -43,7 +43,9 @@ def work(
         for i, task in enumerate(tasks):
             yield i, function(common, task)
         return
-    with ProcessPoolExecutor(processes, get_context(start_method()), _begin, (function, common)) as pool:
+    context = get_context(start_method())
+    context.set_forkserver_preload([function.__module__])  # imported once for all processes; no matter elsewhere
+    with ProcessPoolExecutor(processes, context, _begin, (function, common)) as pool:
         futures = {pool.submit(_one, task): i for i, task in enumerate(tasks)}
         try:
             for future in as_completed(list(futures)):

@@ -72,7 +72,7 @@ def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: flo
 
 @dataclass(frozen=True)
 class CurvedRays(ForwardModel):
-    """The `curved` model: d = S (X - X0) with X the background point that the bent ray finds.
+    """The `traced` model: d = S (X - X0) with X the background point that the bent ray finds.
 
     Parameters
     ----------

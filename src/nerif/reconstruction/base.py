@@ -20,6 +20,15 @@ from nerif.volume import Volume
 
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 
+SHOWN_VOXELS = 48  # along the longest edge, in a notebook
+
+MISFITS = {
+    "residual_over_sigma": "times the noise, rms over the training views",
+    "residual": "rms over the training views, where the ambient field has 1",
+    "loss": "in the loss, where the ambient field has 1",
+}
+"""Names in a history, the most telling first, and what they say."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -27,12 +36,18 @@ class Outcome:
 
     Parameters
     ----------
-    reason : one word: converged, discrepancy, epochs, steps, iterations, time_limit, interrupted or diverged
+    reason : one word: converged, discrepancy, epochs, steps, iterations, time_limit, interrupted, diverged or
+        collapsed (the field explains nothing of what was measured)
     message : one sentence, with the remedy where there is one
     """
 
     reason: str
     message: str
+
+    @property
+    def failed(self) -> bool:
+        """Whether no field was found."""
+        return self.reason in ("diverged", "collapsed")
 
 
 @dataclass(frozen=True)
@@ -117,6 +132,21 @@ class Reconstruction:
     def volume(self, grid: Grid) -> Volume:
         """Return the index excess at the voxel centres of a grid."""
         return Volume(self.field.sample(grid, self.device), grid, attributes={"n_ambient": self.n_ambient})
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the three middle slices, why it stopped, how long it took, and the misfit."""
+        from nerif.notebook import number, panel, show_slices
+
+        volume = self.volume(Grid.of_resolution(self.box, SHOWN_VOXELS))
+        rows = [("Outcome", f"{self.outcome.reason.replace('_', ' ')}: {self.outcome.message}")]
+        rows.append(("Time", f"{self.seconds:.0f} s on {self.device}"))
+        last = self.history[-1] if self.history else {}
+        for name, meaning in MISFITS.items():
+            if name in last:
+                rows.append(("Misfit", f"{number(last[name], 3)} {meaning}"))
+                break
+        picture = show_slices(volume)
+        return panel("Reconstruction", rows + volume.summary(), picture, "Index excess in the three middle slices")
 
 
 class Reconstructor(ABC):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -59,6 +60,19 @@ class Budget:
             shares.append(self.seconds / settings.time_limit)
         return max(shares)
 
+    def left(self, rays: int) -> float:
+        """Return how many rays the run has time or steps for yet, at the pace so far; inf where neither is limited.
+
+        Parameters
+        ----------
+        rays : done at that pace since the beginning
+        """
+        settings = self.settings
+        shares = [self.step / settings.max_steps] if settings.max_steps else []
+        shares += [self.seconds / settings.time_limit] if settings.time_limit else []
+        share = max(shares, default=0.0)
+        return rays * (1 - share) / share if share else math.inf
+
     def exhausted(self) -> Outcome | None:
         """Return which limit is reached, if one is."""
         settings = self.settings
@@ -69,6 +83,10 @@ class Budget:
         if settings.time_limit and self.seconds >= settings.time_limit:
             return Outcome("time_limit", f"time limit of {settings.time_limit:g} s reached; more time may give more")
         return None
+
+    def recount(self, rays: int) -> None:
+        """Count passes over another number of rays from now on."""
+        self.rays_done, self.rays = round(self.epoch * rays), rays
 
     def where(self) -> dict[str, float]:
         """Return step, epoch and seconds, as the history has them."""

@@ -3,20 +3,34 @@
 Muon steps along the matrix U V^T nearest to the momentum U S V^T, so that each direction of a layer moves alike,
 however small its gradient. What that is worth: benchmarks/results/choices-cpu.md.
 
-Source: Jordan et al., Muon (2024); Kingma & Ba, Adam, ICLR (2015); both as torch.optim has them.
+A rate is that of the reference, a network of 4 x 128 and five octaves. In another shape each weight has a share of it,
+such that a step changes what a layer gives as much as in the reference, whatever the width (maximal-update
+parametrisation):
+
+    Muon   |dW|_2 ~ sqrt(fan_out / fan_in)
+    Adam   |dW_ij| ~ 1 / fan_in,      biases and first layer ~ 1
+
+Source: Kingma & Ba, Adam, ICLR (2015); Yang et al., Tensor Programs V, arXiv:2203.03466 (2022), for Adam; Yang, Simon &
+Bernstein, A spectral condition for feature learning, arXiv:2310.17813 (2023), for Muon.
 """
 
 from __future__ import annotations
 
+import math
+
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerif.conventions import InputError
+from nerif.fields.encoding import encoded_width
+from nerif.fields.mlp import Network, NetworkShape
+from nerif.reconstruction.muon import Muon
 
 __all__ = ["OPTIMISERS", "NetworkOptimiser"]
 
 OPTIMISERS = ("muon", "adam")
-NEWTON_SCHULZ = 5  # iterations to U V^T
+REFERENCE = NetworkShape()
+SPECTRAL = 0.2 * math.sqrt(REFERENCE.width)  # of a square matrix of the reference: the root mean square of Adam's step
 
 
 class NetworkOptimiser:
@@ -27,20 +41,21 @@ class NetworkOptimiser:
     kind : one of OPTIMISERS
     betas : Adam's decay rates
     momentum : Muon's
+    by_shape : whether the rates of other shapes than the reference's follow from it; else all weights have Adam's
     """
 
-    def __init__(self, kind: str, network: nn.Module, betas: tuple[float, float], momentum: float) -> None:
+    def __init__(
+        self, kind: str, network: Network, betas: tuple[float, float], momentum: float, by_shape: bool = True
+    ) -> None:
         parameters = list(network.parameters())
         matrices = [p for p in parameters if kind == "muon" and p.ndim == 2 and min(p.shape) > 1]
         chosen = {id(p) for p in matrices}
         others = [p for p in parameters if id(p) not in chosen]
-        self.parts: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(others, lr=1.0, betas=betas)}
+        adam = [{"params": [p], "share": adam_share(network, p) if by_shape else 1.0} for p in others]
+        self.parts: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(adam, lr=1.0, betas=betas)}
         if matrices:
-            # scaled so that a step has the root mean square of Adam's
-            self.parts["muon"] = torch.optim.Muon(
-                matrices, lr=1.0, weight_decay=0.0, momentum=momentum, ns_steps=NEWTON_SCHULZ,
-                adjust_lr_fn="match_rms_adamw",
-            )  # fmt: skip
+            muon = [{"params": [p], "share": muon_share(network, p)} for p in matrices]
+            self.parts["muon"] = Muon(muon, momentum)
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -51,7 +66,7 @@ class NetworkOptimiser:
         """Step, with a learning rate for each part by name."""
         for name, part in self.parts.items():
             for group in part.param_groups:
-                group["lr"] = rates[name]
+                group["lr"] = rates[name] * group["share"]
             part.step()
 
     def tensors(self) -> dict[str, Tensor]:
@@ -78,3 +93,19 @@ class NetworkOptimiser:
             moments[name].setdefault(int(i), {})[entry] = tensor.clone()
         for name, part in self.parts.items():
             part.load_state_dict({"state": moments[name], "param_groups": part.state_dict()["param_groups"]})
+
+
+def muon_share(network: Network, matrix: Tensor) -> float:
+    """Return the spectral norm of a step of Muon, in units of its rate."""
+    fan_out, fan_in = matrix.shape
+    if matrix is network.layers[0].weight:  # its inputs are as many as the octaves ask for, whatever the width
+        octaves = encoded_width(REFERENCE.octaves) / encoded_width(network.shape.octaves)
+        return SPECTRAL * math.sqrt(fan_out / REFERENCE.width * octaves)
+    return SPECTRAL * math.sqrt(fan_out / fan_in)
+
+
+def adam_share(network: Network, weight: Tensor) -> float:
+    """Return the rate of a weight, in units of Adam's rate in the reference."""
+    if weight.ndim < 2 or weight is network.layers[0].weight:
+        return 1.0
+    return REFERENCE.width / weight.shape[1]

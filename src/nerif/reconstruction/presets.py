@@ -21,7 +21,7 @@ PRESETS: dict[str, NeRIF] = {
         network=NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64),
         samples=(24, 64),
         points_per_batch=1 << 17,
-        learning_rate=2e-3,
+        learning_rate=6e-3,
         epochs=60,
     ),
     # the paper to the letter: three terms, lengths of residuals, constant learning rate, its stopping rule
@@ -35,6 +35,7 @@ PRESETS: dict[str, NeRIF] = {
         sampling="random",
         points_per_batch=1 << 15,
         learning_rate=1e-3,
+        rates_by_shape=False,
         schedule="constant",
         epochs=200,
         stop_ratio=0.005,

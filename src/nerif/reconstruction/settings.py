@@ -48,7 +48,9 @@ class TrainingSettings(Reconstructor):
     optimiser: str = "muon"
     """Muon for weight matrices and Adam for the rest, or adam for all (the paper's)."""
     learning_rate: float = 1.5e-2
-    """Adam's, at its highest."""
+    """Adam's at its highest, for a network of 4 x 128; other shapes have shares of it (reconstruction/optimiser.py)."""
+    rates_by_shape: bool = True
+    """Whether Adam's rates follow the shape of the network, or are the same for all weights (the paper's)."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Adam's decay rates."""
     matrix_rate: float = 2.0
@@ -56,7 +58,7 @@ class TrainingSettings(Reconstructor):
     momentum: float = 0.9
     """Muon's."""
     warm_up: int = 50
-    """Steps over which the learning rate rises; with the cosine schedule."""
+    """Steps over which the learning rate rises, at most a sixth of max_steps; with the cosine schedule."""
     schedule: str = "cosine"
     """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
     epochs: float = 40.0

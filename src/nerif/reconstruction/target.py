@@ -12,6 +12,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
+from nerif.reconstruction.bins import binned_rays
 
 __all__ = ["Target"]
 
@@ -37,19 +38,23 @@ class Target:
     chi_square_scale: float | None = None
 
     @classmethod
-    def of(cls, measurement: Measurement, open_faces: tuple[str, ...] = ()) -> Target:
-        """Collect the usable rays that cross none of the open faces.
+    def of(cls, measurement: Measurement, open_faces: tuple[str, ...] = (), edge: int = 1) -> Target:
+        """Collect the usable rays that cross none of the open faces, or those of bins of edge x edge pixels.
 
         Raises
         ------
         InputError
             If no ray is left.
         """
-        rays, displacement, sigma = measurement.rays()
+        if edge > 1:
+            rays, displacement, sigma = binned_rays(measurement, edge, open_faces)
+        else:
+            rays, displacement, sigma = measurement.rays()
         keep = ~rays.exit_faces(measurement.box, open_faces)
         if not bool(keep.any()):
             raise InputError("open_faces: every ray crosses one of them, so none is left; name fewer faces")
-        rays, displacement = rays[keep], displacement[keep]
+        if not bool(keep.all()):
+            rays, displacement, sigma = rays[keep], displacement[keep], None if sigma is None else sigma[keep]
         rms = float(displacement.square().mean().sqrt())
         if rms == 0:
             rms = 1.0  # no displacement at all: the answer is the ambient index, in whatever scale
@@ -58,9 +63,10 @@ class Target:
         index_scale = float((displacement / pixels_per_radian[:, None]).square().mean().sqrt()) or 1e-6
         if sigma is None:
             return cls(rays, displacement, torch.full_like(displacement, 1 / rms), index_scale)
-        inverse = 1 / sigma[keep]
+        inverse = 1 / sigma
         chi_square = float((displacement * inverse).square().mean()) or 1.0
-        return cls(rays, displacement, inverse / math.sqrt(chi_square), index_scale, chi_square)
+        known = None if measurement.sigma is None else chi_square
+        return cls(rays, displacement, inverse / math.sqrt(chi_square), index_scale, known)
 
     def __len__(self) -> int:
         return len(self.rays)

@@ -2,7 +2,9 @@
 
     batch of rays -> samples -> loss_terms -> one step of the optimiser, until the budget is used up
 
-A loss or weights that turn non-finite take the run back to its last good state, with half the learning rate.
+Of large pictures the first steps see bins of pixels, and those after PIONEERS of the run the smallest bins of which it
+can see all (bins.py). A loss or weights that turn non-finite, and a field that is or becomes empty (watch.py), take the
+run back to its last good state with a third of the learning rate.
 """
 
 from __future__ import annotations
@@ -22,8 +24,9 @@ from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, St
 from nerif.reconstruction.budget import Budget
 from nerif.reconstruction.device import peak_memory
 from nerif.reconstruction.fingerprint import check_fingerprint
-from nerif.reconstruction.losses import Evaluator, loss_terms
+from nerif.reconstruction.losses import Evaluator, loss_terms, reduce
 from nerif.reconstruction.optimiser import NetworkOptimiser
+from nerif.reconstruction.order import shuffled
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.sampling import SamplingDensity, sample_count, sample_rays
@@ -31,10 +34,12 @@ from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import TrainingData
 from nerif.reconstruction.warm_start import adopt, fit_network
+from nerif.reconstruction.watch import Watch
 
 __all__ = ["Training"]
 
-RETRIES = 5  # times a run that turned non-finite is taken back before it gives up
+RETRIES = 5  # times a run is taken back before it gives up
+PIONEERS = 0.1  # share of the run after which its pace is known
 GAUGE_POINTS = 256  # a step
 DENSITY_EVERY = 60  # steps between looks at where the field varies
 LEVEL_POINTS = 1 << 14  # at which the ambient level is taken at the end
@@ -73,18 +78,21 @@ class Training:
             self.field = data.untrained(settings.network)
         network = self.field.network
         self.density = SamplingDensity(self.field)
-        self.optimiser = NetworkOptimiser(settings.optimiser, network, settings.betas, settings.momentum)
+        self.optimiser = NetworkOptimiser(
+            settings.optimiser, network, settings.betas, settings.momentum, settings.rates_by_shape
+        )
         self.network = MixedPrecision(network, self.device, settings.precision, settings.compile)
         self.budget = Budget(settings, len(data), self.ranks, self.device)  # its clock begins here: imports are no training
         self.history: list[dict[str, float]] = []
-        self.order = torch.empty(0, dtype=torch.long)
+        self.edge, self.settled = data.coarsest, data.coarsest == 1
+        self.watch = Watch(data.noise)
         self.retries, self.rate = 0, 1.0
         self.initial_loss, self.running = float("nan"), float("nan")
         if resume is not None:
             check_fingerprint(resume.scalars.get("fingerprint"), data.fingerprint)
             self._restore(resume)
         self.start = start if resume is None else None
-        self.good = self._capture()
+        self.first = self.good = self._capture()
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -94,6 +102,9 @@ class Training:
         clock, rays_then = time.perf_counter(), budget.rays_done
         while outcome is None:
             self._agree()
+            if not self.settled and budget.progress >= PIONEERS:
+                self._settle()
+                clock, rays_then = time.perf_counter(), budget.rays_done
             target, tau, s, interval, rays = self._batch()
             terms = self._terms(target, tau, s, interval)
             loss = sum(getattr(settings.weights, name) * term for name, term in terms.items())
@@ -107,16 +118,21 @@ class Training:
             outcome = self._outcome()
             if self.device.type == "cuda" and budget.step % LOG_EVERY and outcome is None:
                 continue  # looking at a number waits for the GPU, so look now and then
-            figures = torch.stack([term.detach().float() for term in (*terms.values(), loss)])
-            values = dict(zip((*terms, "loss"), self.ranks.average(figures, len(target), rays).tolist(), strict=True))
+            empty = reduce(target.displacement * target.inverse_scale, settings.norm)
+            figures = torch.stack([term.detach().float() for term in (*terms.values(), loss, empty)])
+            means = self.ranks.average(figures, len(target), rays).tolist()
+            values = dict(zip((*terms, "loss"), means, strict=False))
             if not math.isfinite(values["loss"]) or (outcome is not None and not self._finite()):
                 outcome = self._take_back()
                 continue
-            self._follow(values["loss"])
+            self._follow(values, means[-1])
+            if self.watch.collapsed(outcome is not None):
+                outcome = self._take_back("the field was lost") or budget.exhausted()
+                continue
             speed = (budget.rays_done - rays_then) / max(time.perf_counter() - clock, 1e-9)
             if budget.step % LOG_EVERY == 0 or budget.step == 1 or outcome is not None:
                 self._log({**values, "rays_per_second": speed})
-            if budget.step % KEEP_EVERY == 0 and self._finite():
+            if budget.step % KEEP_EVERY == 0 and self.watch.healthy and self._finite():
                 self.good = self._capture()
             if self._asked(on_step, self._tell(values, speed)) and outcome is None:
                 outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
@@ -163,11 +179,25 @@ class Training:
 
     def _draw(self, count: int) -> Tensor:
         """The numbers of the next rays, of a random order that has each once an epoch."""
-        if len(self.order) < count:
-            self.order = torch.cat([self.order, torch.randperm(len(self.data), generator=self.generator)])
-        index, self.order = self.order[:count], self.order[count:]
+        index = shuffled(self.budget.rays_done, count, len(self.data), self.settings.seed)
         self.budget.rays_done += count
         return index
+
+    def _settle(self) -> None:
+        """Go on with the smallest bins of which the rest of the run can see all."""
+        left, rays, edge = self.budget.left(self.budget.rays_done), len(self.data), self.edge
+        while edge > 1 and 4 * rays <= left:
+            edge, rays = edge // 2, 4 * rays
+        self.settled = True
+        if edge < self.edge:
+            self._refine(edge)
+
+    def _refine(self, edge: int) -> None:
+        self.edge = edge
+        self.data.refine(edge)
+        self.budget.recount(len(self.data))
+        self.watch.noise = self.data.noise
+        self._log({"bin_edge": float(edge)})
 
     def _batch(self) -> tuple[Target, Tensor | None, Tensor, Tensor, int]:
         """Rays, their instants and samples: this process's share of a step, and how many rays the step has in all."""
@@ -208,7 +238,8 @@ class Training:
         """Adam's, of the next step."""
         settings, rate = self.settings, self.rate * self.settings.learning_rate
         if settings.schedule == "cosine":
-            rate *= min(1.0, (self.budget.step + 1) / settings.warm_up)
+            warm_up = min(settings.warm_up, settings.max_steps / 6 or math.inf)
+            rate *= min(1.0, (self.budget.step + 1) / warm_up)
             rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(self.budget.progress, 1.0)))
         return rate
 
@@ -221,9 +252,14 @@ class Training:
             return Outcome("converged", f"loss fell to {share:g} of its initial value")
         return outcome
 
-    def _follow(self, loss: float) -> None:
+    def _follow(self, values: dict[str, float], empty: float) -> None:
         """A running mean of the loss; squares are rooted so that ratios mean the same for both norms."""
-        loss = math.sqrt(loss) if self.settings.norm == "squared" else loss
+        weights, squared = self.settings.weights, self.settings.norm == "squared"
+        data = {name: getattr(weights, name) for name in ("automatic", "head", "numerical") if name in values}
+        residual = sum(weight * values[name] for name, weight in data.items()) / sum(data.values())
+        power = 1 if squared else 2
+        self.watch.follow(residual**power, empty**power, self.budget.step)
+        loss = math.sqrt(values["loss"]) if squared else values["loss"]
         if math.isnan(self.initial_loss):
             self.initial_loss = self.running = loss
         self.running += 0.1 * (loss - self.running)
@@ -232,17 +268,25 @@ class Training:
         """Whether the weights are: a finite loss can have a gradient that is not."""
         return all(bool(torch.isfinite(w).all()) for w in self.field.network.parameters())
 
-    def _take_back(self) -> Outcome | None:
-        """Return to the last good state with half the learning rate."""
-        retries, rate, seconds = self.retries + 1, self.rate / 2, self.budget.seconds
-        self._restore(self.good)
+    def _take_back(self, why: str = "loss turned non-finite") -> Outcome | None:
+        """Return to the last good state, or to the first if nothing was found since, with a third of the rate."""
+        retries, rate, seconds, left = self.retries + 1, self.rate / 3, self.budget.seconds, self.watch.left
+        empty = self.watch.collapsed(over=True) and not self.watch.found
+        self._restore(self.first if empty else self.good)
         self.budget.restore({**self.budget.used(), "seconds": seconds})
         self.retries, self.rate = retries, rate
         self._log({"taken_back": float(retries)})
+        if empty and (retries > RETRIES or self.budget.exhausted()):
+            return Outcome(
+                "collapsed",
+                f"no field was found: after {retries} attempt(s) {min(left, 9.99):.0%} of the squared "
+                "displacement, noise apart, is not explained; try a smaller --learning-rate, and nerif check on the "
+                "measurement",
+            )
         if retries > RETRIES:
             return Outcome(
                 "diverged",
-                f"loss turned non-finite {retries} times; kept the last good state of step {self.budget.step}; "
+                f"{why} {retries} times; kept the last good state of step {self.budget.step}; "
                 "try a smaller --learning-rate or --precision float32",
             )
         return None
@@ -261,13 +305,12 @@ class Training:
         tensors = {f"network.{k}": v.detach().clone() for k, v in self.field.network.state_dict().items()}
         tensors |= {f"optimiser.{k}": v for k, v in self.optimiser.tensors().items()}
         tensors["generator"] = self.generator.get_state().clone()
-        tensors["order"] = self.order.clone()
         if self.density.values is not None:
             tensors["density"] = self.density.values.clone()
-        names = ("retries", "rate", "initial_loss", "running")
+        names = ("retries", "rate", "initial_loss", "running", "settled")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
         kept = {"budget": self.budget.used(), "history": list(self.history), "fingerprint": self.data.fingerprint}
-        return State(tensors, {**scalars, **kept})
+        return State(tensors, {**scalars, **kept, "edge": self.edge, "watch": self.watch.kept()})
 
     def _restore(self, state: State) -> None:
         tensors, scalars = state.tensors, dict(state.scalars)
@@ -278,20 +321,24 @@ class Training:
             raise InputError("resume: the checkpoint is of another network; give the same settings") from None
         self.optimiser.restore({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser.")})
         self.generator.set_state(tensors["generator"])
-        self.order = tensors["order"].clone()
         density = tensors.get("density")
         self.density.values = None if density is None else density.clone().to(self.device)
         del scalars["fingerprint"]
         self.history = list(scalars.pop("history"))
+        self.watch.restore(scalars.pop("watch"))
+        edge = int(scalars.pop("edge"))
+        if edge != self.edge:
+            self._refine(edge)
+            self.history.pop()
         self.budget.restore(scalars.pop("budget"))
         for name, value in scalars.items():
             setattr(self, name, value)
 
     def _result(self, outcome: Outcome) -> Reconstruction:
         state = self._capture()
-        if self.retries and outcome.reason != "diverged":
-            taken_back = f"; taken back {self.retries} time(s) to the last good state after a non-finite loss"
-            outcome = Outcome(outcome.reason, outcome.message + taken_back)
+        if not outcome.failed:
+            again = f"; taken back {self.retries} time(s) to the last good state" if self.retries else ""
+            outcome = Outcome(outcome.reason, outcome.message + again + self.watch.remark)
         self.field.network.eval().requires_grad_(False)
         # the constant that the data leave open
         self.field.offset = float(self._at_ambient(LEVEL_POINTS, torch.Generator().manual_seed(0)).mean())

@@ -15,6 +15,7 @@ from torch import Tensor
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 from nerif.measurement import Measurement
+from nerif.reconstruction.bins import coarsest_edge
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.gauge import AmbientRegion
@@ -37,6 +38,15 @@ class TrainingData(ABC):
 
     def __init__(self, device: torch.device, box: Box, n_ambient: float, fingerprint: dict[str, str]) -> None:
         self.device, self.box, self.n_ambient, self.fingerprint = device, box, n_ambient, fingerprint
+
+    coarsest: int = 1
+    """Edge of the largest bins that the data can be given in, px."""
+    noise: float = 0.0
+    """Mean square of the noise over that of what was measured; 0 where it is not known."""
+
+    def refine(self, edge: int) -> None:
+        """Give bins of another edge, px, from now on."""
+        assert edge == 1, "these data are pixels always"
 
     @abstractmethod
     def __len__(self) -> int:
@@ -69,14 +79,20 @@ class FrameData(TrainingData):
     ----------
     settings : TrainingSettings
     measurement : Measurement
+    coarsest : edge of the bins to begin with, px; None for what a picture of its size can do with
     """
 
-    def __init__(self, settings: TrainingSettings, measurement: Measurement) -> None:
+    def __init__(self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None) -> None:
         known = fingerprint(measurement, settings.open_faces)
         super().__init__(resolve_device(settings.device), measurement.box, measurement.n_ambient, known)
-        self.measurement = measurement
+        self.settings, self.measurement = settings, measurement
+        self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces or measurement.ambient_faces)
-        self.target = Target.of(measurement, settings.open_faces).to(self.device)
+        self.refine(self.coarsest)
+
+    def refine(self, edge: int) -> None:
+        self.target = Target.of(self.measurement, self.settings.open_faces, edge).to(self.device)
+        self.noise = 1 / self.target.chi_square_scale if self.target.chi_square_scale else 0.0
 
     def __len__(self) -> int:
         return len(self.target)

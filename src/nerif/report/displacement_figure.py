@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from nerif.atomic import atomic
+from nerif.drawing import draw_displacement
 from nerif.measurement import Measurement
-from nerif.report.figures import draw_displacement
 
 __all__ = ["save_displacements", "save_masks"]
+
+MOST = 512  # px along the longer edge of a view
 
 
 def save_displacements(path: Path, measurement: Measurement) -> None:
@@ -18,7 +20,9 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    d = np.where(measurement.usable.numpy()[..., None], measurement.displacement.numpy(), np.nan)
+    step = _step(measurement)
+    usable, d = (x[:, ::step, ::step].numpy() for x in (measurement.usable, measurement.displacement))
+    d = np.where(usable[..., None], d, np.nan)
     limit = float(np.nanpercentile(np.abs(d), 99.5)) or 1.0
     count = len(measurement.cameras)
     columns = min(count, 5)
@@ -35,7 +39,8 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
             axes = grid[2 * (i // columns) + k, i % columns]
             axes.set_visible(True)
             axes.set_facecolor("0.75")
-            shown = draw_displacement(axes, d[i, :height, :width, k], limit)
+            shown = draw_displacement(axes, d[i, : -(-height // step), : -(-width // step), k], limit)
+            shown.images[-1].set_extent((-0.5, width - 0.5, height - 0.5, -0.5))
             axes.set_title(f"{camera.name}: {component}", fontsize=8)
             axes.tick_params(labelsize=6)
             axes.set_xlabel("column [px]" if k else "", fontsize=7)
@@ -52,7 +57,11 @@ def save_masks(path: Path, measurement: Measurement) -> None:
     from matplotlib.figure import Figure
 
     assert measurement.flow_mask is not None
-    d = np.where(measurement.usable.numpy(), measurement.displacement.norm(dim=-1).numpy(), np.nan)
+    step = _step(measurement)
+    usable, components, masks = (
+        x[:, ::step, ::step].numpy() for x in (measurement.usable, measurement.displacement, measurement.flow_mask)
+    )
+    d = np.where(usable, np.linalg.norm(components, axis=-1), np.nan)
     limit = float(np.nanpercentile(d, 99.5)) or 1.0
     count = len(measurement.cameras)
     columns = min(count, 5)
@@ -64,10 +73,12 @@ def save_masks(path: Path, measurement: Measurement) -> None:
     for i, (axes, camera) in enumerate(zip(grid.flat, measurement.cameras, strict=False)):
         height, width = camera.image_size
         axes.set_facecolor("0.75")
-        shown = axes.imshow(d[i, :height, :width], vmin=0, vmax=limit, cmap="viridis", interpolation="nearest")
-        mask = measurement.flow_mask[i, :height, :width].numpy()
-        if mask.any() and not mask.all():
-            axes.contour(mask.astype(float), [0.5], colors="white", linewidths=1)
+        inside = (i, slice(0, -(-height // step)), slice(0, -(-width // step)))
+        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+        shown = axes.imshow(d[inside], vmin=0, vmax=limit, cmap="viridis", interpolation="nearest", extent=extent)
+        if masks[inside].any() and not masks[inside].all():
+            columns_px, rows_px = np.arange(0, width, step), np.arange(0, height, step)
+            axes.contour(columns_px, rows_px, masks[inside].astype(float), [0.5], colors="white", linewidths=1)
         axes.set_title(camera.name, fontsize=8)
         axes.tick_params(labelsize=6)
         axes.set_xlabel("column [px]", fontsize=7)
@@ -75,3 +86,8 @@ def save_masks(path: Path, measurement: Measurement) -> None:
     figure.colorbar(shown, ax=grid.ravel().tolist(), label="|d| [px]", shrink=0.6, extend="max")
     with atomic(path) as part:
         figure.savefig(part, dpi=120)
+
+
+def _step(measurement: Measurement) -> int:
+    """Distance of the pixels that are drawn: more than MOST along an edge would not show."""
+    return max(1, -(-max(measurement.displacement.shape[1:3]) // MOST))

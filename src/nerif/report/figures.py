@@ -1,54 +1,20 @@
-"""Figures, each drawn into Axes that the caller gives and gets back; `pages.py` makes pages of them for print.
+"""How a run went and how good it is, each drawn into Axes that the caller gives and gets back.
 
-Sequential colour maps are perceptually uniform, diverging ones centred on 0; the colour-blind can read both.
+`pages.py` makes pages of these and of the slices and maps of `nerif/drawing.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerif.volume import Volume
+from nerif.drawing import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "COLOUR_MAPS",
-    "DIVERGING",
-    "LABELS",
-    "add_colour_bar",
-    "colour_range",
-    "draw_displacement",
-    "draw_history",
-    "draw_residuals",
-    "draw_slice",
-    "draw_slice_scores",
-    "draw_view_scores",
-    "label_of",
-    "shown",
-]
-
-PLANES = {"z": ("x", "y"), "y": ("x", "z"), "x": ("y", "z")}
-"""Normal of a slice: the axes it is drawn over."""
-
-COLOUR_MAPS = {"temperature": "inferno"}
-"""By quantity; the others are drawn in viridis."""
-
-DIVERGING = "RdBu_r"
-
-COLOURS = {"blue": "#0072B2", "orange": "#D55E00", "green": "#009E73", "grey": "#595959"}  # Okabe & Ito
-
-LABELS = {
-    "index_excess": ("n − n$_{ambient}$", "1"),
-    "n": ("n − 1", "1"),
-    "density": ("density", "kg m$^{-3}$"),
-    "temperature": ("temperature", "K"),
-}
-"""What stands at a colour bar, and the unit."""
-
+__all__ = ["draw_history", "draw_residuals", "draw_slice_scores", "draw_view_scores"]
 
 TERMS = {
     "automatic": "displacement, exact gradient",
@@ -59,88 +25,6 @@ TERMS = {
     "loss": "whole loss",
 }
 """Names of the terms of the loss in words."""
-
-
-def label_of(quantity: str) -> str:
-    """Return the label of a colour bar, with its unit: of density, density_std and so on."""
-    base, _, statistic = quantity.rpartition("_")
-    if statistic in ("mean", "std") and base in LABELS:
-        name, unit = LABELS[base]
-        return f"{'standard deviation of' if statistic == 'std' else 'mean'} {name} [{unit}]"
-    name, unit = LABELS.get(quantity, (quantity, "1"))
-    return f"{name} [{unit}]"
-
-
-def shown(volume: Volume) -> np.ndarray:
-    """Return the values as they are shown, (z, y, x): n as n - 1, the others as they are."""
-    values = volume.values.double().numpy()
-    return values - 1 if volume.quantity in ("n", "n_mean") else values
-
-
-def draw_slice(
-    axes: Axes, volume: Volume, normal: str, limits: tuple[float, float] | None = None, colour_map: str | None = None
-) -> Axes:
-    """Draw the middle slice of a volume across the axis `normal`; lengths in mm, masked voxels grey."""
-    values = shown(volume)
-    low, high = limits or colour_range(values)
-    axis = "zyx".index(normal)
-    plane = np.take(values, values.shape[axis] // 2, axis=axis)
-    across, up = PLANES[normal]
-    box = volume.grid.box
-    i, j = "xyz".index(across), "xyz".index(up)
-    axes.set_facecolor("0.8")
-    axes.imshow(
-        plane,
-        origin="lower",
-        extent=(box.lower[i], box.upper[i], box.lower[j], box.upper[j]),
-        vmin=low,
-        vmax=high,
-        cmap=colour_map or COLOUR_MAPS.get(volume.quantity.partition("_")[0], "viridis"),
-        interpolation="nearest",
-    )
-    axes.set_xlabel(f"{across} [mm]")
-    axes.set_ylabel(f"{up} [mm]")
-    return axes
-
-
-def colour_range(values: np.ndarray) -> tuple[float, float]:
-    """Return the ends of the colours: lowest and highest value, or where a thousandth of the voxels is left beyond.
-
-    The latter where a few outliers would take a fifth of the colours and more. NaN is left out; 0 and 1 for nothing.
-    """
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return 0.0, 1.0
-    low, high = float(known.min()), float(known.max())
-    inner = np.quantile(known, [0.001, 0.999])
-    if inner[1] > inner[0] and high - low > 1.25 * (inner[1] - inner[0]):
-        return float(inner[0]), float(inner[1])
-    return low, high
-
-
-def draw_displacement(axes: Axes, image: np.ndarray, limit: float) -> Axes:
-    """Draw one displacement component (px) on a diverging scale centred on 0; rows downward, unmeasured pixels grey."""
-    axes.set_facecolor("0.8")
-    axes.imshow(image, vmin=-limit, vmax=limit, cmap=DIVERGING, interpolation="nearest")
-    axes.set_xlabel("column [px]")
-    axes.set_ylabel("row [px]")
-    return axes
-
-
-def add_colour_bar(axes: Sequence[Axes], label: str) -> Axes:
-    """Put a colour bar beside axes that share the last one's scale, and return its axes."""
-    from matplotlib.ticker import ScalarFormatter
-
-    form = ScalarFormatter(useMathText=True)
-    form.set_powerlimits((-3, 4))
-    figure = axes[0].figure
-    low, high = axes[-1].images[-1].get_clim()
-    drawn = np.concatenate([np.ma.masked_invalid(np.ma.asarray(a.images[-1].get_array())).compressed() for a in axes])
-    beyond = (bool((drawn < low).any()), bool((drawn > high).any()))
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
-    bar = figure.colorbar(axes[-1].images[-1], ax=list(axes), format=form, shrink=0.9, pad=0.02, extend=extend)
-    bar.set_label(label)
-    return bar.ax
 
 
 def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Axes:

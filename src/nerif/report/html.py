@@ -14,12 +14,14 @@ import torch
 
 from nerif import __version__
 from nerif.atomic import atomic
+from nerif.drawing import COLOUR_MAPS, DIVERGING, style
+from nerif.notebook import number
 from nerif.report import packing
-from nerif.report.figures import COLOUR_MAPS, DIVERGING, draw_history, draw_residuals, draw_slice_scores
+from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.isosurface import default_level
-from nerif.report.pages import error_of, residuals_over_sigma, style
+from nerif.report.pages import error_of, residuals_over_sigma
 from nerif.report.rig_figure import picture_corners
-from nerif.report.summary import came_out, headline, measured, number, trust, trust_figures
+from nerif.report.summary import came_out, headline, measured, trust, trust_figures
 from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
 from nerif.volume import Volume

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from nerif.report.figures import colour_range, shown
+from nerif.drawing import colour_range, shown
 from nerif.volume import Volume
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ FACE = "#E69F00"
 def default_level(volume: Volume) -> float:
     """Return the value halfway between the ambient (median of the faces of the box) and what is farthest from it.
 
-    A few outliers do not count: see figures.colour_range.
+    A few outliers do not count: see drawing.colour_range.
     """
     values = shown(volume)
     faces = np.concatenate([np.take(values, i, axis=a).ravel() for a in range(3) for i in (0, -1)])

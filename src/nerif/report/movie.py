@@ -11,7 +11,7 @@ import numpy as np
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
-from nerif.report.figures import COLOUR_MAPS, LABELS, colour_range, shown
+from nerif.drawing import COLOUR_MAPS, LABELS, colour_range, shown
 from nerif.report.isosurface import default_level, filled
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence

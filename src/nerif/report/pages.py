@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,19 +11,17 @@ import numpy as np
 import torch
 
 from nerif.atomic import atomic
-from nerif.report.figures import (
+from nerif.drawing import (
     DIVERGING,
     add_colour_bar,
     colour_range,
     draw_displacement,
-    draw_history,
-    draw_residuals,
     draw_slice,
-    draw_slice_scores,
-    draw_view_scores,
     label_of,
     shown,
+    style,
 )
+from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.view_images import lattice_step
 from nerif.reprojection import Reprojection
@@ -34,36 +31,13 @@ from nerif.volume import Volume
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["JOURNALS", "error_of", "figures_of", "residuals_over_sigma", "save_figures", "style"]
+__all__ = ["JOURNALS", "error_of", "figures_of", "residuals_over_sigma", "save_figures"]
 
 JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature": (89, 183), "springer": (84, 174)}
 """Widths of one and of two columns, mm, as the publishers' guides for authors give them."""
 
 NOT_IN_FILES = r"[^\w.+-]"
 TO_DRAW = ("n", "density", "temperature", "n_std", "density_std", "temperature_std")
-
-
-@contextmanager
-def style(size: float = 7.0) -> Iterator[None]:
-    """Text of `size` points, thin lines, fonts that stay text in PDF and SVG."""
-    import matplotlib as mpl
-
-    settings: Any = {
-        "font.size": size,
-        "axes.titlesize": size,
-        "axes.labelsize": size,
-        "legend.fontsize": size - 0.5,
-        "xtick.labelsize": size - 0.5,
-        "ytick.labelsize": size - 0.5,
-        "axes.linewidth": 0.6,
-        "xtick.major.width": 0.6,
-        "ytick.major.width": 0.6,
-        "pdf.fonttype": 42,
-        "svg.fonttype": "none",
-        "hatch.linewidth": 0.6,
-    }
-    with mpl.rc_context(settings):
-        yield
 
 
 def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi: int = 300) -> list[Path]:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.report.figures import COLOURS, colour_range
+from nerif.drawing import COLOURS, colour_range
 from nerif.resolution import SIZE, THRESHOLD, Resolution
 
 if TYPE_CHECKING:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerif.conventions import InputError
+from nerif.drawing import COLOUR_MAPS, colour_range
+from nerif.notebook import number
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import packing
-from nerif.report.figures import COLOUR_MAPS, colour_range
 from nerif.report.html import QUANTITIES, flat, render_page, svg
 from nerif.report.isosurface import default_level
 from nerif.report.movie import frames_there
-from nerif.report.summary import Statement, number
+from nerif.report.summary import Statement
 from nerif.report.view_images import colour_table
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
@@ -114,7 +115,7 @@ def _statements(store: VolumeSequence) -> list[Statement]:
     missing, failed = int((status == 0).sum()), np.flatnonzero(status == 2)
     if missing:
         found.append(
-            Statement("warning", f"{missing} of {len(status)} frames are missing; the same command does them.")
+            Statement("warning", f"{missing} of {len(status)} frames are missing; the same command again does them.")
         )
     if len(failed):
         reasons = [str(r) for r in store.array("reason")[:]]
@@ -122,14 +123,14 @@ def _statements(store: VolumeSequence) -> list[Statement]:
         found.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
     held = set(store.attributes.get("hold_out", ()))
     if not held:
-        found.append(Statement("note", "No view was held out, so nothing here tests what the cameras did not see."))
+        found.append(Statement("note", "No view was held out, so nothing here is a test on unseen data."))
     return found
 
 
 def _headline(store: VolumeSequence, there: list[int]) -> Statement:
     """The sum of it."""
     if len(there) < len(store):
-        return Statement("warning", f"{len(store) - len(there)} of {len(store)} frames are not there; see below.")
+        return Statement("warning", f"{len(store) - len(there)} of {len(store)} frames are missing; see below.")
     return Statement("good", f"All {len(store)} frames are there.")
 
 
@@ -173,7 +174,7 @@ def _curves(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
             out = name in held
             axes.plot(times, rms[:, i], lw=1.2, ls="--" if out else "-", label=f"{name} (held out)" if out else name)
         axes.set_xlabel("time [ms]")
-        axes.set_ylabel("rms difference to the measured [px]")
+        axes.set_ylabel("rms difference from the measurement [px]")
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=7, ncols=2)
 

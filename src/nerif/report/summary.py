@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from nerif.drawing import shown
+from nerif.notebook import number, percent, span
 from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
-from nerif.report.figures import shown
 from nerif.result import METRICS, VOLUME, Result
 
-__all__ = ["Statement", "came_out", "headline", "measured", "number", "percent", "trust", "trust_figures"]
+__all__ = ["Statement", "came_out", "headline", "measured", "trust", "trust_figures"]
 
 VITAL = (FIELD, METRICS, VOLUME)
 """Without these nothing can be said of a result; without the others less can be shown."""
@@ -38,50 +39,13 @@ class Statement:
     text: str
 
 
-def number(value: object, digits: int = 4) -> str:
-    """Return a number for people, with a power of ten written as such; a dash for what is none."""
-    if not isinstance(value, int | float) or not np.isfinite(value):
-        return "–"
-    if value == 0 or 1e-3 <= abs(value) < 1e5:
-        return f"{float(f'{value:.{digits}g}'):.10g}"
-    mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
-    raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"{float(mantissa):g} × 10{raised}"
-
-
-def percent(share: float) -> str:
-    """Return a share in per cent; what is there at all is never called 0."""
-    return "under 0.01%" if 0 < share < 1e-4 else f"{share:.2%}"
-
-
 def measured(result: Result) -> list[tuple[str, str]]:
     """Return what was measured, as names and values with units."""
     m = result.measurement
     if m is None:
         return [("Measurement", str(result.settings.get("measurement", "unknown")))]
-    sizes = sorted({c.image_size for c in m.cameras})
-    size = " and ".join(f"{w} × {h}" for h, w in sizes[:3])
-    names = result.settings.get("hold_out", ()) if result.reprojection is None else result.reprojection.held_out
-    held = f", of which {len(names)} held out" if names else ""
-    usable = m.usable
-    d = m.displacement[usable]
-    rows = [
-        ("Views", f"{len(m.cameras)}{held}, of {size} px"),
-        (
-            "Displacement",
-            f"rms {number(float(d.square().mean().sqrt()), 3)} px, up to {number(float(d.abs().max()), 3)} px",
-        ),
-    ]
-    if m.sigma is not None:
-        rows.append(("Noise σ", f"rms {number(float(m.sigma[usable].square().mean().sqrt()), 3)} px"))
-    else:
-        rows.append(("Noise σ", "not known"))
-    inside = sum(h * w for h, w in (c.image_size for c in m.cameras))
-    rows.append(("Usable pixels", f"{float(usable.sum()) / inside:.1%}"))
-    rows.append(("Volume", " × ".join(f"{e:g}" for e in m.box.edges) + " mm (x, y, z)"))
-    light = f" at {m.wavelength_nm:g} nm" if m.wavelength_nm else ""
-    rows.append(("Ambient index", f"{m.n_ambient:.7g}{light}"))
-    return rows
+    held_out = result.settings.get("hold_out", ()) if result.reprojection is None else result.reprojection.held_out
+    return m.summary(len(held_out))
 
 
 def came_out(result: Result) -> list[tuple[str, str]]:
@@ -95,17 +59,7 @@ def came_out(result: Result) -> list[tuple[str, str]]:
         volume = result.volumes.get(quantity)
         if volume is None:
             continue
-        values = shown(volume)
-        known = values[np.isfinite(values)]
-        if not known.size:
-            rows.append((name, "masked everywhere"))
-            continue
-        share = 1 - known.size / values.size
-        masked = f"; {percent(share)} masked" if share else ""
-        digits = 4 if quantity == "temperature" else 3
-        rows.append(
-            (name, f"{number(float(known.min()), digits)} to {number(float(known.max()), digits)}{unit}{masked}")
-        )
+        rows.append((name, span(shown(volume), unit, 4 if quantity == "temperature" else 3)))
     ambient = _ambient_temperature(result)
     if ambient is not None:
         rows.append(("Ambient, implied", f"{ambient:.1f} K"))
@@ -176,10 +130,10 @@ def headline(statements: list[Statement]) -> Statement:
     return Statement(
         worst,
         {
-            "good": "It predicts a view it has not seen, and what it leaves unexplained is the noise.",
-            "note": "Nothing found speaks against it; read the notes.",
-            "warning": "Use it with the reservations below.",
-            "bad": "Not to be relied on as it is; see below.",
+            "good": "It predicts a view it has not seen, and what remains unexplained is noise.",
+            "note": "No problems found; see the notes below.",
+            "warning": "Usable, with the reservations below.",
+            "bad": "Not to be relied on as it stands; see below.",
         }[worst],
     )
 
@@ -207,11 +161,13 @@ def _of_outcome(result: Result) -> list[Statement]:
         return []
     if outcome == "diverged":
         return [Statement("bad", f"The run diverged. {message}".strip())]
+    if outcome == "collapsed":
+        return [Statement("bad", f"The run found no field. {message}".strip())]
     if outcome == "interrupted":
-        return [Statement("warning", f"The run was interrupted; --resume goes on. {message}".strip())]
+        return [Statement("warning", f"The run was interrupted; --resume continues it. {message}".strip())]
     if outcome in ("time_limit", "steps"):
         limit = "time limit" if outcome == "time_limit" else "limit of steps"
-        return [Statement("note", f"The run ended at its {limit}; more may give more.")]
+        return [Statement("note", f"The run ended at its {limit}; a longer one may be more accurate.")]
     return []
 
 
@@ -225,11 +181,11 @@ def _of_held_out(result: Result) -> list[Statement]:
         if not seen:
             text = "The field was not compared with any view: nerif evaluate --measurement FILE does it."
             return [Statement("warning", text)]
-        text = "No view was held out, so nothing was checked against data that the reconstruction has not seen."
+        text = "No view was held out, so the field was not checked against data the reconstruction has not seen."
         return [Statement("warning", f"{text} Repeat with --hold-out VIEW.")]
     known = [v for v in held if v.get("cc") is not None]
     if not known:
-        return [Statement("warning", "The held-out views have no pixel to compare.")]
+        return [Statement("warning", "The held-out views have no pixels to compare.")]
     worst = min(known, key=lambda v: v["cc"])
     cc, noise, name = worst["cc"], _largest(known, "rms_over_sigma"), worst["name"]
     among = f"; the worst of {len(known)}" if len(known) > 1 else ""
@@ -244,10 +200,14 @@ def _of_held_out(result: Result) -> list[Statement]:
 
 def _of_residual(result: Result) -> list[Statement]:
     seen = _views(result, False)
+    if not seen:
+        text = "No training view was compared, so there is no telling whether what is left unexplained is noise."
+        remedy = "nerif evaluate --measurement FILE compares the views of the reconstruction."
+        return [Statement("note", f"{text} {remedy}")] if _views(result, True) else []
     known = [v for v in seen if v.get("rms_over_sigma") is not None]
     if not known:
-        text = "The noise of the measurement is not known, so it cannot be told whether the residual is noise."
-        return [Statement("note", f"{text} nerif displacement writes sigma.")] if seen else []
+        text = "The noise of the measurement is not known, so there is no telling whether the residual is noise."
+        return [Statement("note", f"{text} nerif displacement writes sigma.")]
     lowest, highest = (f(known, key=lambda v: v["rms_over_sigma"]) for f in (min, max))
     low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
     found = []

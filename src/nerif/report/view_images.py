@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nerif.drawing import DIVERGING
 from nerif.measurement import Measurement
-from nerif.report.figures import DIVERGING
 from nerif.reprojection import Reprojection
 
 __all__ = ["ViewImages", "colour_table", "lattice_step", "view_images"]

@@ -69,7 +69,9 @@ class ChunkData(TrainingData):
             self.inverse_scale[i, row] = target.inverse_scale * math.sqrt(own)
         measured = torch.isfinite(self.displacement)
         scaled = self.displacement[measured] * self.inverse_scale[measured]
-        self.inverse_scale /= float(scaled.square().mean().sqrt()) or 1.0
+        mean_square = float(scaled.square().mean()) or 1.0
+        self.inverse_scale /= math.sqrt(mean_square)
+        self.noise = 1 / mean_square if all(t.chi_square_scale for t in targets) else 0.0
         self.measured = measured.all(-1).reshape(-1).nonzero()[:, 0]  # frame r + ray
         self.index_scale = float(np.sqrt(np.mean([t.index_scale**2 for t in targets])))
 

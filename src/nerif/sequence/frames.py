@@ -102,7 +102,7 @@ def _frame(
     begun = time.perf_counter()
     training = measurement.select([name for name in measurement.names if name not in plan.hold_out])
     result = settings(training, watch, None, start)
-    if result.outcome.reason == "diverged":
+    if result.outcome.failed:
         raise ArithmeticError(result.outcome.message)
     assert isinstance(result.field, NeuralField)
     frame = finished_frame(plan, result.field, measurement, result.device)

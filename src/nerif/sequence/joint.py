@@ -95,7 +95,7 @@ def _read(plan: SequencePlan, sequence: MeasurementSequence, index: int) -> Fram
     """A frame without the views held out."""
     frame = sequence.frame(index)
     training = frame.select([name for name in frame.names if name not in plan.hold_out])
-    return FrameData(replace(plan.cold, device="cpu"), training)
+    return FrameData(replace(plan.cold, device="cpu"), training, coarsest=1)
 
 
 def _trained(
@@ -110,7 +110,7 @@ def _trained(
             data = ChunkData(settings, frames, tau, plan.time_octaves)
             training = Training(settings, data, _resumable(kept, data))
             result = training.run(compose(on_step, checkpoints(kept, CHECKPOINT_EVERY)))
-            if result.outcome.reason == "diverged":
+            if result.outcome.failed:
                 raise ArithmeticError(result.outcome.message)
             return data, result
         except FAILURES as error:

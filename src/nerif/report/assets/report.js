@@ -193,7 +193,7 @@ async function main() {
     const message = document.getElementById("space-message");
     message.hidden = false;
     document.querySelector(".panel").hidden = true;
-    message.textContent = "This browser offers no WebGL 2, so the field cannot be shown in three dimensions here (" + error.message + "). The slices above hold the same values; volume.vti opens in ParaView.";
+    message.textContent = "This browser has no WebGL 2, so the field cannot be shown in three dimensions here (" + error.message + "). The slices above hold the same values; volume.vti opens in ParaView.";
     return;
   }
   const on = (id, event, act) => { const found = document.getElementById(id); if (found) found.addEventListener(event, () => act(found)); };
@@ -218,5 +218,5 @@ main().catch((error) => {
   const trouble = document.getElementById("trouble");
   if (!trouble) throw error;
   trouble.hidden = false;
-  trouble.textContent = "This browser could not draw the field (" + error.message + "). One of 2023 or later can; volume.vti opens in ParaView.";
+  trouble.textContent = "This browser could not draw the field (" + error.message + "). Any browser from 2023 or later can; volume.vti opens in ParaView.";
 });

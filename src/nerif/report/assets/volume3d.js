@@ -170,11 +170,22 @@ function makeSpace(scene, canvas) {
   const controls = new THREE.OrbitControls(eye, canvas);
   controls.enableDamping = false; controls.zoomSpeed = 1.2;
 
-  // the wheel scrolls the page, unless this view is in use
-  canvas.addEventListener("pointerdown", () => canvas.focus());
-  canvas.parentElement.addEventListener("wheel", (event) => {
-    if (!event.ctrlKey && document.activeElement !== canvas) event.stopPropagation();
+  // wheel and finger scroll the page unless this view is in use, that is, has the focus: a click or a tap gives it,
+  // Escape, a second tap or a touch elsewhere takes it away
+  const stage = canvas.parentElement, inUse = () => document.activeElement === canvas;
+  let pointer = "mouse";
+  stage.addEventListener("pointerdown", (event) => {
+    pointer = event.pointerType;
+    if (pointer !== "touch") canvas.focus();
+    else if (!inUse()) event.stopPropagation();
   }, { capture: true });
+  canvas.addEventListener("mousedown", (event) => { if (pointer === "touch") event.preventDefault(); });  // the tap decides
+  canvas.addEventListener("click", () => { if (pointer === "touch") inUse() ? canvas.blur() : canvas.focus({ preventScroll: true }); });
+  document.addEventListener("pointerdown", (event) => { if (!stage.contains(event.target)) canvas.blur(); });
+  stage.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey && !inUse()) event.stopPropagation();
+  }, { capture: true });
+  canvas.style.touchAction = "";  // report.css says who has the finger
 
   let pending = 0, coarse = false, settle = 0, slow = 0;
   let full = Math.min(window.devicePixelRatio || 1, 2);
@@ -232,6 +243,7 @@ function makeSpace(scene, canvas) {
   canvas.addEventListener("keydown", (event) => {
     const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     const zoom = { "+": 0.9, "=": 0.9, "-": 1 / 0.9 }[event.key];
+    if (event.key === "Escape") canvas.blur();
     if (!turn && !zoom) return;
     event.preventDefault();
     const arm = eye.position.clone().sub(controls.target);

@@ -1,0 +1,116 @@
+"""Cameras of full size: error, seconds and memory of the same rig at 100 x 100 and at 1000 x 1000 pixels.
+
+    python benchmarks/full_size.py --write benchmarks/results/full-size-cpu.md
+
+The displacements are to first order along straight rays; the noise of a pixel is the same share of their root mean
+square at every size. Each row is a process of its own, so that the memory is that row's; it includes the measurement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import multiprocessing
+import shlex
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from flame import N_AMBIENT, machine
+from nerif.evaluation import evaluate_volume
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Grid, paper_rig
+from nerif.measurement import Measurement
+from nerif.physics.deflection import Deflection, project
+from nerif.reconstruction import bins
+from nerif.reconstruction.device import keep_freed_memory
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.presets import preset
+from nerif.simulation import add_noise
+from nerif.volume import Volume
+
+SAMPLES = 150  # along a ray of the simulation
+
+
+def measured(pixels: int, noise: float, folder: Path) -> Path:
+    """Simulate the flame on the paper's rig, and return the measurement file; one that is there already is taken."""
+    path = folder / f"flame-{pixels}-{noise:g}.nc"
+    if not path.is_file():
+        cameras, box = paper_rig(pixels)
+        flame, model = make_phantom("flame", box, 0), Deflection(samples=SAMPLES, n_ambient=N_AMBIENT)
+        views = []
+        for camera in cameras:
+            rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
+            views.append(project(model, flame, rays).reshape(pixels, pixels, 2))
+        clean = Measurement(cameras=cameras, displacement=torch.stack(views), box=box, n_ambient=N_AMBIENT)
+        add_noise(clean, noise, seed=1).write(path)
+    return path
+
+
+def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> str:
+    """Reconstruct one measurement, and return its line."""
+    torch.set_num_threads(threads)
+    keep_freed_memory()
+    bins.FEWEST = fewest or bins.FEWEST
+    measurement = Measurement.read(path)
+    begun = time.perf_counter()
+    result = settings(measurement)
+    seconds = time.perf_counter() - begun
+    grid = Grid.of_resolution(measurement.box, 100)
+    truth = Volume(make_phantom("flame", measurement.box, 0).sample(grid), grid)
+    found = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
+    assert result.state is not None
+    edges = [bins.coarsest_edge(measurement)] + [int(r["bin_edge"]) for r in result.history if "bin_edge" in r]
+    last, steps = result.history[-1], " then ".join(map(str, edges))
+    return (
+        f"| {measurement.displacement.shape[1]}² | {steps} | {last['step']:.0f} | {last['epoch']:.2f} | "
+        f"{seconds:.0f} | {result.peak_memory_bytes / 2**30:.2f} | {found['l2']:.3%} | {found['l2_variation']:.2%} |"
+    )
+
+
+def main() -> None:
+    """Run and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--pixels", type=int, nargs="+", default=[100, 1000], help="of an edge of each view")
+    parser.add_argument("--fewest", type=int, nargs="+", default=[0], help="bins along a picture at least; 0 as it is")
+    parser.add_argument("--noise", type=float, default=0.05)
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="seconds of training")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--folder", type=Path, help="of the simulated measurements, to keep them")
+    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    arguments = parser.parse_args()
+
+    settings = replace(
+        preset(arguments.preset), time_limit=arguments.time_limit, epochs=1e6, device=arguments.device
+    )
+    lines = [
+        f"Command: `python {shlex.join(sys.argv)}`  ",
+        f"Machine: {machine()}  ",
+        f"Date: {datetime.date.today().isoformat()}; flame, 9 views, noise {arguments.noise:g}",
+        "",
+        "| pixels | edge of the bins [px] | steps | passes | seconds | memory [GiB] | L2 | L2 of variation |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    print("\n".join(lines), flush=True)
+    spawn = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as temporary:
+        for pixels in arguments.pixels:
+            path = measured(pixels, arguments.noise, arguments.folder or Path(temporary))
+            for fewest in arguments.fewest:
+                with ProcessPoolExecutor(1, mp_context=spawn) as pool:
+                    done = pool.submit(row, path, settings, fewest or None, torch.get_num_threads())
+                    lines.append(done.result())
+                print(lines[-1], flush=True)
+    if arguments.write:
+        arguments.write.parent.mkdir(parents=True, exist_ok=True)
+        arguments.write.write_text("# Cameras of full size\n\n" + "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

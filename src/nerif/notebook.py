@@ -1,0 +1,113 @@
+"""What a notebook shows of a noun: a picture and a short table, as HTML that loads nothing; and numbers for people."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from nerif.drawing import (
+    Drawable,
+    add_colour_bar,
+    colour_range,
+    draw_displacement,
+    draw_slice,
+    label_of,
+    shown,
+    style,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["number", "panel", "percent", "png", "show_slices", "show_views", "span"]
+
+VIEWS = 9  # that are drawn: of more, as many, evenly spread
+PIXELS = 120  # along an edge of a view, beyond which nothing more is seen
+
+
+def number(value: object, digits: int = 4) -> str:
+    """Return a number for people, with a power of ten written as such; a dash for what is none."""
+    if not isinstance(value, int | float) or not np.isfinite(value):
+        return "–"
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        return f"{float(f'{value:.{digits}g}'):.10g}"
+    mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
+    raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{float(mantissa):g} × 10{raised}"
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent; what is there at all is never called 0."""
+    return "under 0.01%" if 0 < share < 1e-4 else f"{share:.2%}"
+
+
+def span(values: Float[np.ndarray, ...], unit: str = "", digits: int = 3) -> str:
+    """Return lowest and highest value with their unit, and the share that is masked (NaN)."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "masked everywhere"
+    share = 1 - known.size / values.size
+    masked = f"; {percent(share)} masked" if share else ""
+    return f"{number(float(known.min()), digits)} to {number(float(known.max()), digits)}{unit}{masked}"
+
+
+def panel(title: str, rows: Sequence[tuple[str, str]], picture: str, describes: str) -> str:
+    """Return a title, a picture (a data address, described in words) and a table of names and values as HTML."""
+    cells = "".join(
+        f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
+        for name, value in rows
+    )
+    image = f'<img src="{picture}" alt="{escape(describes)}" style="max-width:100%">'
+    return f"<div><p><b>{escape(title)}</b></p>{image}<table><tbody>{cells}</tbody></table></div>"
+
+
+def png(draw: Callable[[Figure], object], width: float, height: float) -> str:
+    """Return a figure of that size (inches) as a PNG in a data address."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with style(size=8):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        draw(figure)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=110)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def show_slices(volume: Drawable) -> str:
+    """Return the three middle slices of a volume as a PNG in a data address."""
+
+    def draw(figure: Figure) -> None:
+        limits = colour_range(shown(volume))
+        line = list(figure.subplots(1, 3))
+        for axes, normal in zip(line, "zyx", strict=True):
+            draw_slice(axes, volume, normal, limits)
+            axes.set_title(f"{normal} = {volume.grid.box.centre['xyz'.index(normal)]:.3g} mm")
+        add_colour_bar(line, label_of(volume.quantity))
+
+    return png(draw, 8.5, 2.8)
+
+
+def show_views(names: Sequence[str], maps: Sequence[Float[np.ndarray, "row column 2"]]) -> str:
+    """Return u (above) and v (below) of the views, px, NaN where not measured, as a PNG in a data address."""
+    chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), VIEWS)).round().astype(int))
+    known = np.concatenate([np.abs(m[np.isfinite(m)]) for m in maps])
+    limit = (float(np.quantile(known, 0.998)) if known.size else 0.0) or 1.0
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(2, len(chosen), squeeze=False)
+        for column, view in enumerate(chosen):
+            for row, component in enumerate("uv"):
+                axes = draw_displacement(grid[row, column], maps[view][..., row], limit)
+                axes.set(xticks=[], yticks=[], xlabel="", ylabel="" if column else component)
+            grid[0, column].set_title(names[view], parse_math=False)
+        add_colour_bar(list(grid.ravel()), "displacement [px]")
+
+    return png(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 2.8)

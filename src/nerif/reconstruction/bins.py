@@ -1,0 +1,79 @@
+"""Neighbouring pixels averaged: fewer rays, each of less noise, that together hold all that was measured.
+
+    d = sum d_i / sigma_i^2 / sum 1 / sigma_i^2,      sigma^-2 = sum sigma_i^-2,      over the usable pixels of a bin
+
+The ray of a bin is the exact ray through the mean of its pixels, weighted alike. Bins at the rim of the box, some of
+whose rays miss it, are left out.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.geometry import Box, Camera, Rays
+from nerif.measurement import Measurement
+
+__all__ = ["binned_rays", "coarsest_edge"]
+
+FEWEST = 128
+"""Bins that a picture keeps along its shorter side, so that they blur no more than the pixels of a small camera."""
+
+
+def coarsest_edge(measurement: Measurement) -> int:
+    """Return the largest edge of bins that every picture of the measurement can do with, a power of two, px."""
+    shortest = min(min(camera.image_size) for camera in measurement.cameras)
+    return int(1 << max(0, (shortest // FEWEST).bit_length() - 1))
+
+
+def binned_rays(
+    measurement: Measurement, edge: int, open_faces: tuple[str, ...] = ()
+) -> tuple[Rays, Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
+    """Return rays, displacement and sigma (px) of square bins of the usable pixels that cross none of the open faces.
+
+    Where sigma is not known, that of a pixel counts as 1 px.
+
+    Parameters
+    ----------
+    edge : of a bin, px
+    """
+    usable = measurement.usable
+    parts, displacement, sigma = [], [], []
+    for i, camera in enumerate(measurement.cameras):
+        height, width = camera.image_size
+        mask = usable[i, :height, :width]
+        known = None if measurement.sigma is None else measurement.sigma[i, :height, :width]
+        weight = mask[..., None].expand(height, width, 2).double()
+        if known is not None:
+            weight = torch.where(mask[..., None], known.double().pow(-2), 0.0)
+        d = torch.where(mask[..., None], measurement.displacement[i, :height, :width], 0.0)
+        total = _sums(weight, edge)
+        mean = total.mean(-1, keepdim=True)
+        moment = _sums(weight.mean(-1, keepdim=True) * camera.pixel_grid(), edge)
+        keep = (mean[..., 0] > 0) & _inside(camera, measurement.box, edge, open_faces)
+        pixels = (moment / mean)[keep].to(camera.intrinsics.dtype)
+        rays = camera.rays(pixels).clip(measurement.box)
+        crosses = rays.crosses
+        parts.append(rays[crosses].to(dtype=torch.float32))
+        displacement.append((_sums(weight * d, edge)[keep] / total[keep])[crosses].float())
+        sigma.append(total[keep][crosses].rsqrt().float())
+    return Rays.concatenate(parts), torch.cat(displacement), torch.cat(sigma)
+
+
+def _sums(x: Float[Tensor, "row column k"], edge: int) -> Float[Tensor, "r c k"]:
+    """Sums over bins, those at the lower and right rim of the pixels that are left."""
+    height, width, k = x.shape
+    x = torch.nn.functional.pad(x.double(), (0, 0, 0, -width % edge, 0, -height % edge))
+    return x.reshape(x.shape[0] // edge, edge, -1, edge, k).sum(dim=(1, 3))
+
+
+def _inside(camera: Camera, box: Box, edge: int, open_faces: tuple[str, ...]) -> Bool[Tensor, "r c"]:
+    """Bins at all of whose corners rays cross the box, and none of the open faces."""
+    height, width = camera.image_size
+    rows, columns = (torch.arange(0, n + edge, edge)[: -(-n // edge) + 1].clamp(max=n) - 0.5 for n in (height, width))
+    v, u = torch.meshgrid(rows.double(), columns.double(), indexing="ij")
+    rays = camera.rays(torch.stack([u, v], dim=-1).reshape(-1, 2).to(camera.intrinsics.dtype)).clip(box)
+    good = rays.crosses & (rays.background > rays.far) & ~rays.exit_faces(box, open_faces)
+    good = good.reshape(u.shape)
+    return good[1:, 1:] & good[1:, :-1] & good[:-1, 1:] & good[:-1, :-1]

@@ -1,0 +1,91 @@
+"""Bins of pixels: the mean they stand for, its noise and its ray."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.geometry import Ring
+from nerif.physics.deflection import Deflection, project
+from nerif.reconstruction.bins import binned_rays, coarsest_edge
+from nerif.reconstruction.target import Target
+from nerif.simulation import simulate
+
+EDGE = 3
+
+
+@pytest.fixture(scope="module")
+def noisy(measurement):
+    """Noise that differs from pixel to pixel, and some that measured nothing."""
+    generator = torch.Generator().manual_seed(2)
+    sigma = 0.01 + 0.03 * torch.rand(measurement.displacement.shape, generator=generator)
+    valid = torch.rand(measurement.displacement.shape[:3], generator=generator) > 0.1
+    displacement = measurement.displacement.clone()
+    displacement[~valid] = float("nan")
+    return replace(measurement, displacement=displacement, sigma=sigma, valid=valid)
+
+
+def test_a_bin_is_the_weighted_mean_of_its_usable_pixels(noisy):
+    """One bin by hand, of the first view, in the middle of the picture."""
+    rays, displacement, sigma = binned_rays(noisy.select([noisy.names[0]]), EDGE)
+    camera, row, column = noisy.cameras[0], 9, 12
+    block = (0, slice(row, row + EDGE), slice(column, column + EDGE))
+    good = noisy.valid[block]
+    weight = noisy.sigma[block][good].double() ** -2
+    mean = (weight * noisy.displacement[block][good]).sum(0) / weight.sum(0)
+    pixels = camera.pixel_grid()[block[1:]][good]
+    centre = (weight.mean(1, keepdim=True) * pixels).sum(0) / weight.mean(1).sum()
+    wanted = camera.rays(centre[None])
+    (found,) = ((rays.direction - wanted.direction.float()).norm(dim=1) < 1e-6).nonzero()
+    assert torch.allclose(displacement[found].double(), mean, atol=1e-6)
+    assert torch.allclose(sigma[found].double(), weight.sum(0).rsqrt(), rtol=1e-5)
+    assert torch.allclose(rays.sensitivity[found], wanted.sensitivity.float(), rtol=1e-5)
+
+
+def test_invalid_pixels_do_not_count(noisy):
+    """Whatever stands in them."""
+    absurd = noisy.displacement.clone()
+    absurd[~noisy.valid] = 99.0
+    assert torch.equal(binned_rays(replace(noisy, displacement=absurd), EDGE)[1], binned_rays(noisy, EDGE)[1])
+
+
+def test_bins_stay_inside_the_box_and_off_open_faces(measurement):
+    """Their pixels are all among those that cross it."""
+    rays, _, _ = binned_rays(measurement, EDGE)
+    assert bool(rays.crosses.all())
+    assert 0.4 < len(rays) * EDGE**2 / len(Target.of(measurement)) <= 1
+    fewer, _, _ = binned_rays(measurement, EDGE, ("z+",))
+    assert 0 < len(fewer) < len(rays)
+
+
+def test_bins_predict_what_they_measured(ball, box):
+    """Without noise: the ray of a bin sees the mean of its pixels, up to the curvature of the displacement."""
+    ring = Ring(views=2, image_size=(60, 72), pixel_pitch=0.03, distance=700.0, background_distance=450.0)
+    fine = simulate(ball, ring.cameras(), box, n_ambient=1.00027, steps=60)
+    errors = []
+    for edge in (2, 4):
+        target = Target.of(fine, edge=edge)
+        predicted = project(Deflection(n_ambient=1.00027), ball, target.rays)
+        errors.append(float((predicted - target.displacement).norm() / target.displacement.norm()))
+    assert errors[0] < 0.03
+    assert 4 < errors[1] / errors[0] < 6  # (edge^2 - 1) / 12, the variance of the pixels of a bin: 5 times
+
+
+def test_without_sigma_a_bin_of_more_pixels_weighs_more(noisy):
+    target = Target.of(replace(noisy, sigma=None), edge=EDGE)
+    assert target.chi_square_scale is None
+    assert float((target.displacement * target.inverse_scale).square().mean()) == pytest.approx(1, rel=1e-5)
+    ratio = target.inverse_scale.max() / target.inverse_scale.min()
+    assert 1.1 < float(ratio) <= EDGE
+
+
+def test_small_pictures_are_not_binned(measurement):
+    assert coarsest_edge(measurement) == 1
+    for pixels, edge in ((200, 1), (256, 2), (1000, 4), (1024, 8)):
+        cameras = Ring(views=2, image_size=(pixels, pixels + 30)).cameras()
+        shown = replace(
+            measurement, cameras=cameras, displacement=torch.zeros(2, pixels, pixels + 30, 2), sigma=None
+        )
+        assert coarsest_edge(shown) == edge

@@ -1,0 +1,141 @@
+"""What a notebook has: names under `nerif`, loaded when asked for, and nouns that show themselves."""
+
+from __future__ import annotations
+
+import ast
+import base64
+import io
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+import nerif
+from nerif.fields.base import Field
+from nerif.geometry import Box, Grid
+from nerif.measurement import Measurement
+from nerif.notebook import VIEWS, panel, show_views
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.volume import Volume
+
+
+@pytest.mark.parametrize("name", nerif.__all__)
+def test_every_name_is_there_and_at_home(name):
+    found = getattr(nerif, name)
+    assert name in dir(nerif)
+    if name != "__version__":
+        assert found is getattr(sys.modules[found.__module__], name)
+
+
+def test_importing_loads_nothing_until_a_name_is_asked_for():
+    code = "import sys, nerif; heavy = {'torch', 'numpy'} & {*sys.modules}; print(len(heavy), nerif.Box.cube(2.0))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("0 Box(")
+
+
+def test_a_name_that_is_not_there_is_refused():
+    with pytest.raises(AttributeError, match="measurment"):
+        _ = nerif.measurment
+
+
+def test_type_checkers_see_the_same_names():
+    tree = ast.parse(Path(nerif.__file__).read_text())
+    seen = {
+        (str(node.module).removeprefix("nerif."), alias.name)
+        for block in tree.body
+        if isinstance(block, ast.If)
+        for node in ast.walk(block)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == {(module, name) for module, names in nerif._HOMES.items() for name in names}
+
+
+class Panel(HTMLParser):
+    """The one picture and the cells of what a notebook shows; every tag must be closed in turn."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.cells: list[str] = []
+        self.feed(html)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        if tag == "img":
+            self.images.append(dict(attributes))
+        else:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] in (["th"], ["td"]):
+            self.cells.append(data)
+
+    @property
+    def pixels(self) -> np.ndarray:
+        [image] = self.images
+        assert image["alt"]
+        kind, _, data = str(image["src"]).partition(",")
+        assert kind == "data:image/png;base64"
+        return np.asarray(iio.imread(io.BytesIO(base64.b64decode(data))))[..., :3].astype(int)
+
+
+def coloured(pixels: np.ndarray) -> float:
+    """Share of the pixels that are neither white, black nor grey."""
+    return float((np.ptp(pixels, axis=-1) > 30).mean())
+
+
+def test_a_measurement_shows_its_views(measurement: Measurement):
+    shown = Panel(measurement._repr_html_())
+    cells = " | ".join(shown.cells)
+    for words in ("Views | 5, of 26 × 20 px", "Displacement | rms", "Noise σ | rms", "24 × 20 × 16 mm", "1.00027"):
+        assert words in cells
+    assert coloured(shown.pixels) > 0.02
+    still = replace(measurement, displacement=torch.zeros_like(measurement.displacement))
+    assert coloured(Panel(still._repr_html_()).pixels) < 0.7 * coloured(shown.pixels)
+
+
+def test_of_many_views_some_are_drawn():
+    maps = [np.random.default_rng(i).normal(size=(9, 30, 2)).astype(np.float32) for i in range(VIEWS + 5)]
+    pixels = Panel(panel("many", [], show_views([f"c{i}" for i in range(len(maps))], maps), "views")).pixels
+    assert pixels.shape[1] < 1200
+
+
+def test_names_cannot_break_the_page():
+    assert Panel(panel("<b>", [("a<script>", "1 & 2")], "data:,", 'the "thing"')).cells == ["a<script>", "1 & 2"]
+
+
+def test_a_volume_shows_its_slices(ball: Field, box: Box):
+    grid = Grid.of_resolution(box, 24)
+    shown = Panel(Volume(ball.sample(grid), grid, attributes={"n_ambient": 1.00027})._repr_html_())
+    assert "24 × 20 × 16 (x, y, z)" in shown.cells
+    assert "× 10⁻⁴" in shown.cells[shown.cells.index("Index excess") + 1]
+    assert coloured(shown.pixels) > 0.1
+    masked = torch.full(grid.shape, torch.nan)
+    masked[2:] = 300.0
+    cells = Panel(Volume(masked, grid, "temperature", "K")._repr_html_()).cells
+    assert cells[cells.index("Temperature") + 1] == "300 to 300 K; 12.50% masked"
+
+
+def test_a_reconstruction_shows_its_field_and_why_it_stopped(measurement: Measurement):
+    settings: dict[str, Any] = {"voxels": 10, "regularisation": 0.01}
+    result = Tikhonov(**settings)(measurement)
+    shown = Panel(result._repr_html_())
+    assert shown.cells[shown.cells.index("Outcome") + 1].startswith(result.outcome.reason)
+    misfit = shown.cells[shown.cells.index("Misfit") + 1]
+    assert float(misfit.split()[0]) == pytest.approx(result.history[-1]["residual_over_sigma"], rel=0.01)
+    assert "times the noise" in misfit
+    assert " s on cpu" in shown.cells[shown.cells.index("Time") + 1]
+    assert coloured(shown.pixels) > 0.1
