@@ -151,13 +151,13 @@ def _earlier(case: Case, measurement: Measurement, states: list[State]) -> Itera
     """The reconstruction as it stood in each state: resumed, and stopped before the next step."""
     assert isinstance(case.reconstructor, NeRIF)
     for state in states:
-        stop = replace(case.reconstructor, time_limit=0.0, max_steps=int(state.scalars["step"]), compile="off")
+        stop = replace(case.reconstructor, time_limit=0.0, max_steps=int(state.scalars["budget"]["step"]), compile="off")
         yield stop(measurement, resume=state)
 
 
 def _point(result: Reconstruction, truth: Volume, rays: int) -> dict[str, float]:
     assert result.state is not None
-    at = result.state.scalars
+    at = result.state.scalars["budget"]
     rec = result.field.sample(truth.grid, result.device).numpy()
     return {
         "step": float(at["step"]),

@@ -72,7 +72,6 @@ class Training:
             raise InputError(
                 f"torchrun: expected at least a ray a process, got {len(data)} rays for {self.ranks.size}"
             )
-        self.budget = Budget(settings, len(data), self.ranks, self.device)
         self.generator = torch.Generator().manual_seed(settings.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -83,6 +82,7 @@ class Training:
             settings.optimiser, network, settings.betas, settings.momentum, settings.rates_by_shape
         )
         self.network = MixedPrecision(network, self.device, settings.precision, settings.compile)
+        self.budget = Budget(settings, len(data), self.ranks, self.device)  # its clock begins here: imports are no training
         self.history: list[dict[str, float]] = []
         self.edge, self.settled = data.coarsest, data.coarsest == 1
         self.watch = Watch(data.noise)
