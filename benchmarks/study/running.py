@@ -151,7 +151,8 @@ def _earlier(case: Case, measurement: Measurement, states: list[State]) -> Itera
     """The reconstruction as it stood in each state: resumed, and stopped before the next step."""
     assert isinstance(case.reconstructor, NeRIF)
     for state in states:
-        stop = replace(case.reconstructor, time_limit=0.0, max_steps=int(state.scalars["budget"]["step"]), compile="off")
+        step = int(state.scalars["budget"]["step"])
+        stop = replace(case.reconstructor, time_limit=0.0, max_steps=step, compile="off")
         yield stop(measurement, resume=state)
 
 
