@@ -9,19 +9,14 @@ square at every size. Each row is a process of its own, so that the memory is th
 from __future__ import annotations
 
 import argparse
-import datetime
-import multiprocessing
-import shlex
-import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from bench import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write, alone
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
@@ -34,6 +29,7 @@ from nerif.reconstruction.presets import preset
 from nerif.simulation import add_noise
 from nerif.volume import Volume
 
+COLUMNS = ("pixels", "edge of the bins [px]", "steps", "passes", "seconds", "memory [GiB]", "L2", "L2 of variation")
 SAMPLES = 150  # along a ray of the simulation
 
 
@@ -52,8 +48,8 @@ def measured(pixels: int, noise: float, folder: Path) -> Path:
     return path
 
 
-def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> str:
-    """Reconstruct one measurement, and return its line."""
+def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> list[str]:
+    """Reconstruct one measurement, and return its row."""
     torch.set_num_threads(threads)
     keep_freed_memory()
     bins.FEWEST = fewest or bins.FEWEST
@@ -67,10 +63,16 @@ def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> str:
     assert result.state is not None
     edges = [bins.coarsest_edge(measurement)] + [int(r["bin_edge"]) for r in result.history if "bin_edge" in r]
     last, steps = result.history[-1], " then ".join(map(str, edges))
-    return (
-        f"| {measurement.displacement.shape[1]}² | {steps} | {last['step']:.0f} | {last['epoch']:.2f} | "
-        f"{seconds:.0f} | {result.peak_memory_bytes / 2**30:.2f} | {found['l2']:.3%} | {found['l2_variation']:.2%} |"
-    )
+    return [
+        f"{measurement.displacement.shape[1]}²",
+        steps,
+        f"{last['step']:.0f}",
+        f"{last['epoch']:.2f}",
+        f"{seconds:.0f}",
+        f"{result.peak_memory_bytes / 2**30:.2f}",
+        f"{found['l2']:.3%}",
+        f"{found['l2_variation']:.2%}",
+    ]
 
 
 def main() -> None:
@@ -83,33 +85,19 @@ def main() -> None:
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds of training")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--folder", type=Path, help="of the simulated measurements, to keep them")
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    add_write(parser)
     arguments = parser.parse_args()
 
     settings = replace(
         preset(arguments.preset), time_limit=arguments.time_limit, epochs=1e6, device=arguments.device
     )
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}; flame, 9 views, noise {arguments.noise:g}",
-        "",
-        "| pixels | edge of the bins [px] | steps | passes | seconds | memory [GiB] | L2 | L2 of variation |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    print("\n".join(lines), flush=True)
-    spawn = multiprocessing.get_context("spawn")
+    more = f"; flame, 9 views, noise {arguments.noise:g}"
+    table = Table("Cameras of full size", COLUMNS, arguments.write, more)
     with tempfile.TemporaryDirectory() as temporary:
         for pixels in arguments.pixels:
             path = measured(pixels, arguments.noise, arguments.folder or Path(temporary))
             for fewest in arguments.fewest:
-                with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-                    done = pool.submit(row, path, settings, fewest or None, torch.get_num_threads())
-                    lines.append(done.result())
-                print(lines[-1], flush=True)
-    if arguments.write:
-        arguments.write.parent.mkdir(parents=True, exist_ok=True)
-        arguments.write.write_text("# Cameras of full size\n\n" + "\n".join(lines) + "\n")
+                table.row(alone(row, path, settings, fewest or None, torch.get_num_threads()))
 
 
 if __name__ == "__main__":

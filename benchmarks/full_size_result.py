@@ -9,18 +9,15 @@ measured is the prediction plus noise of 5 %. Every stage is a process of its ow
 from __future__ import annotations
 
 import argparse
-import platform
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
 
+from bench import Table, add_write, alone
 from nerif.evaluation import evaluate_views
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import make_phantom
@@ -30,12 +27,14 @@ from nerif.members import all_quantities
 from nerif.physics.quantities import GasSettings
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.warm_start import fit_network
 from nerif.reprojection import Reprojection
 from nerif.result import ResultDirectory
 from nerif.workflow import write_report
 
 BOX, N_AMBIENT, NOISE = Box.cube(50.0), 1.00027, 0.05
+COLUMNS = ("stage", "seconds", "of CPU", "peak [GiB]", "")
 STAGES = ("prepare", "volume", "reproject", "score", "write", "report")
 
 
@@ -45,7 +44,8 @@ def prepare(out: ResultDirectory, measured: Path, views: int, pixels: int, steps
     network = Network(NetworkShape())
     field = NeuralField(network, BOX, 1e-4)
     flame = make_phantom("flame", BOX, 0, 0.0)
-    fit_network(field, network, flame, steps, 4096, 2e-3, torch.Generator().manual_seed(0))
+    evaluator = MixedPrecision(network, torch.device("cpu"), "float32", "off")
+    fit_network(field, evaluator, flame, steps, 4096, 2e-3, torch.Generator().manual_seed(0))
     network.eval().requires_grad_(False)
     result = Reconstruction(field, BOX, N_AMBIENT, [], Outcome("time_limit", "fitted"), {"model": "lever_arm"})
     out.begin({"method": "nerif", "measurement": str(measured)})
@@ -59,8 +59,8 @@ def prepare(out: ResultDirectory, measured: Path, views: int, pixels: int, steps
     replace(empty, displacement=noisy, sigma=torch.full_like(noisy, sigma)).write(measured)
 
 
-def stage(name: str, folder: Path, views: int, pixels: int, steps: int) -> str:
-    """Do one stage, and return a row of the table."""
+def stage(name: str, folder: Path, views: int, pixels: int, steps: int) -> list[str]:
+    """Do one stage, and return its row."""
     out, measured, kept = ResultDirectory(folder / "result"), folder / "m.nc", folder / "views.pt"
     note, data, views_seen = "", None, None
     if name in ("reproject", "score", "write"):
@@ -92,7 +92,7 @@ def stage(name: str, folder: Path, views: int, pixels: int, steps: int) -> str:
         note = f"page of {write_report(out.path).stat().st_size / 1e6:.1f} MB"
     seconds, busy = time.perf_counter() - began, _cpu() - before
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return f"| {name} | {seconds:.1f} | {busy:.1f} | {peak:.2f} | {note} |"
+    return [name, f"{seconds:.1f}", f"{busy:.1f}", f"{peak:.2f}", note]
 
 
 def _cpu() -> float:
@@ -107,18 +107,13 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=300, help="of the fit of the network")
     parser.add_argument("--folder", type=Path, help="where the files are kept; default: a temporary one")
-    parser.add_argument("--stage", choices=STAGES, help="this one only, on the files of an earlier call")
+    add_write(parser)
     given = parser.parse_args()
-    if given.stage:
-        print(stage(given.stage, given.folder, given.views, given.pixels, given.steps), flush=True)
-        return
     folder = given.folder or Path(tempfile.mkdtemp())
-    machine = f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    print(f"{given.views} views of {given.pixels} x {given.pixels}; {machine}; {datetime.now(UTC):%Y-%m-%d}\n")
-    print("| stage | seconds | of CPU | peak GiB | |\n|---|---|---|---|---|", flush=True)
-    same = ["--folder", str(folder), "--views", str(given.views), "--pixels", str(given.pixels)]
+    more = f"; {given.views} views of {given.pixels} x {given.pixels} px, network fitted in {given.steps} steps"
+    table = Table("What follows the training of full-size views", COLUMNS, given.write, more)
     for name in STAGES:
-        subprocess.run([sys.executable, __file__, *same, "--steps", str(given.steps), "--stage", name], check=True)
+        table.row(alone(stage, name, folder, given.views, given.pixels, given.steps))
 
 
 if __name__ == "__main__":

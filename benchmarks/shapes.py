@@ -9,17 +9,13 @@ nothing. The last column has what the run says of itself.
 from __future__ import annotations
 
 import argparse
-import datetime
 import itertools
-import shlex
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
-from bench import N_AMBIENT, machine
+from bench import N_AMBIENT, Table, add_write
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
@@ -29,6 +25,8 @@ from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import preset
 from nerif.reconstruction.target import Target
 from nerif.simulation import simulate
+
+COLUMNS = ("octaves", "width", "depth", "loss / that of the empty field", "taken back", "seconds", "outcome")
 
 
 def unexplained(result: Reconstruction, target: Target) -> float:
@@ -48,7 +46,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--write", type=Path, help="also write the table to this file")
+    parser.add_argument("--batch", type=int, default=8192, help="sample points of a step")
+    add_write(parser)
     arguments = parser.parse_args()
 
     keep_freed_memory()
@@ -57,29 +56,19 @@ def main() -> None:
     target = Target.of(measurement)
     target = target[torch.arange(0, len(target), 5)]
     base = replace(preset(arguments.preset), epochs=1e6, max_steps=arguments.steps, device=arguments.device)
-    lines = [
-        f"Command: `python {shlex.join(sys.argv)}`  ",
-        f"Machine: {machine()}  ",
-        f"Date: {datetime.date.today().isoformat()}; flame, {arguments.pixels} x {arguments.pixels} px, "
-        f"noise {arguments.noise:g}, {arguments.steps} steps",
-        "",
-        "| octaves | width | depth | loss / that of the empty field | taken back | seconds | outcome |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    print("\n".join(lines), flush=True)
+    base = replace(base, points_per_batch=arguments.batch)
+    size = f"{arguments.pixels} x {arguments.pixels} px"
+    more = f"; flame, {size}, noise {arguments.noise:g}, {arguments.steps} steps of {arguments.batch} points"
+    table = Table("Networks of any shape after sixty steps", COLUMNS, arguments.write, more)
     for octaves, width, depth in itertools.product(arguments.octaves, arguments.width, arguments.depth):
         start = time.perf_counter()
         result = replace(base, network=NetworkShape(depth=depth, width=width, octaves=octaves))(measurement)
         seconds = time.perf_counter() - start
         back = sum("taken_back" in record for record in result.history)
-        said = result.outcome.reason if not result.outcome.failed else f"**{result.outcome.reason}**"
-        lines.append(
-            f"| {octaves} | {width} | {depth} | {unexplained(result, target):.3f} | {back} | {seconds:.1f} | {said} |"
-        )
-        print(lines[-1], flush=True)
-        if arguments.write:
-            arguments.write.parent.mkdir(parents=True, exist_ok=True)
-            arguments.write.write_text("# Networks of any shape after sixty steps\n\n" + "\n".join(lines) + "\n")
+        said = f"**{result.outcome.reason}**" if result.outcome.failed else result.outcome.reason
+        said += " (said in its message)" if "not explained yet" in result.outcome.message else ""
+        shape = (str(octaves), str(width), str(depth))
+        table.row((*shape, f"{unexplained(result, target):.3f}", str(back), f"{seconds:.1f}", said))
 
 
 if __name__ == "__main__":

@@ -46,10 +46,8 @@ class Target:
         InputError
             If no ray is left.
         """
-        if edge > 1:
-            rays, displacement, sigma = binned_rays(measurement, edge, open_faces)
-        else:
-            rays, displacement, sigma = measurement.rays()
+        binned = edge > 1
+        rays, displacement, sigma = binned_rays(measurement, edge, open_faces) if binned else measurement.rays()
         keep = ~rays.exit_faces(measurement.box, open_faces)
         if not bool(keep.any()):
             raise InputError("open_faces: every ray crosses one of them, so none is left; name fewer faces")

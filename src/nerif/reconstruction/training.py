@@ -82,7 +82,8 @@ class Training:
             settings.optimiser, network, settings.betas, settings.momentum, settings.rates_by_shape
         )
         self.network = MixedPrecision(network, self.device, settings.precision, settings.compile)
-        self.budget = Budget(settings, len(data), self.ranks, self.device)  # its clock begins here: imports are no training
+        # its clock begins here: imports are no training
+        self.budget = Budget(settings, len(data), self.ranks, self.device)
         self.history: list[dict[str, float]] = []
         self.edge, self.settled = data.coarsest, data.coarsest == 1
         self.watch = Watch(data.noise)
