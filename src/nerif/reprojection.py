@@ -33,6 +33,14 @@ class Accuracy:
     error_px: float = 0.0
     compared: int = 0
 
+    @property
+    def sentence(self) -> str:
+        """What to tell of it."""
+        if not self.compared:
+            return f"re-projected by {self.how}"
+        apart = f"{self.error_px:.2g} px rms from the path integral through the network on {self.compared} pixels"
+        return f"re-projected by {self.how}; {apart}"
+
 
 @dataclass(frozen=True)
 class Reprojection:

@@ -217,7 +217,7 @@ def _write(
     out.write_reprojection(reprojection)
     for line in score_lines(views):
         monitor.say(line)
-    monitor.say(f"re-projected by {reprojection.accuracy.how}")
+    monitor.say(reprojection.accuracy.sentence)
     monitor.say(
         f"{out.path}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView"
     )
