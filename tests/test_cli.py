@@ -115,6 +115,7 @@ def test_evaluate(work, capsys):
     assert metrics["l2"] == pytest.approx(float(error / (truth.values.double() + n_ambient - 1).norm()), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_views_are_compared_by_the_model_of_the_reconstruction(work, tmp_path):
     """At the end of reconstruct and by evaluate: one model throughout, and not always the default."""
     out = tmp_path / "r"

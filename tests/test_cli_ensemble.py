@@ -65,6 +65,7 @@ def test_members_that_are_there_are_not_done_again(measured, tmp_path):
     assert not (out / "ensemble").exists()
 
 
+@pytest.mark.slow
 def test_members_of_other_settings_are_done_again(measured, tmp_path):
     """Resuming with a view left out, or another weight, must not take members that saw it, or had another weight."""
     out, fresh = tmp_path / "r", tmp_path / "fresh"

@@ -259,6 +259,7 @@ def test_a_mirrored_camera_is_refused(copy, capsys):
     assert "mirrored" in said
 
 
+@pytest.mark.slow
 def test_many_flow_pictures_become_a_sequence(copy, capsys):
     pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
     from nerif.measurement_sequence import MeasurementSequence

@@ -133,6 +133,7 @@ def test_start_from_another_result(work, tmp_path, source):
             assert {float(r["voxels"]) for r in csv.DictReader(file)} == {14.0}
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_usable_result_to_resume(work, tmp_path):
     out = tmp_path / "r"
     words = [sys.executable, "-m", "nerif", "reconstruct", str(work / "m.nc"), "--method", "tv", "-o", str(out)]

@@ -168,7 +168,7 @@ def test_loss_that_stays_non_finite_ends_with_the_last_good_state(measurement, m
     assert bool(torch.isfinite(result.field(torch.rand(30, 3))).all())
 
 
-@pytest.mark.parametrize("rate", [0.5, 1e4])
+@pytest.mark.parametrize("rate", [pytest.param(0.5, marks=pytest.mark.slow), 1e4])
 def test_an_absurd_rate_is_lowered_or_the_run_says_that_it_found_nothing(measurement, rate):
     result = replace(SMALL, learning_rate=rate, max_steps=80)(measurement)
     assert any("taken_back" in record for record in result.history)
@@ -199,7 +199,15 @@ def test_a_field_that_is_lost_is_taken_back(measurement, monkeypatch):
     assert result.outcome.reason == "steps"
 
 
-@pytest.mark.parametrize(("octaves", "width", "depth"), [(0, 32, 8), (8, 32, 2), (8, 128, 8), (5, 512, 2)])
+@pytest.mark.parametrize(
+    ("octaves", "width", "depth"),
+    [
+        (0, 32, 8),
+        (8, 32, 2),
+        pytest.param(8, 128, 8, marks=pytest.mark.slow),
+        pytest.param(5, 512, 2, marks=pytest.mark.slow),
+    ],
+)
 def test_sixty_steps_serve_every_shape(measurement, octaves, width, depth):
     shape = NetworkShape(depth=depth, width=width, octaves=octaves)
     result = replace(NeRIF(device="cpu", precision="float32", epochs=1e6), network=shape, max_steps=60)(measurement)
@@ -223,7 +231,7 @@ def test_large_pictures_begin_with_bins_and_go_on_with_what_there_is_time_for(me
     (refined,) = (record["bin_edge"] for record in ample.history if "bin_edge" in record)
     assert refined == 1
     states = []
-    settings = replace(SMALL, max_steps=120)
+    settings = replace(SMALL, max_steps=120, points_per_batch=300)
     whole = settings(measurement, on_step=lambda s: states.append(s.capture()) if s.step == 60 else None)
     again = settings(measurement, resume=states[0])
     assert torch.equal(whole.field(torch.zeros(1, 3)), again.field(torch.zeros(1, 3)))

@@ -36,7 +36,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-# Muon makes its steps from bfloat16, in which the last bit of a sum is 0.4 %
+# Muon gives the smallest directions of a step the weight of the largest, and with them the last bit of a sum
 @pytest.mark.parametrize(
     ("norm", "optimiser", "tolerance"),
     [pytest.param("squared", "muon", 2e-3, marks=pytest.mark.slow), ("l2", "adam", 2e-5)],

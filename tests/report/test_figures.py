@@ -112,6 +112,7 @@ def test_masked_voxels_have_no_surface_of_their_own(volume):
     assert len(masked) == len(whole)
 
 
+@pytest.mark.slow
 def test_names_of_views_become_names_of_files(whole):
     result = ResultDirectory(whole).read()
     assert result.reprojection is not None

@@ -137,8 +137,13 @@ def test_pictures_of_views_share_their_scales(whole):
     assert all(address.startswith("data:image/png") for v in views for row in v.rows.values() for address in row)
 
 
-@pytest.mark.parametrize("name", PARTS)
-@pytest.mark.parametrize("how", ["gone", "truncated", "nonsense"])
+QUICK = {("gone", "run.toml"), ("truncated", "reprojection.nc"), ("nonsense", "volume.nc"), ("nonsense", "metrics.json")}
+BROKEN = [(how, name) for how in ("gone", "truncated", "nonsense") for name in PARTS]
+
+
+@pytest.mark.parametrize(
+    ("how", "name"), [b if b in QUICK else pytest.param(*b, marks=pytest.mark.slow) for b in BROKEN]
+)
 def test_a_broken_result_gives_a_page_that_says_what_is_missing(copy, capsys, name, how):
     path = copy / name
     if how == "gone":

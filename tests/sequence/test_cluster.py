@@ -55,6 +55,7 @@ def workers_of(process: subprocess.Popen) -> list[psutil.Process]:
     return [c for c in children if any("spawn_main" in word for word in c.cmdline())]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="kills processes by POSIX signals")
 def test_killed_workers_a_killed_command_and_a_frame_of_nan_leave_a_complete_store(film, tmp_path):
     spoilt = Path(shutil.copytree(film, tmp_path / "film.zarr"))
@@ -101,9 +102,11 @@ def test_workers_share_the_gpus_that_are_left_to_the_command(monkeypatch, visibl
     assert _gpus() == expected
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(film, tmp_path):
     out = tmp_path / "out.zarr"
-    process = subprocess.Popen(command(film, out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    slowly = command(film, out, "--max-steps", "200", "--warm-steps", "100")
+    process = subprocess.Popen(slowly, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     wait(out, 2, process)
     process.send_signal(signal.SIGINT)
     text, errors = process.communicate(timeout=60)
@@ -199,14 +202,14 @@ def _plan(film: Path, out: Path):
     return SequencePlan(film, out, COLD, replace(COLD, max_steps=10), 10, ("index_excess",), threads=1)
 
 
-def test_a_scheduler_that_is_there_already_is_used(film, tmp_path):
+def test_a_scheduler_that_is_there_already_is_used(five, tmp_path):
     from distributed import LocalCluster
 
     out = tmp_path / "out.zarr"
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
         address = cluster.scheduler_address
         arguments = [*QUICK, "--chunk", "12", "--threads", "1", "--cluster", address]
-        assert main(["sequence", str(film), "-o", str(out), *arguments]) == 0
+        assert main(["sequence", str(five), "-o", str(out), *arguments]) == 0
     assert (status_of(out) == DONE).all()
 
 

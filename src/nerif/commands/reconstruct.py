@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +41,15 @@ def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         raise InputError("tensorboard: not installed; pip install 'nerif[tensorboard]'") from None
-    with SummaryWriter(str(settings.out / "tensorboard")) as writer:
+    with ExitStack() as stack:
+        writer: list[SummaryWriter] = []
 
         def write(step: Step) -> None:
+            if not writer:  # the directory is looked at before the first step, and must be as it was until then
+                writer.append(stack.enter_context(SummaryWriter(str(settings.out / "tensorboard"))))
             if step.step % 20 == 0:
                 for name, value in {**step.losses, "rays_per_second": step.rays_per_second}.items():
-                    writer.add_scalar(name, value, step.step)
+                    writer[0].add_scalar(name, value, step.step)
 
         yield write
 
