@@ -89,8 +89,8 @@ def reading(refusal: str) -> Iterator[None]:
 def check_heaps(path: Path) -> None:
     """Refuse a file whose global heaps do not add up: the HDF5 library would walk along them for ever.
 
-    A heap is a header of 16 bytes with its size, and objects: index (2 bytes), references (2), 4 free, size (8), data up to
-    a multiple of 8 bytes. Object 0 is the free space, whose size counts its own header.
+    A heap is a header of 16 bytes with its size, and objects: index (2 bytes), references (2), 4 free, size (8), data
+    up to a multiple of 8 bytes. Object 0 is the free space, whose size counts its own header.
 
     Raises
     ------
