@@ -16,8 +16,9 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Box, Grid
-from nerif.report.resolution_figure import draw_distribution, draw_edge_spread, draw_mtf
+from nerif.report.resolution_figure import draw_mtf
 from nerif.resolution import Resolution, measure_resolution
+from study.octahedron_figures import draw_distribution, draw_edge_spread
 
 PHANTOM = Octahedron(Box((-9.0, -12.0, -14.0), (11.0, 13.0, 16.0)))  # off the origin; one unit is 5 mm
 

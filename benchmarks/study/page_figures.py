@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from nerif.drawing import COLOURS
-from nerif.report.resolution_figure import draw_distribution, draw_edge_spread, draw_mtf
+from nerif.report.resolution_figure import draw_mtf
 from study.cases import METHODS, NOISES, PHANTOMS, SECTIONS
 from study.figures import (
     Line,

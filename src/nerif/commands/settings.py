@@ -24,7 +24,7 @@ import tyro
 
 from nerif.conventions import InputError
 
-__all__ = ["Flat", "Settings", "flag_value", "merge", "parse", "read_settings", "read_toml", "to_toml", "value_given"]
+__all__ = ["Flat", "Settings", "flag_value", "merge", "parse", "read_settings", "read_toml", "value_given"]
 
 T = TypeVar("T")
 
@@ -193,23 +193,3 @@ def _one_line(box: str, prog: str) -> str:
     text = re.sub(r"\s+", " ", text)
     text = re.sub(r" Perhaps you meant: (--[\w.-]+|-\w, --[\w.-]+).*", r"; perhaps you meant \1", text)
     return f"{text}; see {prog} --help"
-
-
-def to_toml(settings: Any, about: dict[str, Any] | None = None) -> str:
-    """Write a record as TOML under the names of the flags, and what came out under [about]."""
-    import tomli_w
-
-    def plain(value: Any) -> Any:
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            inner = ((f.name, plain(getattr(value, f.name))) for f in dataclasses.fields(value))
-            return {name: v for name, v in inner if v is not None}  # TOML has no word for nothing
-        if isinstance(value, list | tuple):
-            return [plain(v) for v in value]
-        return str(value) if isinstance(value, Path) else value
-
-    table: dict[str, Any] = {}
-    for name, value in plain(settings).items():
-        table |= value if _inner_record(type(settings), name) else {name: value}
-    # tables last, as TOML wants them
-    table = dict(sorted(table.items(), key=lambda item: isinstance(item[1], dict)))
-    return tomli_w.dumps({**table, **({"about": about} if about else {})})
