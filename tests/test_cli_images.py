@@ -22,7 +22,7 @@ BOX = ["--lower", "-25", "-25", "-25", "--upper", "25", "25", "25"]
 VIEWS = 4
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def experiment(tmp_path_factory):
     """Pictures of four views, a calibration and a measurement, each made by its verb."""
     folder = tmp_path_factory.mktemp("experiment")

@@ -93,8 +93,8 @@ def make_pages(app: Any) -> None:
         made.add(docs / "repository" / name)
         write(docs / "repository" / name, text)
 
-    for path in sorted((root / "benchmarks" / "results").glob("*.md")):
-        page(f"benchmarks/results/{path.name}", relink(path.read_text(), path.parent, docs, modules))
+    for path in sorted((root / "benchmarks" / "results").rglob("*.md")):
+        page(path.relative_to(root).as_posix(), relink(path.read_text(), path.parent, docs, modules))
     for path in [*sorted((root / "benchmarks").glob("*.py")), *sorted((root / "examples").glob("*.py"))]:
         inside = path.relative_to(root)
         source = f"```{{literalinclude}} /{os.path.relpath(path, docs)}\n```\n"

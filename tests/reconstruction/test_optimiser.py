@@ -97,7 +97,7 @@ def test_the_reference_steps_as_torch_has_it():
         of_torch.step()
     for start, matrix, twin in zip(before, *([w.detach() for w in part] for part in (matrices, twins)), strict=True):
         ours, theirs = (matrix - start).flatten(), (twin - start).flatten()
-        assert float(torch.dot(ours, theirs) / (ours.norm() * theirs.norm())) > 0.99  # bf16 turns small directions
+        assert float(torch.dot(ours, theirs) / (ours.norm() * theirs.norm())) > 0.98  # bf16 turns small directions
         torch.testing.assert_close(ours.norm(), theirs.norm(), rtol=0.02, atol=0)
     assert {group["share"] for group in optimiser.parts["adam"].param_groups} == {1.0}
 
