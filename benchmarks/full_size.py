@@ -18,10 +18,11 @@ import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
 from nerif.evaluation import evaluate_volume
+from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
-from nerif.geometry import Grid, paper_rig
+from nerif.geometry import Box, Grid, paper_rig
 from nerif.measurement import Measurement
-from nerif.physics.deflection import Deflection, project
+from nerif.prediction import predict
 from nerif.reconstruction import bins
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
@@ -30,7 +31,13 @@ from nerif.simulation import add_noise
 from nerif.volume import Volume
 
 COLUMNS = ("pixels", "edge of the bins [px]", "steps", "passes", "seconds", "memory [GiB]", "L2", "L2 of variation")
-SAMPLES = 150  # along a ray of the simulation
+VOXELS = 160  # along an edge of the box, on which the flame is given
+
+
+def flame(box: Box) -> VoxelField:
+    """The flame on voxels, through which millions of rays are traced in seconds."""
+    grid = Grid.of_resolution(box, VOXELS)
+    return VoxelField.through(make_phantom("flame", box, 0).sample(grid), grid)
 
 
 def measured(pixels: int, noise: float, folder: Path) -> Path:
@@ -38,13 +45,7 @@ def measured(pixels: int, noise: float, folder: Path) -> Path:
     path = folder / f"flame-{pixels}-{noise:g}.nc"
     if not path.is_file():
         cameras, box = paper_rig(pixels)
-        flame, model = make_phantom("flame", box, 0), Deflection(samples=SAMPLES, n_ambient=N_AMBIENT)
-        views = []
-        for camera in cameras:
-            rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
-            views.append(project(model, flame, rays).reshape(pixels, pixels, 2))
-        clean = Measurement(cameras=cameras, displacement=torch.stack(views), box=box, n_ambient=N_AMBIENT)
-        add_noise(clean, noise, seed=1).write(path)
+        add_noise(predict(flame(box), cameras, box, N_AMBIENT), noise, seed=1).write(path)
     return path
 
 
@@ -58,7 +59,7 @@ def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> list[s
     result = settings(measurement)
     seconds = time.perf_counter() - begun
     grid = Grid.of_resolution(measurement.box, 100)
-    truth = Volume(make_phantom("flame", measurement.box, 0).sample(grid), grid)
+    truth = Volume(flame(measurement.box).sample(grid), grid)
     found = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
     assert result.state is not None
     edges = [bins.coarsest_edge(measurement)] + [int(r["bin_edge"]) for r in result.history if "bin_edge" in r]
