@@ -11,6 +11,7 @@ process, and the largest sum over all processes at one moment.
 from __future__ import annotations
 
 import argparse
+import math
 import subprocess
 import sys
 import tempfile
@@ -40,7 +41,7 @@ def write_view(folder: Path, camera: Camera, references: int, seed: int) -> None
     dots = np.clip(dots / np.percentile(dots, 99), 0, 1)
     rows, columns = np.arange(height, dtype=np.float32)[:, None], np.arange(width, dtype=np.float32)[None]
     y, x = (rows - height / 2) / (height / 5), (columns - width / 2) / (width / 5)
-    bump = LARGEST * np.sqrt(2 * np.e) * np.exp(-(x**2) - y**2)  # gradient of a Gaussian blob
+    bump = LARGEST * math.sqrt(2 * math.e) * np.exp(-(x**2) - y**2)  # gradient of a Gaussian blob
     for source, count, size in (("reference", references, 0.0), ("flow", 1, 1.0)):
         seen = map_coordinates(dots, [rows + 8 - size * y * bump, columns + 8 - size * x * bump], order=3)
         path = folder / camera.name / source

@@ -21,6 +21,7 @@ from study.figures import (
     variety,
 )
 from study.octahedron import from_plain
+from study.octahedron_figures import draw_distribution, draw_edge_spread
 from study.paper import COLUMNS, CORRELATION, L2, MEMORY_GB, MINUTES, paper_value
 from study.results import Results, metric, typical
 from study.words import duration, memory
