@@ -109,7 +109,7 @@ def test_penalty_basis_model_and_bounds_are_options(work, tmp_path):
     assert float(field.coefficients[1:-1, 1:-1, 1:-1].max()) <= 0
 
 
-@pytest.mark.parametrize("source", ["tv", "nerif"])
+@pytest.mark.parametrize("source", [pytest.param("tv", marks=pytest.mark.slow), "nerif"])
 def test_start_from_another_result(work, tmp_path, source):
     """A network starts from voxels, and voxels from a network."""
     small = [

@@ -131,6 +131,7 @@ def test_a_flame_that_ends_at_the_box_does_not_go_on_beyond_it(cut, smeared):
     assert _open_faces(field, small) == []
 
 
+@pytest.mark.slow
 def test_a_flipped_sign_of_everything_shows_as_a_denser_flow(clean):
     found = check_consistency(spoilt(clean, lambda d: -d), voxels=20)
     assert found.findings == ()
@@ -151,6 +152,7 @@ def test_too_few_views_are_no_error(clean):
     assert "fewer than three views" in found.remarks[-1]
 
 
+@pytest.mark.slow
 def test_camera_shake_and_missing_pixels_are_told(clean):
     moved = spoilt(clean, in_view(2, lambda d: d + torch.tensor([1.5, 0.0])))
     valid = torch.ones(moved.displacement.shape[:3], dtype=torch.bool)

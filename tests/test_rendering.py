@@ -124,6 +124,7 @@ def test_a_lens_is_sharp_in_focus_and_blurs_by_its_circle_of_confusion(camera):
     assert variance == pytest.approx((circle / 4) ** 2 + 1 / 12, rel=0.1)  # of a disc, along one axis, and a pixel
 
 
+@pytest.mark.slow
 def test_an_aperture_smooths_the_flow(camera, texture, ball):
     strong = Times(ball, 20.0)
     still = render(camera, texture, lens=Lens(60.0, points=30))

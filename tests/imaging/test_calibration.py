@@ -108,6 +108,7 @@ def test_without_background_pictures_there_is_no_plane_but_a_note():
     assert sum("its plane is not known" in n for n in result.notes) == 4
 
 
+@pytest.mark.slow
 def test_world_is_where_it_is_asked_for():
     plain = calibrate(pictures(), dataclasses.replace(SETTINGS, axes=("x+", "y+", "z+")))
     moved = calibrate(pictures(), dataclasses.replace(SETTINGS, axes=("y+", "z+", "x+"), origin=(1.0, 2.0, 3.0)))
@@ -170,6 +171,7 @@ def relabelled(target: Target) -> list[ViewPictures]:
     return [dataclasses.replace(v, poses=other(v.poses), background=other(v.background)) for v in pictures()]
 
 
+@pytest.mark.slow
 def test_a_wrong_pitch_shows_in_the_size_of_the_rig_only():
     result = calibrate(relabelled(dataclasses.replace(TARGET, pitch=24.0)), SETTINGS)
     assert result.rms() < 1e-3

@@ -70,6 +70,7 @@ def test_a_film_of_one_instant_is_the_measurement(recording, tmp_path):
         assert torch.equal(getattr(frame, name).nan_to_num(), getattr(single, name).nan_to_num()), name
 
 
+@pytest.mark.slow
 def test_several_processes_find_what_one_does(recording, tmp_path):
     single, _ = measure_instant(recording, processes=1)
     several, _ = measure_instant(recording, processes=2)

@@ -37,7 +37,7 @@ NETWORK = NeRIF(
     points_per_batch=64, device="cpu", precision="float32",
 )  # fmt: skip
 BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))
-QUICK = 40
+QUICK = 30
 """Mutants of each kind in `make test`."""
 MANY = {
     "m.nc": 3600, "v.nc": 1600, "v.vti": 900, "c.toml": 1200, "c.csv": 400, "c.json": 500, "m.zarr": 1000,

@@ -87,17 +87,16 @@ def test_the_reference_steps_as_torch_has_it():
         twins, lr=2e-2, weight_decay=0.0, momentum=0.9, ns_steps=5, adjust_lr_fn="match_rms_adamw"
     )
     before = [m.detach().clone() for m in matrices]
-    p = torch.rand(200, 3) * 2 - 1
     for _ in range(3):
         optimiser.zero_grad()
-        (net(p) - p.sum(1).sin()).square().mean().backward()
         for matrix, twin in zip(matrices, twins, strict=True):
+            matrix.grad = torch.randn_like(matrix)
             twin.grad = matrix.grad.clone()
         optimiser.step({"adam": 1e-2, "muon": 2e-2})
         of_torch.step()
     for start, matrix, twin in zip(before, *([w.detach() for w in part] for part in (matrices, twins)), strict=True):
         ours, theirs = (matrix - start).flatten(), (twin - start).flatten()
-        assert float(torch.dot(ours, theirs) / (ours.norm() * theirs.norm())) > 0.98  # bf16 turns small directions
+        assert float(torch.dot(ours, theirs) / (ours.norm() * theirs.norm())) > 0.995  # up to bf16
         torch.testing.assert_close(ours.norm(), theirs.norm(), rtol=0.02, atol=0)
     assert {group["share"] for group in optimiser.parts["adam"].param_groups} == {1.0}
 

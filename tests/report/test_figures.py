@@ -28,6 +28,7 @@ def volume() -> Volume:
     return Volume(-2e-4 * torch.exp(-((x - 1) ** 2 + y**2 + z**2) / 4), grid, attributes={"n_ambient": 1.00027})
 
 
+@pytest.mark.slow
 def test_every_figure_is_whole(whole):
     """The names expected; nothing beyond the edge of the paper; a unit on every axis and colour bar; no empty panel."""
     result = ResultDirectory(whole).read()

@@ -72,6 +72,7 @@ def test_a_store_with_nothing_to_show_is_refused(tmp_path, capsys):
     assert "no such store" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @needs_browser
 def test_time_is_turned_by_slider_and_button(browser: Any, tmp_path: Path) -> None:
     store_of(tmp_path / "r.zarr", 6)

@@ -275,6 +275,7 @@ def test_ambient_points_of_an_instant_lie_outside_its_own_masks(moving):
         assert float(distance[:, 1 - own].min()) < 1.5
 
 
+@pytest.mark.slow
 def test_each_frame_of_a_joint_network_is_found_within_its_own_masks(moving, tmp_path):
     """The ambient counts a hundredfold, so that a frame pinned where it is not ambient comes out flat."""
     plan = begun(moving, tmp_path / "r.zarr", 150, points_per_batch=2000, weights=LossWeights(gauge=100.0))
