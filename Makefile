@@ -1,5 +1,5 @@
 # make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo
-# make test   set up, lint, check types, run the tests (under 10 minutes on 2 cores)
+# make test   set up, lint, check types, run the tests (some nine minutes on 2 slow cores)
 # make docs   the documentation site: open docs/_build/html/index.html
 # make study  the paper's numerical study (hours; benchmarks/study): out/study; make study-quick: a small one, out/study-quick
 
