@@ -5,6 +5,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: demo test test-all lint docs study study-quick clean
 
@@ -12,10 +13,10 @@ demo: .venv/.run
 	$(BIN)/nerif demo --out out/demo --force
 
 test: .venv/.dev lint
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-all: .venv/.dev lint
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(PYTEST)
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

@@ -45,16 +45,21 @@ from nerif.simulation import simulate
 torch.set_num_threads(1)  # tests run side by side
 
 
-GROUPS = {"whole": "report", "site": "docs", "experiment": "pictures"}
-"""Fixtures that take long: tests that use one run in one process, so that it is made once."""
+GROUPS = {"whole": "report", "experiment": "pictures"}
+"""Fixtures of more than one file, by the group of the tests that use them."""
+LONGEST = ("test_docs", "pictures", "report", "test_consistency", "test_neural", "test_cluster", "test_joint", "test_cli")
+"""Groups to begin with, so that both processes end at about the same time."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep tests together that share a costly fixture."""
+    """Run the tests of a file, or of a costly fixture, in one process, where what takes long is made once."""
+    group = {}
     for item in items:
-        for fixture, group in GROUPS.items():
-            if fixture in getattr(item, "fixturenames", ()):
-                item.add_marker(pytest.mark.xdist_group(group))
+        shared = [g for fixture, g in GROUPS.items() if fixture in getattr(item, "fixturenames", ())]
+        group[item] = shared[0] if shared else item.path.stem
+        item.add_marker(pytest.mark.xdist_group(group[item]))
+    items.sort(key=lambda item: LONGEST.index(group[item]) if group[item] in LONGEST else len(LONGEST))
 
 
 @pytest.fixture
