@@ -222,13 +222,13 @@ def test_networks_kept_without_gains_have_octaves_that_count_alike():
 def test_large_pictures_begin_with_bins_and_go_on_with_what_there_is_time_for(measurement, monkeypatch):
     """A run that can see all pixels ends with pixels, one that cannot stays with bins; a resumed one goes on alike."""
     monkeypatch.setattr(bins, "FEWEST", 8)  # 20 x 26 px are large
-    short, ample = (replace(SMALL, max_steps=n, points_per_batch=300)(measurement) for n in (12, 600))
+    short, ample = (replace(SMALL, max_steps=n, points_per_batch=300)(measurement) for n in (12, 300))
     assert not any("bin_edge" in record for record in short.history)
     (refined,) = (record["bin_edge"] for record in ample.history if "bin_edge" in record)
     assert refined == 1
     states = []
-    settings = replace(SMALL, max_steps=120, points_per_batch=300)
-    whole = settings(measurement, on_step=lambda s: states.append(s.capture()) if s.step == 60 else None)
+    settings = replace(SMALL, max_steps=60, points_per_batch=300)
+    whole = settings(measurement, on_step=lambda s: states.append(s.capture()) if s.step == 30 else None)
     again = settings(measurement, resume=states[0])
     assert torch.equal(whole.field(torch.zeros(1, 3)), again.field(torch.zeros(1, 3)))
 
@@ -254,8 +254,8 @@ def test_sigma_weighs_the_rays(measurement):
     sigma = measurement.sigma.clone()
     sigma[2] = 1e3
     honest = replace(measurement, displacement=wrong, sigma=sigma)
-    good = evaluate_views(reproject(replace(SMALL, max_steps=100)(honest).field, measurement))
-    blind = evaluate_views(reproject(replace(SMALL, max_steps=100)(replace(honest, sigma=None)).field, measurement))
+    good = evaluate_views(reproject(replace(SMALL, max_steps=60)(honest).field, measurement))
+    blind = evaluate_views(reproject(replace(SMALL, max_steps=60)(replace(honest, sigma=None)).field, measurement))
     others = [0, 1, 3, 4]
     assert max(good[i]["rms_px"] for i in others) < 0.5 * max(blind[i]["rms_px"] for i in others)
 
