@@ -1,13 +1,17 @@
 """A random order without a list of it: a permutation that is computed where it is asked.
 
-A Feistel network on 2 h bits exchanges two halves, each time adding to one a hash of the other; that is one-to-one
-whatever the hash. Numbers that it carries beyond the count are sent through it again until they are below.
+A Feistel network on pairs of numbers below a = ceil(sqrt(count)) exchanges the two, each time adding to one, modulo a, a
+hash of the other; that is one-to-one whatever the hash. The few numbers that it carries to count or beyond are sent
+through it again until they are below.
 
 Source: Black & Rogaway, Ciphers with arbitrary finite domains, CT-RSA (2002).
 """
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -27,25 +31,27 @@ def shuffled(first: int, length: int, count: int, seed: int) -> Int[Tensor, " n"
     count : things to put in order
     seed : of the order; each epoch has its own
     """
-    place = torch.arange(first, first + length)
-    epochs = torch.div(place, count, rounding_mode="floor")
-    keys = {epoch: _hash(seed * MULTIPLIER + epoch) for epoch in epochs.unique().tolist()}
-    return torch.cat([_permuted(place[epochs == epoch] % count, count, key) for epoch, key in keys.items()])
+    place = np.arange(first, first + length, dtype=np.int64)
+    epochs = place // count
+    parts = [
+        _permuted(place[epochs == epoch] % count, count, _hash(seed * MULTIPLIER + epoch))
+        for epoch in range(first // count, (first + length - 1) // count + 1)
+    ]
+    return torch.from_numpy(np.concatenate(parts))
 
 
-def _permuted(x: Int[Tensor, " n"], count: int, key: int) -> Int[Tensor, " n"]:
-    half = max(1, (max(count - 1, 1).bit_length() + 1) // 2)
-    mask = (1 << half) - 1
-    outside = torch.ones_like(x, dtype=torch.bool)
-    while bool(outside.any()):
-        left, right = x[outside] >> half, x[outside] & mask
-        for turn in range(ROUNDS):
-            mixed = (right + key + turn * MULTIPLIER) & 0x7FFFFFFF
-            mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0x7FFFFFFF
-            mixed = ((mixed ^ (mixed >> 12)) * 0x297A2D39) & 0x7FFFFFFF
-            left, right = right, left ^ ((mixed ^ (mixed >> 15)) & mask)
-        x[outside] = left << half | right
-        outside = x >= count
+def _permuted(x: Int[np.ndarray, " n"], count: int, key: int) -> Int[np.ndarray, " n"]:
+    side = math.isqrt(count - 1) + 1
+    left, right = np.divmod(x, side)
+    for turn in range(ROUNDS):
+        mixed = (right + key + turn * MULTIPLIER) & 0x7FFFFFFF
+        mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0x7FFFFFFF
+        mixed = ((mixed ^ (mixed >> 12)) * 0x297A2D39) & 0x7FFFFFFF
+        left, right = right, (left + (mixed ^ (mixed >> 15))) % side
+    x = left * side + right
+    outside = x >= count
+    if outside.any():
+        x[outside] = _permuted(x[outside], count, key)
     return x
 
 
