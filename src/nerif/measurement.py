@@ -102,7 +102,7 @@ class Measurement:
             height, width = camera.image_size
             u = torch.linspace(0, width - 1, min(width, 33), dtype=torch.float64)
             v = torch.linspace(0, height - 1, min(height, 33), dtype=torch.float64)
-            rays = camera.rays(torch.cartesian_prod(u, v).reshape(-1, 2)).clip(self.box)
+            rays = camera.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False).clip(self.box)
             crossing |= bool(rays.crosses.any())
             normal = camera.background.normal.to(torch.float64)
             plane = corners @ normal - camera.background.offset
