@@ -24,6 +24,7 @@ from nerif.result import VOLUME, ResultDirectory
 from nerif.volume import Volume, read_volume
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
+SIDE_BY_SIDE = 4  # views that are scored at a time: each of a megapixel takes some 0.1 GiB
 
 __all__ = ["FLOW", "evaluate", "evaluate_views", "evaluate_volume", "score_lines"]
 
@@ -76,10 +77,13 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
 
     Where sigma is known, rms_over_sigma tells whether the residual is the noise (1) or more.
     """
+    from concurrent.futures import ThreadPoolExecutor
+
     measurement = reprojection.measurement
     compared = measurement.usable & measurement.sees_box
-    views = []
-    for i, camera in enumerate(measurement.cameras):
+
+    def scores(i: int) -> dict[str, Any]:
+        camera = measurement.cameras[i]
         height, width = camera.image_size
         mask = compared[i, :height, :width]
         predicted = reprojection.predicted[i, :height, :width]
@@ -89,8 +93,10 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         if measurement.sigma is not None and bool(mask.any()):
             residual = (predicted - measured)[mask] / measurement.sigma[i, :height, :width][mask]
             view["rms_over_sigma"] = float(residual.square().mean().sqrt())
-        views.append(view)
-    return views
+        return view
+
+    with ThreadPoolExecutor(min(torch.get_num_threads(), SIDE_BY_SIDE)) as threads:
+        return list(threads.map(scores, range(len(measurement.cameras))))
 
 
 def score_lines(views: list[dict[str, Any]]) -> list[str]:

@@ -161,18 +161,20 @@ class Measurement:
     def sees_box(self) -> Bool[Tensor, "view row column"]:
         """Pixels whose rays cross the box on the way to the background."""
         mask = self._inside
-        for _ in self._crossing(mask, sensitivity=False):
+        for _ in self._traced(mask, sensitivity=False):
             pass
         return mask
 
     def rays(self) -> tuple[Rays, Float[Tensor, "n 2"], Float[Tensor, "n 2"] | None]:
         """Return the usable rays that cross the box, their displacement and sigma (None if unknown), px."""
         mask = self.usable
-        rays = Rays.collect(self._crossing(mask), int(mask.sum()))
+        rays = Rays.collect((traced[keep] for traced, keep in self._traced(mask)), int(mask.sum()))
         return rays, self.displacement[mask].float(), None if self.sigma is None else self.sigma[mask].float()
 
-    def _crossing(self, mask: Bool[Tensor, "view row column"], sensitivity: bool = True) -> Iterator[Rays]:
-        """Trace the pixels of a mask, some at a time, and clear those whose ray does not cross the box.
+    def _traced(
+        self, mask: Bool[Tensor, "view row column"], sensitivity: bool = True
+    ) -> Iterator[tuple[Rays, Bool[Tensor, " n"]]]:
+        """Trace the pixels of a mask, some at a time, tell whose ray crosses the box, and clear the others in the mask.
 
         Rays are made in double precision: cameras stand far off, and positions lose digits in single precision.
         """
@@ -185,7 +187,7 @@ class Measurement:
                 rays = camera.rays(pixels, sensitivity).clip(self.box)
                 keep = rays.crosses & (rays.background > rays.far)
                 block[row, column] = keep
-                yield rays[keep]
+                yield rays, keep
 
     def select(self, names: Sequence[str]) -> Measurement:
         """Return the measurement of the named views only.
