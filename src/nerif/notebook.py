@@ -69,12 +69,10 @@ def panel(title: str, rows: Sequence[tuple[str, str]], picture: str, describes: 
 
 def png(draw: Callable[[Figure], object], width: float, height: float) -> str:
     """Return a figure of that size (inches) as a PNG in a data address."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     with style(size=8):
         figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(figure)
         draw(figure)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=110)

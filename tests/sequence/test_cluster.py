@@ -143,7 +143,7 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     from nerif.sequence import run
     from nerif.sequence.run import run_sequence
 
-    plan = _plan(film, tmp_path / "out.zarr")
+    plan = _plan(film, tmp_path / "out.zarr", 6)
     deadly = tmp_path / "deadly.py"
     monkeypatch.syspath_prepend(tmp_path)  # workers get it
     deadly.write_text(
@@ -160,7 +160,7 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     module = importlib.import_module("deadly")
     monkeypatch.setattr(run, "_in_worker", module.work)
     with open_cluster("local", 2) as (client, _):
-        progress = run_sequence(client, plan, 6)
+        progress = run_sequence(client, plan)
     store = SequenceStore(plan.out)
     assert np.flatnonzero(store.status == FAILED).tolist() == [7]
     assert (store.status == DONE).sum() == 23
@@ -173,7 +173,7 @@ def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(fi
 
     from nerif.sequence import run
 
-    plan, real = _plan(five, tmp_path / "out.zarr"), run.reconstruct_frames
+    plan, real = _plan(five, tmp_path / "out.zarr", 3), run.reconstruct_frames
 
     def work(plan, first, last, event):
         real(plan, first, min(last, 1), event)
@@ -183,23 +183,22 @@ def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(fi
 
     monkeypatch.setattr(run, "reconstruct_frames", work)
     with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
-        progress = run.run_sequence(client, plan, 3)
+        progress = run.run_sequence(client, plan)
     store = SequenceStore(plan.out)
     assert store.status.tolist() == [DONE, FAILED, FAILED, DONE, DONE]
     assert store.reasons[1] == "KeyError: 'layer 7'"
     assert (progress.done, progress.failed) == (3, 2)
 
 
-def _plan(film: Path, out: Path):
-    from dataclasses import replace
-
+def _plan(film: Path, out: Path, chunk: int):
     from nerif.geometry import Grid
-    from nerif.sequence.plan import SequencePlan
+    from nerif.sequence.plan import SequencePlan, SequenceSettings
 
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.first_good().box, 10)
     SequenceStore.begin(out, sequence, grid, ("index_excess",), COLD.network, {})
-    return SequencePlan(film, out, COLD, replace(COLD, max_steps=10), 10, ("index_excess",), threads=1)
+    settings = SequenceSettings(chunk=chunk, warm_steps=10, voxels=10, quantities=("index_excess",))
+    return SequencePlan(film, out, COLD, settings, threads=1)
 
 
 def test_a_scheduler_that_is_there_already_is_used(five, tmp_path):
@@ -302,6 +301,7 @@ def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["--workers", "-1"], "workers: expected 0 or more"),
         (["--chunk", "0"], "chunk: expected 1 or more"),
         (["--quantities", "pressure"], "quantities: expected some of"),
         (["--time-limit", "5"], "time_limit: expected none in a sequence"),

@@ -75,11 +75,9 @@ def draw_resolution(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
 
 def save_design(path: Path, ring: Ring, flow: DesignSettings) -> None:
     """Write the three drawings side by side, as PNG or PDF by the ending."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
     first, second, third = figure.subplots(1, 3)
     draw_plan(first, ring, flow)
     draw_displacement(second, ring, flow)

@@ -214,12 +214,10 @@ def _curves(result: Result) -> list[tuple[str, str]]:
 
 def svg(draw: Callable[[Axes], object]) -> str:
     """Return a plot as SVG in a data address."""
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     with style(size=10):
         figure = Figure(figsize=(5.6, 3.6), layout="constrained")
-        FigureCanvasSVG(figure)
         draw(figure.subplots())
         text = io.BytesIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})

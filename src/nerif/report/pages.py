@@ -42,12 +42,9 @@ TO_DRAW = ("n", "density", "temperature", "n_std", "density_std", "temperature_s
 
 def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi: int = 300) -> list[Path]:
     """Write NAME.pdf and NAME.png of every figure that the result has data for, and return the paths."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     paths = []
     with style():
         for name, figure in figures_of(result, *JOURNALS[journal]):
-            FigureCanvasAgg(figure)
             for ending in ("pdf", "png"):
                 paths.append(directory / f"{name}.{ending}")
                 with atomic(paths[-1]) as part:

@@ -90,12 +90,10 @@ def draw_two_sides(figure: Figure, cameras: Sequence[Camera], box: Box | None = 
 def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> None:
     """Write a picture of the rig from two sides."""
     import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     with mpl.rc_context({"font.size": 8, "axes.titlesize": 9}):
         figure = Figure(figsize=(12, 6.2))
-        FigureCanvasAgg(figure)
         draw_two_sides(figure, cameras, box)
         with atomic(path) as part:
             figure.savefig(part, dpi=130)

@@ -41,8 +41,6 @@ def require_dask() -> None:
 
 def worker_count(workers: int) -> int:
     """Return the workers of this machine: as asked, or one for each GPU, or one for each two cores."""
-    if workers < 0:
-        raise InputError(f"workers: expected 1 or more, or 0 for as many as fit, got {workers}")
     return workers or torch.cuda.device_count() or max(1, _cores() // 2)
 
 

@@ -100,7 +100,7 @@ def _frame(
     plan: SequencePlan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, watch: OnStep
 ) -> Frame:
     begun = time.perf_counter()
-    training = measurement.select([name for name in measurement.names if name not in plan.hold_out])
+    training = measurement.select([name for name in measurement.names if name not in plan.settings.hold_out])
     result = settings(training, watch, None, start)
     if result.outcome.failed:
         raise ArithmeticError(result.outcome.message)
@@ -112,9 +112,9 @@ def _frame(
 
 def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return what is written of a field: its volumes, and how it compares with what was measured."""
-    grid = Grid.of_resolution(measurement.box, plan.voxels)
+    grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
     excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})
-    volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
+    volumes = [derive(excess, quantity, plan.settings.gas) for quantity in plan.settings.quantities]
     cc, rms = _against_measured(plan.cold.model, field, measurement, device)
     return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)
 

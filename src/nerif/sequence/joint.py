@@ -80,7 +80,7 @@ def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event 
         try:
             field = data.field(trained.field, place)
             found = finished_frame(plan, field, sequence.frame(i), trained.device)
-            found = replace(found, seconds=seconds + time.perf_counter() - begun, steps=plan.joint_steps)
+            found = replace(found, seconds=seconds + time.perf_counter() - begun, steps=plan.settings.joint_steps)
             store.write_frame(i, found)
         except FAILURES as error:
             fail(i, error, 1)
@@ -94,7 +94,7 @@ def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event 
 def _read(plan: SequencePlan, sequence: MeasurementSequence, index: int) -> FrameData:
     """A frame without the views held out."""
     frame = sequence.frame(index)
-    training = frame.select([name for name in frame.names if name not in plan.hold_out])
+    training = frame.select([name for name in frame.names if name not in plan.settings.hold_out])
     return FrameData(replace(plan.cold, device="cpu"), training, coarsest=1)
 
 
@@ -104,10 +104,10 @@ def _trained(
     """The network, from the last checkpoint if there is one; after a failure anew, with half the learning rate."""
     reason = ""
     for attempt in range(ATTEMPTS):
-        rate, steps = plan.cold.learning_rate / 2**attempt, plan.joint_steps * len(frames)
+        rate, steps = plan.cold.learning_rate / 2**attempt, plan.settings.joint_steps * len(frames)
         settings = replace(plan.cold, learning_rate=rate, max_steps=steps)
         try:
-            data = ChunkData(settings, frames, tau, plan.time_octaves)
+            data = ChunkData(settings, frames, tau, plan.settings.time_octaves)
             training = Training(settings, data, _resumable(kept, data))
             result = training.run(compose(on_step, checkpoints(kept, CHECKPOINT_EVERY)))
             if result.outcome.failed:
