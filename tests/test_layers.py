@@ -12,7 +12,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions", "netcdf"),
+    ("atomic", "conventions", "netcdf", "toml"),
     ("geometry",),
     ("drawing",),
     ("notebook",),

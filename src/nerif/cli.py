@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 from nerif import __version__
@@ -34,7 +35,8 @@ VERBS = {
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
-    0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted.
+    0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted, 141 nobody reads
+    what it prints any more.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
     if not words or words[0] in ("-h", "--help"):
@@ -65,6 +67,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     except SystemExit as stop:
         return int(stop.code or 0)
+    except BrokenPipeError:  # whoever read it has seen enough, as in nerif info FILE | head -2
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
+        return 141
     except OSError as error:
         return _refuse(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0

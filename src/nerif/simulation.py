@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
+from nerif.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
@@ -21,9 +21,7 @@ from nerif.physics.ray_tracing import background_points
 from nerif.volume import Volume, read_volume
 from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["AMBIENT", "Simulation", "add_noise", "simulate", "view_displacement"]
-
-AMBIENT = 1.00027  # air at 20 °C
+__all__ = ["Simulation", "add_noise", "simulate", "view_displacement"]
 
 MOVING = ("flame", "2", "3", "4", "5", "6", "7")
 STEPS = 120  # Runge-Kutta steps through the box: 2e-4 of the rms displacement on the flame (tests/test_simulation.py)
@@ -201,13 +199,12 @@ class Simulation:
         """The field of index excess, its box, and the ambient it is counted from."""
         path = Path(self.phantom)
         if path.suffix not in (".nc", ".vti"):
-            x, y, z = (e / 2 for e in self.box)
-            box = Box((-x, -y, -z), (x, y, z))
-            n_ambient = AMBIENT if self.n_ambient is None else self.n_ambient
+            box = Box.around_origin(self.box)
+            n_ambient = AMBIENT_INDEX if self.n_ambient is None else self.n_ambient
             return make_phantom(self.phantom, box, self.seed, self.time), box, n_ambient
         volume = read_volume(path)
         try:
-            n_ambient = next(n for n in (self.n_ambient, volume.n_ambient, AMBIENT) if n is not None)
+            n_ambient = next(n for n in (self.n_ambient, volume.n_ambient, AMBIENT_INDEX) if n is not None)
             excess = volume.relative_to(n_ambient)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None

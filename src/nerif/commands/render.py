@@ -11,10 +11,10 @@ import tyro
 
 from nerif.commands.output import check_directory, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
+from nerif.conventions import AMBIENT_INDEX
 from nerif.experiment import Experiment
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.simulation import AMBIENT
 
 __all__ = ["Render", "main", "run"]
 
@@ -36,7 +36,7 @@ class Render(Settings):
     """Of the phantom."""
     box: tuple[float, float, float] = (50.0, 50.0, 50.0)
     """Edges of the box around the origin, along x y z, mm."""
-    n_ambient: float = AMBIENT
+    n_ambient: float = AMBIENT_INDEX
     """Refractive index around the flow."""
     truth_voxels: int = 100
     """Voxels of the truth along the longest edge."""
@@ -50,8 +50,7 @@ def run(settings: Render) -> None:
     """Write pictures and truth."""
     check_directory(settings.out, settings.force)
     cameras, pictures = settings.ring.cameras(), settings.pictures
-    x, y, z = (e / 2 for e in settings.box)
-    box = Box((-x, -y, -z), (x, y, z))
+    box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
     with counting_bar("rendering", pictures.pictures(len(cameras))) as bar:

@@ -45,7 +45,13 @@ class Box:
     @classmethod
     def cube(cls, edge: float) -> Box:
         """Return a cube of `edge` mm centred on the origin."""
-        return cls((-edge / 2,) * 3, (edge / 2,) * 3)
+        return cls.around_origin((edge,) * 3)
+
+    @classmethod
+    def around_origin(cls, edges: tuple[float, float, float]) -> Box:
+        """Return a box with edges along x, y, z (mm), centred on the origin."""
+        x, y, z = (e / 2 for e in edges)
+        return cls((-x, -y, -z), (x, y, z))
 
     @property
     def edges(self) -> tuple[float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,14 +115,7 @@ def _close(axes: Axes3D, corners: np.ndarray, **style: object) -> None:
 
 
 def _draw_box(axes: Axes3D, box: Box) -> None:
-    lower, upper = np.array(box.lower), np.array(box.upper)
-    for axis in range(3):
-        for first in (0, 1):
-            for second in (0, 1):
-                a = lower.copy()
-                others = [k for k in range(3) if k != axis]
-                a[others[0]] = (lower, upper)[first][others[0]]
-                a[others[1]] = (lower, upper)[second][others[1]]
-                b = a.copy()
-                b[axis] = upper[axis]
-                axes.plot(*np.stack([a, b]).T, color="black", linewidth=1)
+    corners = np.array(list(itertools.product(*zip(box.lower, box.upper, strict=True))))
+    for a, b in itertools.combinations(corners, 2):
+        if np.count_nonzero(a != b) == 1:
+            axes.plot(*np.stack([a, b]).T, color="black", linewidth=1)

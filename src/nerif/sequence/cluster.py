@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import logging
 import os
@@ -15,6 +14,7 @@ import torch
 
 from nerif import __version__
 from nerif.conventions import InputError
+from nerif.toml import check_known
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -164,11 +164,7 @@ def slurm_cluster(path: Path) -> Any:
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise InputError("cluster: dask-jobqueue is not installed; pip install 'nerif[cluster]'") from None
-    known = _slurm_names()
-    for name in settings:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0)[0]
-            raise InputError(f"{path}: unknown key '{name}'; the nearest known one is '{near}'; see docs/sequences.md")
+    check_known(settings, _slurm_names(), str(path), more="; see docs/sequences.md")
     cluster = SLURMCluster(**settings)
     cluster.scale(jobs=jobs)
     return cluster
