@@ -17,7 +17,7 @@ LAYERS = (
     ("drawing",),
     ("notebook",),
     ("measurement_file", "measurement", "measurement_sequence"),
-    ("volume", "volume_sequence", "vti", "exports", "reprojection"),
+    ("volume", "volume_file", "volume_sequence", "vti", "exports", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),

@@ -32,8 +32,8 @@ from .simulation import Simulation as Simulation
 from .simulation import add_noise as add_noise
 from .simulation import simulate as simulate
 from .volume import Volume as Volume
-from .volume import read_volume as read_volume
-from .volume import read_volumes as read_volumes
+from .volume_file import read_volume as read_volume
+from .volume_file import read_volumes as read_volumes
 from .workflow import Run as Run
 from .workflow import reconstruct_into as reconstruct_into
 from .workflow import write_report as write_report

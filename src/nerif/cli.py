@@ -67,12 +67,21 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     except SystemExit as stop:
         return int(stop.code or 0)
-    except BrokenPipeError:  # whoever read it has seen enough, as in nerif info FILE | head -2
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
-        return 141
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _nobody_reads():
+            return 141
         return _refuse(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0
+
+
+def _nobody_reads() -> bool:
+    """Whether what is printed has no reader left, as in nerif info FILE | head -2; then the rest goes nowhere."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def _refuse(message: str) -> int:

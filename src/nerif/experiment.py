@@ -23,7 +23,8 @@ from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.targets import CalibrationTarget
 from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
 from nerif.toml import write_toml
-from nerif.volume import Volume, write_netcdf
+from nerif.volume import Volume
+from nerif.volume_file import write_netcdf
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "target_poses", "world_axes"]
 

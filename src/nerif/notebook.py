@@ -16,7 +16,7 @@ from nerif.drawing import (
     add_colour_bar,
     colour_range,
     draw_displacement,
-    draw_slice,
+    draw_slices,
     label_of,
     shown,
     style,
@@ -86,11 +86,8 @@ def show_slices(volume: Drawable) -> str:
     """Return the three middle slices of a volume as a PNG in a data address."""
 
     def draw(figure: Figure) -> None:
-        limits = colour_range(shown(volume))
         line = list(figure.subplots(1, 3))
-        for axes, normal in zip(line, "zyx", strict=True):
-            draw_slice(axes, volume, normal, limits)
-            axes.set_title(f"{normal} = {volume.grid.box.centre['xyz'.index(normal)]:.3g} mm")
+        draw_slices(line, volume, colour_range(shown(volume)))
         add_colour_bar(line, label_of(volume.quantity))
 
     return picture(draw, 8.5, 2.8)

@@ -24,7 +24,8 @@ from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_state, write_field, write_state
 from nerif.reprojection import Reprojection
 from nerif.toml import read_toml, write_toml
-from nerif.volume import Volume, read_volume, read_volumes
+from nerif.volume import Volume
+from nerif.volume_file import read_volume, read_volumes
 
 __all__ = [
     "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions", "write_json",
@@ -152,11 +153,7 @@ class ResultDirectory:
         """Write the field and, where there is one, the checkpoint to go on from."""
         write_field(self.path, result)
         if result.state is not None:
-            self.write_state(result.state)
-
-    def write_state(self, state: State) -> None:
-        """Write the checkpoint."""
-        write_state(self.path, state)
+            write_state(self.path, result.state)
 
     def write_history(self, history: Sequence[Mapping[str, float]]) -> None:
         """Write history.csv, a line a record, blank where a record lacks a column."""

@@ -18,7 +18,8 @@ from nerif.geometry import Box, Camera, Grid
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.ray_tracing import background_points
-from nerif.volume import Volume, read_volume
+from nerif.volume import Volume
+from nerif.volume_file import read_volume
 from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["Simulation", "add_noise", "simulate", "view_displacement"]
@@ -144,25 +145,19 @@ class Simulation:
             raise InputError(f"truth_voxels: expected at least 1, got {self.truth_voxels}")
 
     def __call__(
-        self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None
+        self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None, frame: int = 0
     ) -> tuple[Measurement, Volume]:
-        """Return what the cameras would measure, and the truth as index excess.
+        """Return what the cameras would measure, and the truth as index excess; each frame has noise of its own.
 
         Raises
         ------
         InputError
             If there is no such phantom, or a volume file is none.
         """
-        return self._with_noise(self.seed, cameras, on_view)
-
-    def _with_noise(
-        self, seed: int, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None
-    ) -> tuple[Measurement, Volume]:
-        """The same phantom, with the noise of another seed."""
         field, box, n_ambient = self._field()
         measurement = simulate(
-            field, cameras, box, n_ambient, self.noise, seed, self.steps, self.wavelength_nm, self.ambient_faces,
-            on_view,
+            field, cameras, box, n_ambient, self.noise, self.seed + frame, self.steps, self.wavelength_nm,
+            self.ambient_faces, on_view,
         )  # fmt: skip
         grid = Grid.of_resolution(box, self.truth_voxels)
         return measurement, Volume(field.sample(grid), grid, attributes={"n_ambient": n_ambient})
@@ -186,7 +181,7 @@ class Simulation:
         if self.phantom not in MOVING:
             raise InputError(f"times: expected a phantom that moves (flame, 2-7), got '{self.phantom}'")
         for i, time in enumerate(times):
-            measurement, volume = replace(self, time=time)._with_noise(self.seed + i, cameras)
+            measurement, volume = replace(self, time=time)(cameras, frame=i)
             if i == 0:
                 sequence = MeasurementSequence.create(out, times, measurement, force)
                 store = VolumeSequence.create(truth, times, volume.grid, ("index_excess",), measurement.n_ambient)

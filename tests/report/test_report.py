@@ -275,7 +275,7 @@ def test_tables_of_another_kind_are_refused_not_drawn(copy, name, text, words):
     assert main(["report", str(copy)]) == 0
 
 
-def scene_of(page: Path) -> str:
+def scene_in(page: Path) -> str:
     """The JSON that the page draws from."""
     match = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page.read_text())
     assert match is not None
@@ -289,7 +289,7 @@ def test_the_gas_is_doubted_in_a_liquid(tmp_path):
     statements = trust(Result(tmp_path, volumes={"index_excess": water, **found}))
     assert any("do not apply here" in s.text and s.level == "warning" for s in statements)
     html.write(html.render(Result(tmp_path, volumes={"index_excess": water, **found})), tmp_path / "r.html")
-    assert "NaN" not in scene_of(tmp_path / "r.html")
+    assert "NaN" not in scene_in(tmp_path / "r.html")
 
 
 def test_residuals_are_those_of_every_ray_through_the_box(measurement):

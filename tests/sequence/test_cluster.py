@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
+from nerif.sequence.plan import SequenceSettings
+from nerif.sequence.reconstruct import reconstruct_sequence
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 CHUNKS = ["--workers", "2", "--threads", "1", "--chunk", "6"]
@@ -192,7 +195,7 @@ def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(fi
 
 def _plan(film: Path, out: Path, chunk: int):
     from nerif.geometry import Grid
-    from nerif.sequence.plan import SequencePlan, SequenceSettings
+    from nerif.sequence.plan import SequencePlan
 
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.first_good().box, 10)
@@ -325,3 +328,21 @@ def test_a_store_begun_with_other_settings_is_left_alone(film, tmp_path, capsys)
     assert "seed: expected 0, with which it was begun, got 4" in capsys.readouterr().err
     assert main(["sequence", str(film), "-o", str(tmp_path / "o.nc"), *QUICK]) == 2
     assert "ending in .zarr" in capsys.readouterr().err
+
+
+def test_from_python_in_one_call(five, tmp_path):
+    out, said, told = tmp_path / "r.zarr", [], []
+    settings = SequenceSettings(chunk=3, warm_steps=10, voxels=10)
+    arguments = {"workers": 1, "threads": 1, "say": said.append}
+    store = reconstruct_sequence(out, five, COLD, settings, on_progress=told.append, **arguments)
+    assert (store.status == DONE).all()
+    assert store.quantities == ("index_excess", "density")
+    assert store.attributes["gas"]["wavelength_nm"] == MeasurementSequence.read(five).first_good().wavelength_nm
+    assert said[0].endswith("r.zarr: 5 of 5 frames to do, in chunks of 3")
+    assert said[-1].startswith("5 of 5 frames done")
+    assert told[-1].done == 5
+    said.clear()
+    reconstruct_sequence(str(out), str(five), COLD, settings, **arguments)
+    assert len(said) == 1  # nothing is done twice
+    with pytest.raises(InputError, match="chunk: expected 3, with which it was begun, got 4"):
+        reconstruct_sequence(out, five, COLD, replace(settings, chunk=4), **arguments)

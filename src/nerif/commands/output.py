@@ -12,11 +12,9 @@ from pathlib import Path
 from nerif.conventions import InputError
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import OnStep, Step, compose
-from nerif.result import ResultDirectory
 
 __all__ = [
     "MONITOR",
-    "check_directory",
     "check_file",
     "counting_bar",
     "figures_bar",
@@ -42,11 +40,6 @@ def check_file(path: Path, force: bool, *others: Path) -> None:
             raise InputError(f"{file}: expected the name of a file to write, got a folder")
         if file.exists() and not force:
             raise InputError(f"{file}: exists already and was left as it is; give another --out, or --force")
-
-
-def check_directory(path: Path, force: bool) -> None:
-    """Refuse an output directory that holds anything, unless forced."""
-    ResultDirectory(path).check_free(force)
 
 
 @contextmanager

@@ -9,12 +9,13 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_directory, counting_bar, say
+from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import AMBIENT_INDEX
 from nerif.experiment import Experiment
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
+from nerif.result import ResultDirectory
 
 __all__ = ["Render", "main", "run"]
 
@@ -48,7 +49,7 @@ class Render(Settings):
 
 def run(settings: Render) -> None:
     """Write pictures and truth."""
-    check_directory(settings.out, settings.force)
+    ResultDirectory(settings.out).check_free(settings.force)
     cameras, pictures = settings.ring.cameras(), settings.pictures
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)

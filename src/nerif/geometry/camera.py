@@ -183,8 +183,6 @@ class Camera:
         if not bool(self.distortion.any()):
             return distorted
         ideal = distorted
-        if not bool(self.distortion.any()):
-            return ideal
         for _ in range(20):
             value, jacobian = self._distort(ideal)
             residual = distorted - value

@@ -65,6 +65,11 @@ class Box:
         x, y, z = ((a + b) / 2 for a, b in zip(self.lower, self.upper, strict=True))
         return (x, y, z)
 
+    def holds(self, other: Box) -> bool:
+        """Whether another box lies within this one, to a nanometre."""
+        pairs = (*zip(self.lower, other.lower, strict=True), *zip(other.upper, self.upper, strict=True))
+        return all(a <= b + 1e-6 for a, b in pairs)
+
     def face_points(self, face: str, unit: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
         """Map points of the unit square onto a face such as ``"x-"``, mm."""
         axis, side = FACES.index(face) // 2, FACES.index(face) % 2

@@ -16,7 +16,7 @@ from nerif.drawing import (
     add_colour_bar,
     colour_range,
     draw_displacement,
-    draw_slice,
+    draw_slices,
     label_of,
     shown,
     style,
@@ -103,12 +103,8 @@ def slices(volume: Volume, width: float) -> Figure:
     ratios = [ex, ex, ey]
     tallest = max(ey, ez)
     figure = _page(width, max(0.2, 0.80 * tallest / sum(ratios)) + 0.06)
-    limits = colour_range(shown(volume))
     line = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
-    for axes, normal in zip(line, "zyx", strict=True):
-        draw_slice(axes, volume, normal, limits)
-        n = volume.grid.shape["zyx".index(normal)]
-        axes.set_title(f"{normal} = {float(volume.grid.axis(normal)[n // 2]):.1f} mm")
+    draw_slices(line, volume, colour_range(shown(volume)))
     add_colour_bar(line, label_of(volume.quantity))
     return figure
 
@@ -188,10 +184,7 @@ def comparison(excess: Volume, error: Volume, width: float) -> Figure:
     grid = figure.subplots(3, 3, gridspec_kw={"width_ratios": [ex, ex, ey]})
     rows = (("reconstruction", excess, limits), ("truth", truth, limits), ("error", error, (-reach, reach)))
     for (name, volume, scale), line in zip(rows, grid, strict=True):
-        for axes, normal in zip(line, "zyx", strict=True):
-            draw_slice(axes, volume, normal, scale, DIVERGING if name == "error" else None)
-            n = volume.grid.shape["zyx".index(normal)]
-            axes.set_title(f"{name}, {normal} = {float(volume.grid.axis(normal)[n // 2]):.1f} mm")
+        draw_slices(line, volume, scale, DIVERGING if name == "error" else None, name)
         add_colour_bar(list(line), "error of n [1]" if name == "error" else label_of("index_excess"))
     return figure
 
@@ -205,9 +198,7 @@ def error_of(result: Result) -> Volume | None:
         return None
     if excess.grid == truth.grid:
         return Volume(excess.values - truth.values, excess.grid)
-    inside = all(a >= b - 1e-6 for a, b in zip(excess.grid.box.lower, truth.grid.box.lower, strict=True))
-    inside &= all(a <= b + 1e-6 for a, b in zip(excess.grid.box.upper, truth.grid.box.upper, strict=True))
-    if not inside:
+    if not truth.grid.box.holds(excess.grid.box):
         return None
     field = VoxelField.through(truth.values, truth.grid)
     with torch.no_grad():

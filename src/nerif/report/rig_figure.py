@@ -46,8 +46,7 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
         away = (0.09, 0.2)[around[i] % 2] * reach  # names of neighbours are not in each other's way
         name_at = camera.centre.numpy() + away * outward
         axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center", parse_math=False)
-        everything.append(name_at[None])
-        everything.append(hits)
+        everything += [name_at[None], hits]
     if box is not None:
         _draw_box(axes, box)
     for axis, (name, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):

@@ -26,7 +26,6 @@ from nerif.metrics import correlation
 from nerif.physics.deflection import Deflection, project
 from nerif.physics.quantities import derive
 from nerif.reconstruction.base import OnStep, Step
-from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
@@ -58,9 +57,6 @@ def end_without(parent: int) -> OnStep:
 
 def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event = lambda told: None) -> None:
     """Reconstruct the frames first to last - 1 that the store lacks."""
-    if plan.threads:
-        torch.set_num_threads(plan.threads)
-    keep_freed_memory()
     sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
     watch = end_without(os.getppid())
     before: NeuralField | None = None

@@ -18,7 +18,6 @@ from torch import Tensor
 from nerif.fields.space_time import SpaceTimeField
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step, compose
-from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.files import CHECKPOINT, checkpoints, read_state
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.training_data import FrameData
@@ -35,9 +34,6 @@ TELL_EVERY = 50  # steps
 
 def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event = lambda told: None) -> None:
     """Reconstruct the frames first to last - 1 by one network, if the store lacks any of them."""
-    if plan.threads:
-        torch.set_num_threads(plan.threads)
-    keep_freed_memory()
     sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
     missing = [i for i in range(first, last) if store.status[i] == MISSING]
     if not missing:

@@ -82,10 +82,8 @@ def reconstruct_sequence(
                     say(f"dashboard: {client.dashboard_link}")
                 check_workers(client)
                 run_sequence(client, replace(plan, threads=threads or share), on_progress)
-    except KeyboardInterrupt:
+    finally:  # interrupted or not
         say(outcome_table(store))
-        raise
-    say(outcome_table(store))
     return store
 
 

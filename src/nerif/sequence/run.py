@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
+from nerif.reconstruction.device import keep_freed_memory
 from nerif.sequence.frames import ATTEMPTS, reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan
@@ -144,8 +146,8 @@ def _in_worker(plan: SequencePlan, first: int, last: int, topic: str) -> None:
     from distributed import get_worker
 
     worker = get_worker()
-    if not plan.threads:
-        plan = replace(plan, threads=max(1, CPU_COUNT // worker.state.nthreads))
+    torch.set_num_threads(plan.threads or max(1, CPU_COUNT // worker.state.nthreads))
+    keep_freed_memory()
     work = reconstruct_jointly if plan.settings.temporal == "joint" else reconstruct_frames
     work(plan, first, last, lambda told: worker.log_event(topic, told))
 
