@@ -336,7 +336,7 @@ def test_from_python_in_one_call(five, tmp_path):
     arguments = {"workers": 1, "threads": 1, "say": said.append}
     store = reconstruct_sequence(out, five, COLD, settings, on_progress=told.append, **arguments)
     assert (store.status == DONE).all()
-    assert store.quantities == ("index_excess", "density")
+    assert {*store.quantities} == {"index_excess", "density"}
     assert store.attributes["gas"]["wavelength_nm"] == MeasurementSequence.read(five).first_good().wavelength_nm
     assert said[0].endswith("r.zarr: 5 of 5 frames to do, in chunks of 3")
     assert said[-1].startswith("5 of 5 frames done")

@@ -13,15 +13,7 @@ from nerif.conventions import InputError
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import OnStep, Step, compose
 
-__all__ = [
-    "MONITOR",
-    "check_file",
-    "counting_bar",
-    "figures_bar",
-    "interruptible",
-    "progress_bar",
-    "say",
-]
+__all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say"]
 
 SAME_SIGNAL = 0.5  # seconds
 

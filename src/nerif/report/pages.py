@@ -115,12 +115,9 @@ def isosurface(volume: Volume, width: float) -> Figure:
     axes: Any = figure.add_axes((0.02, 0.04, 0.90, 0.88), projection="3d")
     level = default_level(volume)
     draw_isosurface(axes, volume, level)
-    figure.suptitle(f"{label_of(volume.quantity).partition(' [')[0]} = {level:.4g} {_unit(volume)}".rstrip(), y=0.97)
+    name, unit = label_of(volume.quantity).removesuffix("]").split(" [")
+    figure.suptitle(f"{name} = {level:.4g} {'' if unit == '1' else unit}".rstrip(), y=0.97)
     return figure
-
-
-def _unit(volume: Volume) -> str:
-    return "" if volume.unit == "1" else volume.unit.replace("m-3", "m$^{-3}$")
 
 
 def view(reprojection: Reprojection, i: int, width: float) -> Figure:
