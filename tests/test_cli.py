@@ -115,6 +115,18 @@ def test_evaluate(work, capsys):
     assert metrics["l2"] == pytest.approx(float(error / (truth.values.double() + n_ambient - 1).norm()), rel=1e-4)
 
 
+def test_a_run_that_found_no_field_says_so_in_its_report_and_exits_with_1(work, tmp_path, capsys):
+    words = ["reconstruct", str(work / "m.nc"), "-o", str(tmp_path / "r"), *QUICK, "--learning-rate", "1e4"]
+    assert main([*words, "--max-steps", "55", "--points-per-batch", "200"]) == 1
+    assert "collapsed: no field was found" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "r/metrics.json").read_text())
+    assert metrics["outcome"] == "collapsed"
+    assert "try a smaller --learning-rate" in metrics["message"]
+    assert "taken_back" in (tmp_path / "r/history.csv").read_text().splitlines()[0]
+    assert "The run found no field. no field was found" in (tmp_path / "r/report.html").read_text()
+    assert bool(torch.isfinite(read_volume(tmp_path / "r/volume.nc").values).all())
+
+
 @pytest.mark.slow
 def test_views_are_compared_by_the_model_of_the_reconstruction(work, tmp_path):
     """At the end of reconstruct and by evaluate: one model throughout, and not always the default."""

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.io
 import tomli_w
 import xarray as xr
 
@@ -198,16 +199,23 @@ def spoil_text(path: Path, rng: random.Random) -> str:
 
 
 def spoil_tree(tree: Any, rng: random.Random) -> str:
-    """Drop, replace, wrap or multiply one leaf or branch of nested lists and tables."""
+    """Drop, replace, wrap or multiply one leaf or branch of nested lists and tables, or one number of an array."""
     places: list[tuple[Any, Any]] = []
+    numbers: list[tuple[Any, Any]] = []
 
     def walk(node: Any) -> None:
         for key in list(node) if isinstance(node, dict) else range(len(node)):
             places.append((node, key))
             if isinstance(node[key], dict | list):
                 walk(node[key])
+            elif isinstance(node[key], np.ndarray) and node[key].size:
+                numbers.append((node[key].reshape(-1), rng.randrange(node[key].size)))
 
     walk(tree)
+    if numbers and rng.random() < 0.4:
+        array, at = rng.choice(numbers)
+        array[at] = rng.choice(EXTREME)
+        return f"number {at} of an array"
     node, key = rng.choice(places)
     what = rng.choice(("drop", "value", "value", "value", "times", "wrap", "rename"))
     if what == "drop":
@@ -298,8 +306,23 @@ def store(good: Path, path: Path, rng: random.Random) -> str:
     return ", ".join(done)
 
 
+def matlab(good: Path, path: Path, rng: random.Random) -> str:
+    shutil.copy(good, path)
+    if rng.random() < 0.3:
+        return spoil_bytes(path, rng)
+    content = scipy.io.loadmat(good, simplify_cells=True)
+    tree = {k: v for k, v in content.items() if not k.startswith("__")}
+    if rng.random() < 0.5:  # one of the three alone
+        tree = tree.pop(rng.choice(list(tree)))
+    what = spoil_tree(tree, rng)
+    with contextlib.suppress(Exception):  # what SciPy does not write is not made
+        scipy.io.savemat(path, tree)
+    return what
+
+
 MAKERS: dict[str, Callable[[Path, Path, random.Random], str]] = {
-    ".nc": netcdf, ".vti": text, ".toml": text, ".csv": text, ".json": text, ".yml": text, ".zarr": store,
+    ".nc": netcdf, ".vti": text, ".toml": text, ".csv": text, ".json": text, ".yml": text, ".mat": matlab,
+    ".zarr": store,
 }  # fmt: skip
 
 

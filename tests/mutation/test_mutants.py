@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import scipy.io
 import torch
 
 from mutation.mutators import make
@@ -18,7 +22,7 @@ from nerif.exports import export
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
-from nerif.geometry import Box, Grid, Ring
+from nerif.geometry import Box, Camera, Grid, Ring
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.importers import import_cameras
 from nerif.measurement import Measurement
@@ -41,8 +45,8 @@ BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))
 QUICK = 30
 """Mutants of each kind in `make test`."""
 MANY = {
-    "m.nc": 3600, "v.nc": 1600, "v.vti": 900, "c.toml": 1200, "c.csv": 400, "c.json": 500, "m.zarr": 1000,
-    "r.zarr": 800,
+    "m.nc": 3400, "v.nc": 1400, "v.vti": 800, "c.toml": 1000, "c.csv": 400, "c.json": 400, "c.yml": 400, "c.mat": 400,
+    "m.zarr": 1000, "r.zarr": 800,
 }  # fmt: skip
 """Mutants of each kind in `make test-all`: ten thousand."""
 BLOCK = 200
@@ -87,7 +91,7 @@ def of_result(path: Path) -> torch.Tensor:
 
 OUTCOMES: dict[str, Callable[[Path], torch.Tensor]] = {
     "m.nc": of_measurement, "v.nc": of_volume, "v.vti": of_volume, "c.toml": of_calibration, "c.csv": of_calibration,
-    "c.json": of_calibration, "m.zarr": of_film, "r.zarr": of_result,
+    "c.json": of_calibration, "c.yml": of_calibration, "c.mat": of_calibration, "m.zarr": of_film, "r.zarr": of_result,
 }  # fmt: skip
 RIG = Ring(views=3, arc=(0.0, 120.0), image_size=(8, 10), pixel_pitch=0.12).cameras()
 
@@ -136,10 +140,44 @@ def calibrations(folder: Path) -> None:
         frames.append({"file_path": c.name, "transform_matrix": matrix.tolist()})
     lines = [",".join(rows[0]), *(",".join(map(str, row.values())) for row in rows)]
     (folder / "c.csv").write_text("\n".join(lines) + "\n")
-    import json
-
     about = {"w": 10, "h": 8, "fl_x": 400.0, "fl_y": 400.0, "cx": 5.0, "cy": 4.0, "k1": 0.01, "frames": frames}
     (folder / "c.json").write_text(json.dumps(about, indent=1))
+    storage = cv2.FileStorage(str(folder / "c.yml"), cv2.FILE_STORAGE_WRITE)
+    for key, value in (("image_width", 10), ("image_height", 8), ("camera_model", "pinhole")):
+        storage.write(key, value)
+    for i, c in enumerate(RIG, 1):
+        numbered = {"K": c.intrinsics, "D": c.distortion, "R": c.rotation, "T": c.translation}
+        for key, matrix in numbered.items():
+            storage.write(f"{key}{i}", matrix.numpy())
+    storage.release()
+    of_matlab = {"toolbox": to_struct(RIG[0]), "bouguet": bouguet(RIG[1]), "plain": plain(RIG[2])}
+    scipy.io.savemat(folder / "c.mat", of_matlab)
+
+
+def to_struct(camera: Camera) -> dict[str, Any]:
+    """Fields of MATLAB's cameraParameters."""
+    k, r, t = camera.intrinsics.clone(), camera.rotation.numpy(), camera.translation.numpy()
+    k[:2, 2] += 1
+    return {
+        "K": k.numpy(), "RadialDistortion": np.array([-0.1, 0.05]), "TangentialDistortion": np.array([0.001, -0.002]),
+        "ImageSize": np.array([8.0, 10.0]), "RotationVectors": np.stack([cv2.Rodrigues(r)[0].ravel()] * 2),
+        "TranslationVectors": np.stack([t, t]), "WorldUnits": "millimeters", "EstimateSkew": True,
+    }  # fmt: skip
+
+
+def bouguet(camera: Camera) -> dict[str, Any]:
+    """Variables of Bouguet's toolbox."""
+    k = camera.intrinsics.numpy()
+    return {
+        "fc": k[[0, 1], [0, 1]][:, None], "cc": k[:2, 2:], "alpha_c": np.zeros((1, 1)), "kc": np.zeros((5, 1)),
+        "nx": 10.0, "ny": 8.0, "Rc_1": camera.rotation.numpy(), "Tc_1": camera.translation.numpy()[:, None],
+    }  # fmt: skip
+
+
+def plain(camera: Camera) -> dict[str, Any]:
+    """K, R, t."""
+    k, r, t = camera.intrinsics.numpy(), camera.rotation.numpy(), camera.translation.numpy()
+    return {"K": k, "R": r, "t": t, "distortion": np.zeros(5), "image_size": np.array([8.0, 10.0])}
 
 
 def outcome(good: Path, kind: str, number: int, folder: Path) -> tuple[Path, str, str]:

@@ -168,16 +168,12 @@ def test_loss_that_stays_non_finite_ends_with_the_last_good_state(measurement, m
     assert bool(torch.isfinite(result.field(torch.rand(30, 3))).all())
 
 
-@pytest.mark.parametrize("rate", [pytest.param(0.5, marks=pytest.mark.slow), 1e4])
-def test_an_absurd_rate_is_lowered_or_the_run_says_that_it_found_nothing(measurement, rate):
-    result = replace(SMALL, learning_rate=rate, max_steps=80)(measurement)
+@pytest.mark.slow
+def test_a_rate_far_too_high_is_lowered_until_it_serves(measurement):
+    result = replace(SMALL, learning_rate=0.5, max_steps=80)(measurement)
     assert any("taken_back" in record for record in result.history)
-    assert result.outcome.failed == (rate == 1e4)
-    if rate == 1e4:
-        assert result.outcome.reason == "collapsed"
-        assert "--learning-rate" in result.outcome.message
-    else:
-        assert result.history[-1]["loss"] < 0.5
+    assert not result.outcome.failed
+    assert result.history[-1]["loss"] < 0.5
 
 
 def test_a_field_that_is_lost_is_taken_back(measurement, monkeypatch):

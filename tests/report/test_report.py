@@ -228,6 +228,7 @@ def view(held_out: bool, cc: float, noise: float | None) -> dict:
         ({"views": [view(False, 0.99, 1.0), view(True, 0.99, 1.0)], "cc": 0.5, "l2_variation": 0.9}, "bad", "90.0%"),
         ({"views": [view(False, 0.99, 1.0)], "ensemble": {"members": 3, "diverged": [2]}}, "warning", "Members 2"),
         ({"outcome": "diverged", "message": "loss is NaN"}, "bad", "loss is NaN"),
+        ({"outcome": "collapsed", "message": "nothing there"}, "bad", "found no field. nothing there"),
         ({"outcome": "interrupted"}, "warning", "--resume"),
         ({"outcome": "time_limit", "views": [view(False, 0.99, 1.0), view(True, 0.98, 1.1)]}, "note", "time limit"),
     ],

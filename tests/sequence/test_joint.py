@@ -131,6 +131,15 @@ def begun(film: Path, out: Path, steps: int, **changes: object) -> SequencePlan:
     return plan
 
 
+def test_a_joint_network_that_found_nothing_fails_every_frame_in_words(short, tmp_path):
+    plan = begun(short, tmp_path / "r.zarr", 15, learning_rate=1e4, points_per_batch=100)
+    reconstruct_jointly(plan, 0, 5, lambda told: None)
+    store = SequenceStore(plan.out)
+    assert store.status.tolist() == [FAILED] * 5
+    assert all(reason.startswith("no field was found") for reason in store.reasons)
+    assert not store.checkpoints.exists()
+
+
 def test_a_film_is_reconstructed_by_one_network(short, tmp_path):
     blank(short, 3)
     plan = begun(short, tmp_path / "r.zarr", 30)

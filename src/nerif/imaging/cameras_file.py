@@ -123,6 +123,23 @@ def numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
     return array
 
 
+def flat(value: Any, what: str, group: int = 1) -> np.ndarray:
+    """Return the numbers of an array of any shape one after the other, float64.
+
+    Raises
+    ------
+    InputError
+        If they are none, or not a multiple of `group`.
+    """
+    try:
+        found = np.asarray(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        raise InputError(f"{what}: expected numbers, got {value!r}") from None
+    if found.size % group:
+        raise InputError(f"{what}: expected {group} numbers each, got {found.size} in all")
+    return found
+
+
 def image_size(value: Any, what: str) -> tuple[int, int]:
     """Return (height, width), px; InputError if they are not two positive whole numbers."""
     size = numbers(value, (2,), what)
@@ -163,10 +180,7 @@ def check_model(model: Any, where: str) -> None:
 
 def five(values: Any, where: str) -> Tensor:
     """Return OpenCV's five coefficients of 4 to 14; InputError if those beyond are not 0, or one is no number."""
-    try:
-        given = np.asarray(values, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
-        given = np.array([np.nan])
+    given = flat(values, where)
     if not np.isfinite(given).all():
         raise InputError(f"{where}: expected finite numbers as distortion coefficients, got {values!r}")
     if np.any(given[5:] != 0):

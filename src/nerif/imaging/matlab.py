@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from nerif.conventions import InputError
-from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, image_size, numbers, upright
+from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, flat, image_size, numbers, upright
 
 __all__ = ["read_matlab"]
 
@@ -117,9 +117,11 @@ def _toolbox(
     k = upright(np.asarray(given).tolist(), f"{where}: intrinsics").clone()
     k[:2, 2] -= 1
     rotation, translation = known or _pose(content, where, pose)
-    radial = np.ravel(content.get("RadialDistortion", []))
-    k1, k2, k3 = (float(v) for v in np.concatenate([radial, np.zeros(3)])[:3])
-    p1, p2 = (float(v) for v in np.concatenate([np.ravel(content.get("TangentialDistortion", [])), np.zeros(2)])[:2])
+    radial, tangential = (
+        flat(content.get(f"{kind}Distortion", []), f"{where}: {kind}Distortion") for kind in ("Radial", "Tangential")
+    )
+    k1, k2, k3 = np.concatenate([radial, np.zeros(3)])[:3]
+    p1, p2 = np.concatenate([tangential, np.zeros(2)])[:2]
     return CalibratedCamera(
         name=name,
         intrinsics=k,
@@ -134,13 +136,14 @@ def _pose(content: dict[str, Any], where: str, pose: int) -> tuple[np.ndarray, n
     """Rotation and translation, world to camera, of one target picture."""
     import cv2
 
-    translations = np.asarray(content.get("TranslationVectors", []), dtype=np.float64).reshape(-1, 3)
+    def each(key: str, count: int) -> np.ndarray:
+        return flat(content.get(key, []), f"{where}: {key}", count)
+
+    translations = each("TranslationVectors", 3).reshape(-1, 3)
     if "RotationVectors" in content:
-        vectors = np.asarray(content["RotationVectors"], dtype=np.float64).reshape(-1, 3)
-        rotations = [cv2.Rodrigues(v)[0] for v in vectors]
+        rotations = [cv2.Rodrigues(v)[0] for v in each("RotationVectors", 3).reshape(-1, 3)]
     else:
-        matrices = np.asarray(content.get("RotationMatrices", np.zeros((3, 3, 0))), dtype=np.float64)
-        rotations = list(matrices.reshape(3, 3, -1).transpose(2, 1, 0))
+        rotations = list(each("RotationMatrices", 9).reshape(3, 3, -1).transpose(2, 1, 0))
     if not 1 <= pose <= min(len(rotations), len(translations)):
         raise InputError(
             f"{where}: expected the pose of picture {pose} in RotationVectors and TranslationVectors, got "
@@ -152,6 +155,8 @@ def _pose(content: dict[str, Any], where: str, pose: int) -> tuple[np.ndarray, n
 def _stereo(content: dict[str, Any], where: str, pose: int) -> list[CalibratedCamera]:
     """stereoParameters as a struct; without target pictures the first camera is the world."""
     first, second = content["CameraParameters1"], content["CameraParameters2"]
+    if not (isinstance(first, dict) and isinstance(second, dict)):
+        raise InputError(f"{where}: expected CameraParameters1 and CameraParameters2 as structs; {EXPORT}")
     if np.size(first.get("RotationVectors", [])):
         return [_toolbox(own, f"cam{i}", f"{where}: camera {i}", pose) for i, own in ((1, first), (2, second))]
     if "RotationOfCamera2" not in content or "TranslationOfCamera2" not in content:
@@ -174,21 +179,22 @@ def _size(content: dict[str, Any], key: str, where: str) -> tuple[int, int] | No
 def _bouguet(content: dict[str, Any], path: Path, pose: int) -> CalibratedCamera:
     """fc, cc, alpha_c, kc, and the pose of one picture."""
     rotation, translation = content.get(f"Rc_{pose}"), content.get(f"Tc_{pose}")
-    if rotation is None or translation is None or not np.all(np.isfinite(rotation)):
+    if rotation is None or translation is None or not np.isfinite(flat(rotation, f"{path}: Rc_{pose}")).all():
         there = sorted(k for k in content if k.startswith("Rc_"))
         raise InputError(
             f"{path}: expected the pose of picture {pose} (Rc_{pose}, Tc_{pose}), got {', '.join(there) or 'no pose'}; "
             "give the number of another --pose, or save the extrinsic parameters in one world frame"
         )
     fc, cc = (numbers(np.ravel(content[k]).tolist(), (2,), f"{path}: {k}") for k in ("fc", "cc"))
-    skew = float(np.ravel(content.get("alpha_c", 0.0))[0]) * float(fc[0])
+    size = image_size([content["ny"], content["nx"]], f"{path}: ny, nx") if {"nx", "ny"} <= set(content) else None
+    skew = float(numbers(np.ravel(content.get("alpha_c", 0.0)).tolist(), (1,), f"{path}: alpha_c") * fc[0])
     return CalibratedCamera(
         name=path.stem,
         intrinsics=torch.tensor([[fc[0], skew, cc[0]], [0, fc[1], cc[1]], [0, 0, 1]], dtype=torch.float64),
         rotation=numbers(np.asarray(rotation).tolist(), (3, 3), f"{path}: Rc_{pose}"),
         translation=numbers(np.ravel(translation).tolist(), (3,), f"{path}: Tc_{pose}"),
         distortion=five(content.get("kc", []), f"{path}: kc"),
-        image_size=(int(content["ny"]), int(content["nx"])) if "nx" in content and "ny" in content else None,
+        image_size=size,
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, numbers, upright
+from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, flat, image_size, numbers, upright
 
 __all__ = ["ENDINGS", "read_opencv", "read_opencv_folder"]
 
@@ -53,7 +53,10 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
     for key in keys:
         node = storage.getNode(key)
         number = node.real() if node.isReal() or node.isInt() else None
-        values[key] = node.mat() if node.isMap() else node.string() if node.isString() else number
+        try:
+            values[key] = node.mat() if node.isMap() else node.string() if node.isString() else number
+        except cv2.error as error:
+            raise InputError(f"{path}: {key}: expected a matrix as FileStorage writes it ({error.err})") from None
     storage.release()
     for key in MODELS:
         if values.get(key) is not None:
@@ -71,7 +74,7 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
             f"{path}: no camera matrix; expected {', '.join(WORDS['intrinsics'])} (with a number behind each for "
             f"several cameras), got {', '.join(keys)}"
         )
-    size = _opencv_size(values)
+    size = _size(values, str(path))
     stereo = suffixes == ["1", "2"] and find("rotation", "2") is None
     cameras = []
     for suffix in suffixes:
@@ -86,14 +89,14 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
                 f"{where}: no pose; expected {', '.join(WORDS['rotation'])} and {', '.join(WORDS['translation'])} "
                 f"beside the camera matrix, got {', '.join(keys)}"
             )
-        rotation = np.asarray(rotation, dtype=np.float64)
+        rotation = np.asarray(rotation)
         if rotation.size == 3:
-            rotation = cv2.Rodrigues(rotation.reshape(3))[0]
+            rotation = cv2.Rodrigues(flat(rotation, f"{where}: rotation"))[0]
         distortion = find("distortion", suffix)
         cameras.append(
             CalibratedCamera(
                 name=f"cam{suffix}" if suffix else path.stem,
-                intrinsics=upright(find("intrinsics", suffix).tolist(), f"{where}: camera matrix"),
+                intrinsics=upright(np.asarray(find("intrinsics", suffix)).tolist(), f"{where}: camera matrix"),
                 rotation=numbers(rotation.tolist(), (3, 3), f"{where}: rotation"),
                 translation=numbers(np.ravel(translation).tolist(), (3,), f"{where}: translation"),
                 distortion=five([] if distortion is None else distortion, f"{where}: distortion"),
@@ -103,8 +106,8 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
     return cameras
 
 
-def _opencv_size(values: dict[str, Any]) -> tuple[int, int] | None:
+def _size(values: dict[str, Any], where: str) -> tuple[int, int] | None:
     for width, height in (("image_width", "image_height"), ("Image_Width", "Image_Height"), ("width", "height")):
         if values.get(width) and values.get(height):
-            return int(values[height]), int(values[width])
+            return image_size([values[height], values[width]], f"{where}: {height}, {width}")
     return None
