@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 
 from nerif import __version__
@@ -68,20 +67,8 @@ def main(arguments: list[str] | None = None) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     except OSError as error:
-        if isinstance(error, BrokenPipeError) and _nobody_reads():
-            return 141
         return _refuse(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0
-
-
-def _nobody_reads() -> bool:
-    """Whether what is printed has no reader left, as in nerif info FILE | head -2; then the rest goes nowhere."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
 
 
 def _refuse(message: str) -> int:

@@ -126,7 +126,6 @@ def reconstruct_into(
     with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
         callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
         result = reconstructor(training, compose(*callbacks), state, start if state is None else None)
-    monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
     begin(None)
     _write(out, measurement, result, run, settings, voxels, monitor)
     try:
@@ -181,6 +180,7 @@ def _write(
     """Write what came out: the field first, it is the costliest; what only looks at it comes last."""
     out.write_field(result)
     out.write_history(result.history)
+    monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
     volumes = all_quantities(result, run.gas, voxels)
     out.write_volumes(volumes)
     for line in masked_lines(volumes):

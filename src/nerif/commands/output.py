@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -19,8 +20,12 @@ SAME_SIGNAL = 0.5  # seconds
 
 
 def say(text: str) -> None:
-    """Print a line for the user."""
-    print(text, flush=True)
+    """Print a line for the user; where nobody reads any more, as in nerif info FILE | head -2, end in silence."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
+        raise SystemExit(141) from None
 
 
 def check_file(path: Path, force: bool, *others: Path) -> None:
