@@ -15,7 +15,6 @@ Needs nerif[sequence].
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import tempfile
 from dataclasses import replace
@@ -34,7 +33,7 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
-from nerif.sequence.plan import SequencePlan, warm
+from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.store import DONE, Frame, SequenceStore
 from nerif.simulation import Simulation
 from nerif.volume_sequence import VolumeSequence
@@ -63,18 +62,12 @@ def run(
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
     steps, rate, joint = (changes.get(k, 0) for k in ("warm_steps", "warm_rate", "joint_steps"))
     octaves = int(changes.get("time_octaves", 3))
-    plan = SequencePlan(
-        film,
-        out,
-        cold,
-        warm(cold, int(steps), rate) if steps else cold,
-        voxels,
-        joint_steps=int(joint),
-        time_octaves=octaves,
-    )
-    about = {"chunk": len(sequence), "hold_out": [], "settings": dataclasses.asdict(cold)}
-    about |= {"temporal": "joint", "time_octaves": octaves} if joint else {}
-    store = SequenceStore.begin(out, sequence, truth.grid, plan.quantities, cold.network, about)
+    settings = SequenceSettings(
+        chunk=len(sequence), temporal="joint" if joint else "frames", joint_steps=int(joint) or 1, time_octaves=octaves,
+        warm_steps=int(steps) or 1, warm_rate=rate, voxels=voxels, quantities=("index_excess",),
+    )  # fmt: skip
+    plan = SequencePlan(film, out, cold, settings)
+    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
     last = range(len(sequence) - compared, len(sequence))
     if joint:
         reconstruct_jointly(plan, 0, len(sequence))
@@ -99,9 +92,9 @@ def run(
 def first_frame(film: Path, out: Path, cold: NeRIF, voxels: int) -> SequenceStore:
     """The frame that the warm starts begin with: from nothing."""
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
-    plan = SequencePlan(film, out, cold, cold, voxels)
-    about = {"chunk": len(sequence), "hold_out": [], "settings": dataclasses.asdict(cold)}
-    store = SequenceStore.begin(out, sequence, truth.grid, plan.quantities, cold.network, about)
+    settings = SequenceSettings(chunk=len(sequence), voxels=voxels, quantities=("index_excess",))
+    plan = SequencePlan(film, out, cold, settings)
+    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
     reconstruct_frames(plan, 0, 1)
     return store
 

@@ -16,7 +16,8 @@ from nerif.geometry import Grid
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.result import ResultDirectory
 from nerif.simulation import Simulation, simulate
-from nerif.volume import Volume, write_netcdf
+from nerif.volume import Volume
+from nerif.volume_file import write_netcdf
 
 N_AMBIENT = 1.00027
 

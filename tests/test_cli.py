@@ -23,7 +23,7 @@ from nerif.measurement import Measurement
 from nerif.physics.deflection import MODELS
 from nerif.prediction import reproject
 from nerif.reconstruction.files import read_field
-from nerif.volume import read_volume
+from nerif.volume_file import read_volume
 
 TINY = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]
 QUICK = [
@@ -186,6 +186,15 @@ def test_export(work, tmp_path, ending):
         assert volume.grid.box.upper == pytest.approx((9, 8, 7))
         density = volume.values.numpy()
     assert 0.05 < density.min() < density.max() < 1.6
+
+
+def test_a_reader_that_has_seen_enough_ends_a_command_in_silence(work):
+    read, write = os.pipe()
+    os.close(read)  # nobody reads
+    command = [sys.executable, "-m", "nerif", "info", str(work / "m.nc")]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 def test_info_of_each_kind(work, capsys):

@@ -17,7 +17,8 @@ from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction.base import Step
-from nerif.volume import Volume, read_volumes, write_netcdf
+from nerif.volume import Volume
+from nerif.volume_file import read_volumes, write_netcdf
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "3", "--steps", "30", "--truth-voxels", "12"]
 QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]

@@ -16,7 +16,7 @@ from nerif.cli import main
 from nerif.imaging.cameras_file import read_cameras
 from nerif.measurement import Measurement
 from nerif.simulation import view_displacement
-from nerif.volume import read_volume
+from nerif.volume_file import read_volume
 
 BOX = ["--lower", "-25", "-25", "-25", "--upper", "25", "25", "25"]
 VIEWS = 4

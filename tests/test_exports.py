@@ -12,7 +12,8 @@ import xarray as xr
 from nerif.exports import FORMATS, export
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings, derive
-from nerif.volume import Volume, read_volumes
+from nerif.volume import Volume
+from nerif.volume_file import read_volumes
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
 

@@ -12,12 +12,12 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions", "netcdf"),
+    ("atomic", "conventions", "netcdf", "toml"),
     ("geometry",),
     ("drawing",),
     ("notebook",),
     ("measurement_file", "measurement", "measurement_sequence"),
-    ("volume", "volume_sequence", "vti", "exports", "reprojection"),
+    ("volume", "volume_file", "volume_sequence", "vti", "exports", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),

@@ -1,217 +1,58 @@
-"""The resolution of blurred octahedra, of which it is known, and its figures."""
+"""The modulation transfer function of edges of which it is known, and its figure."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.ndimage import gaussian_filter
 
-from nerif.conventions import InputError
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
-from nerif.fields.phantoms import Octahedron
-from nerif.geometry import Box, Grid
 from nerif.report.resolution_figure import draw_mtf
-from nerif.resolution import Resolution, measure_resolution
-from study.octahedron_figures import draw_distribution, draw_edge_spread
+from nerif.resolution import COARSEST, MTF
 
-PHANTOM = Octahedron(Box((-9.0, -12.0, -14.0), (11.0, 13.0, 16.0)))  # off the origin; one unit is 5 mm
-
-
-def expected(sigma: float) -> float:
-    """exp(-2 (pi f sigma)^2) = 0.1."""
-    return math.sqrt(2 * math.log(10)) / (2 * math.pi * sigma)
+STEP, HALF = 0.01, 1.2
 
 
-class Blurred(Field):
-    """The octahedron, of which the steps at the faces are error functions of the distance to them.
-
-    `sigma` gives the blur (mm) at points from the centre (mm).
-    """
-
-    def __init__(self, sigma: Callable[[torch.Tensor], torch.Tensor], strength: float = 1.0) -> None:
-        self.sigma, self.strength = sigma, strength
-
-    def value_and_gradient(self, points):
-        p = points - points.new_tensor(PHANTOM.box.centre)
-        sigma = self.sigma(p)
-        distance = (p.abs().sum(-1) - 1.5 * PHANTOM.unit) / math.sqrt(3)
-        tail = 0.5 * torch.erfc(distance / (math.sqrt(2) * sigma))
-        bell = sigma / math.sqrt(2 * math.pi) * torch.exp(-0.5 * (distance / sigma) ** 2)
-        slope = self.strength * PHANTOM.amplitude / PHANTOM.unit
-        return slope * math.sqrt(3) * (bell - distance * tail), -slope * p.sign() * tail[..., None]
+def edge(sigma: float, strength: float = 1.0) -> torch.Tensor:
+    """A step from -strength to 0, blurred by a Gaussian."""
+    t = (torch.arange(-round(HALF / STEP), round(HALF / STEP), dtype=torch.float64) + 0.5) * STEP
+    return -0.5 * strength * torch.erfc(t / (math.sqrt(2) * sigma))
 
 
-def even(sigma: float) -> Blurred:
-    return Blurred(lambda p: torch.full_like(p[..., 0], sigma * PHANTOM.unit))
+@pytest.mark.parametrize(
+    ("of_length", "error"), [(0.03, 1e-3), (1 / 5, 1e-3), (1 / 3, 8e-3), (1 / 2, 0.14)], ids=lambda v: f"{v:.3g}"
+)
+def test_gaussian_edges_within_the_errors_that_the_module_states(of_length, error):
+    sigma = of_length * HALF
+    mtf = MTF.of(edge(sigma), STEP)
+    assert float(mtf.resolution) == pytest.approx(math.sqrt(2 * math.log(10)) / (2 * math.pi * sigma), rel=error)
+    assert float(mtf.transfer[0]) == pytest.approx(1)
+    assert float(mtf.frequency[-1]) == pytest.approx(0.5 / STEP)
 
 
-class Nothing(Field):
-    def value_and_gradient(self, points):
-        return torch.zeros_like(points[..., 0]), torch.zeros_like(points)
+def test_many_edges_at_once_faint_ones_and_a_sharp_one():
+    edges = torch.stack([edge(0.1), edge(0.2), edge(0.1, 0.5), edge(0.1, 0.05), torch.zeros(240).double(), edge(1e-6)])
+    found = MTF.of(edges, STEP).resolution
+    assert found[0].item() == pytest.approx(2 * found[1].item(), rel=1e-3)
+    assert found[2].item() == pytest.approx(found[0].item())  # a weak edge is as sharp as a strong one
+    assert found[3:5].tolist() == [0, 0]  # no edge
+    assert math.isnan(found[5])  # finer than the samples
 
 
-def measure(field: Field, **settings) -> Resolution:
-    return measure_resolution(field, PHANTOM, **({"patches": 3, "points": 2} | settings))
+def test_nothing_is_coarser_than_the_window_alone():
+    ramp = torch.linspace(-1, 0, 240, dtype=torch.float64)
+    assert float(MTF.of(ramp, STEP).resolution) == pytest.approx(COARSEST / HALF, rel=0.02)
 
 
-@pytest.fixture(scope="module")
-def uneven() -> Resolution:
-    """Twice as sharp above the centre as below, where it grows with x."""
-    return measure(Blurred(lambda p: 0.2 * torch.where(p[..., 2] > 0, 1.0, 2.0 + p[..., 0] / 10)))
-
-
-@pytest.mark.parametrize(("sigma", "error"), [(0.005, 1e-3), (0.02, 1e-3), (0.06, 1e-3), (0.08, 2e-3), (0.13, 0.01)])
-def test_a_gaussian_edge(sigma, error):
-    """The errors that the module states."""
-    found = measure(even(sigma))
-    assert found.lp_per_unit == pytest.approx(expected(sigma), rel=error)
-    assert found.lp_per_mm == pytest.approx(found.lp_per_unit / 5)
-    torch.testing.assert_close(
-        found.local_lp_per_unit, torch.full((72,), found.lp_per_unit).double(), rtol=1e-3, atol=0
-    )
-    below = 2 * found.lp_per_mm
-    gauss = torch.exp(-2 * (math.pi * found.frequency * sigma * PHANTOM.unit) ** 2)
-    torch.testing.assert_close(
-        found.mtf[found.frequency < below], gauss[found.frequency < below], rtol=0, atol=2e-3 if sigma < 0.1 else 0.05
-    )
-
-
-@pytest.mark.parametrize(("sigma", "error"), [(0.05, 0.01), (0.1, 0.025)])
-def test_the_whole_phantom_blurred_in_three_dimensions(sigma, error):
-    """The other steps of the gradient, at the planes of the edges, hardly count."""
-    box = Box.cube(20.0)
-    grid = Grid(box, (110, 110, 110))
-    phantom = Octahedron(box)
-    sharp = phantom(grid.points(torch.float64).reshape(-1, 3)).reshape(grid.shape)
-    field = VoxelField.through(torch.from_numpy(gaussian_filter(sharp.numpy(), sigma * 27.5)), grid)
-    found = measure_resolution(field, phantom, patches=2, points=2, samples=128)
-    assert found.lp_per_unit == pytest.approx(expected(sigma), rel=error)
-    assert float((found.local_lp_per_unit / expected(sigma) - 1).abs().max()) < error
-
-
-def test_the_phantom_itself_is_finer_than_the_samples():
-    found = measure(PHANTOM)
-    assert math.isnan(found.lp_per_mm)
-    assert found.local_lp_per_mm.isnan().all()
-    assert float(found.frequency[-1]) * found.unit == pytest.approx(128)  # half of 256 samples a unit
-    assert float(found.mtf.min()) > 0.99
-    inside = found.distance < 0
-    torch.testing.assert_close(found.edge_spread[inside], -torch.ones(int(inside.sum())).double(), atol=1e-6, rtol=0)
-    torch.testing.assert_close(
-        found.edge_spread[~inside], torch.zeros(int((~inside).sum())).double(), atol=1e-6, rtol=0
-    )
-
-
-def test_no_edge_is_no_resolution():
-    for field in (Nothing(), Blurred(lambda p: torch.full_like(p[..., 0], 0.3), strength=0.05)):
-        found = measure(field)
-        assert found.lp_per_mm == 0
-        assert (found.local_lp_per_mm == 0).all()
-        assert found.mtf.isnan().all()
-
-
-def test_a_weak_edge_is_as_sharp_as_a_strong_one():
-    weak = measure(Blurred(lambda p: torch.full_like(p[..., 0], 0.3), strength=0.5))
-    assert weak.lp_per_mm == pytest.approx(expected(0.3), rel=1e-3)
-    assert float(weak.mtf[0]) == pytest.approx(1)
-
-
-def test_wide_blur_comes_near_what_the_window_alone_has():
-    assert measure(even(2.0)).lp_per_unit == pytest.approx(1.5, rel=0.05)
-    assert measure(even(2.0)).coarsest == pytest.approx(1.5)
-
-
-def test_blur_that_depends_on_the_place(uneven):
-    p = uneven.positions - torch.tensor(PHANTOM.box.centre)
-    above = p[:, 2] > 0
-    assert int(above.sum()) == 36
-    torch.testing.assert_close(
-        uneven.local_lp_per_mm[above], torch.full((36,), expected(0.2)).double(), rtol=1e-3, atol=0
-    )
-    blur = 0.2 * (2 + p[~above, 0] / 10)
-    assert float(blur.max() / blur.min()) > 1.45
-    there = torch.sqrt(torch.tensor(2 * math.log(10))) / (2 * math.pi * blur)
-    torch.testing.assert_close(uneven.local_lp_per_mm[~above], there, rtol=0.02, atol=0)
-    assert expected(0.4 * 1.6) < uneven.lp_per_mm < expected(0.2)
-
-
-def test_noise_is_averaged_out():
-    """White noise of 20 % of the step on every sample."""
-
-    class Noisy(Field):
-        def __init__(self) -> None:
-            self.field, self.generator = even(0.06), torch.Generator().manual_seed(2)
-
-        def value_and_gradient(self, points):
-            value, gradient = self.field.value_and_gradient(points)
-            noise = torch.randn(points.shape, generator=self.generator, dtype=points.dtype)
-            return value, gradient + 0.2 * math.sqrt(3) * PHANTOM.amplitude / PHANTOM.unit * noise
-
-    found = measure(Noisy(), patches=4, points=4)
-    assert found.lp_per_unit == pytest.approx(expected(0.06), rel=0.05)
-    assert float(found.local_lp_per_unit.nanmedian()) == pytest.approx(expected(0.06), rel=0.15)
-
-
-def test_patches_lie_on_the_faces(uneven):
-    p = uneven.positions - torch.tensor(PHANTOM.box.centre)
-    torch.testing.assert_close(p.abs().sum(-1), torch.full((72,), 1.5 * PHANTOM.unit).double())
-    torch.testing.assert_close(uneven.normals, p.sign() / math.sqrt(3))
-    assert len(torch.unique(p, dim=0)) == 72
-    area = torch.linalg.cross(
-        uneven.patches[:, 1] - uneven.patches[:, 0], uneven.patches[:, 2] - uneven.patches[:, 0]
-    ).norm(dim=-1)
-    torch.testing.assert_close(area, area[:1].expand(72))
-    # along the whole profile, all signs stay and the box is not left
-    for side in (-1, 1):
-        ends = uneven.patches + side * uneven.half_length * uneven.normals[:, None]
-        local = ends - torch.tensor(PHANTOM.box.centre)
-        assert float((local * uneven.normals.sign()[:, None]).min()) > 0.049 * PHANTOM.unit
-        assert float(local.abs().max()) < 2 * PHANTOM.unit
-
-
-def test_wrong_settings():
-    with pytest.raises(InputError, match=r"half_length: expected 0 to 0\.78 units, got 0\.8"):
-        measure(PHANTOM, half_length=0.8)
-    with pytest.raises(InputError, match="at least 4 samples"):
-        measure(PHANTOM, samples=2)
-    with pytest.raises(InputError, match="at least 1"):
-        measure(PHANTOM, patches=0)
-
-
-@pytest.mark.parametrize("field", [None, PHANTOM, Nothing()], ids=["uneven", "sharp", "nothing"])
-def test_figures(field, uneven):
-    resolution = measure(field) if field else uneven
-    figure = Figure(figsize=(9, 3), layout="constrained")
-    edge, mtf, distribution = figure.subplots(1, 3)
-    assert draw_edge_spread(edge, resolution, "NeRIF") is edge
-    assert draw_mtf(mtf, resolution, "NeRIF") is mtf
-    assert draw_mtf(mtf, uneven, "other", colour="black") is mtf
-    assert draw_distribution(distribution, resolution) is distribution
+def test_figure():
+    figure = Figure()
+    axes = figure.subplots()
+    for label, spread in (("NeRIF", edge(0.1)), ("sharp", edge(1e-6)), ("nothing", torch.zeros(240).double())):
+        assert draw_mtf(axes, MTF.of(spread, STEP), label) is axes
     FigureCanvasAgg(figure).draw()
-    units = ["[mm]", "[1]", "[lp/unit]", "[1]", "[mm]", "[mm]"]
-    labels = [label for axes in (edge, mtf, distribution) for label in (axes.get_xlabel(), axes.get_ylabel())]
-    assert [label[label.index("[") :] for label in labels] == units
-    assert "lp/unit" in figure.axes[3].get_ylabel()
-    said = [text.get_text() for text in mtf.get_legend().get_texts()]
-    assert len(said) == 3
-    if field is None:
-        assert f"NeRIF: {uneven.lp_per_unit:.2f} lp/unit" in said
-
-
-def test_unfolded_patches_lie_within_their_faces(uneven):
-    axes = Figure().subplots()
-    draw_distribution(axes, uneven, limits=(2.0, 9.0))
-    outlines, patches = axes.collections
-    assert len(outlines.get_paths()) == 8
-    assert len(patches.get_paths()) == 72
-    assert patches.get_clim() == (2.0, 9.0)
-    for i, path in enumerate(patches.get_paths()):
-        inside = [outline.contains_points(path.vertices[:3]).all() for outline in outlines.get_paths()]
-        assert sum(inside) == 1
-        assert inside[i // 9]  # in the order of the faces
+    said = [text.get_text() for text in axes.get_legend().get_texts()]
+    resolution = float(MTF.of(edge(0.1), STEP).resolution)
+    assert said == [f"NeRIF: {resolution:.2f} lp/mm", "10%", "sharp: > 50 lp/mm", "nothing: no edge"]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("spatial frequency [lp/mm]", "MTF [1]")

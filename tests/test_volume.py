@@ -12,7 +12,8 @@ import xarray as xr
 from nerif.conventions import InputError
 from nerif.exports import export
 from nerif.geometry import Box, Grid
-from nerif.volume import Volume, read_volume, write_netcdf
+from nerif.volume import Volume
+from nerif.volume_file import read_volume, write_netcdf
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
 VALUES = torch.arange(60, dtype=torch.float32).reshape(5, 3, 4) * 1e-6

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Camera
-from nerif.resolution import Resolution
+from nerif.resolution import MTF
+from study.resolution import Resolution
 
 __all__ = ["from_plain", "pixels_per_unit", "to_plain"]
 
@@ -21,14 +22,13 @@ def to_plain(resolution: Resolution) -> dict[str, Any]:
         "lp_per_mm": resolution.lp_per_mm,
         "lp_per_unit": resolution.lp_per_unit,
         "coarsest_lp_per_unit": resolution.coarsest,
-        "finest_lp_per_unit": float(resolution.frequency[-1]) * resolution.unit,
+        "finest_lp_per_unit": float(resolution.mtf_per_unit.frequency[-1]),
         "unit_mm": resolution.unit,
         "half_length_mm": resolution.half_length,
         "distance_mm": resolution.distance.tolist(),
         "edge_spread": resolution.edge_spread.tolist(),
-        "line_spread_per_mm": resolution.line_spread.tolist(),
-        "frequency_lp_per_mm": resolution.frequency.tolist(),
-        "mtf": resolution.mtf.tolist(),
+        "frequency_lp_per_mm": resolution.mtf.frequency.tolist(),
+        "mtf": resolution.mtf.transfer.tolist(),
         "patches_mm": resolution.patches.tolist(),
         "local_lp_per_mm": resolution.local_lp_per_mm.tolist(),
     }
@@ -43,16 +43,12 @@ def from_plain(plain: dict[str, Any]) -> Resolution:
             values = [math.nan if v is None else v for v in values]
         return torch.tensor(values, dtype=torch.float64)
 
-    overall = plain["lp_per_mm"]
     return Resolution(
-        lp_per_mm=math.nan if overall is None else overall,
         unit=plain["unit_mm"],
         half_length=plain["half_length_mm"],
         distance=numbers("distance_mm"),
         edge_spread=numbers("edge_spread"),
-        line_spread=numbers("line_spread_per_mm"),
-        frequency=numbers("frequency_lp_per_mm"),
-        mtf=numbers("mtf"),
+        mtf=MTF(numbers("frequency_lp_per_mm"), numbers("mtf")),
         patches=numbers("patches_mm"),
         local_lp_per_mm=numbers("local_lp_per_mm"),
     )

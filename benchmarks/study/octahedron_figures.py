@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.drawing import COLOURS, colour_range
-from nerif.resolution import SIZE, Resolution
+from study.resolution import SIZE, Resolution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

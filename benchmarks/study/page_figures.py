@@ -193,7 +193,7 @@ def _resolution(results: Results, section: str) -> Iterator[FigureSpec]:
         for label, resolution in found.items():
             colour = look(label)["color"]
             draw_edge_spread(left, resolution, label, colour)
-            draw_mtf(right, resolution, label, colour)
+            draw_mtf(right, resolution.mtf_per_unit, label, colour, "unit")
 
     def distribution(figure: Figure) -> None:
         draw_distribution(figure.subplots(), found["NeRIF"])

@@ -27,12 +27,12 @@ from nerif.physics.deflection import Deflection, project
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
-from nerif.resolution import measure_resolution
 from nerif.simulation import add_noise, simulate
 from nerif.volume import Volume
 from study.cases import BOX, N_AMBIENT, NOISE_SEED, Case
 from study.octahedron import pixels_per_unit, to_plain
 from study.records import read_record, write_record
+from study.resolution import measure_resolution
 from study.results import Record
 
 __all__ = ["OnProgress", "run_case", "run_cases"]

@@ -34,7 +34,8 @@ VERBS = {
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
-    0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted.
+    0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted, 141 nobody reads
+    what it prints any more.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
     if not words or words[0] in ("-h", "--help"):

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 __all__ = [
+    "AMBIENT_INDEX",
     "COMPONENTS",
     "DEFAULT_AMBIENT_FACES",
     "FACES",
@@ -36,6 +37,9 @@ FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
 """Where the index is taken as ambient when nothing else is said: the side faces (the gauge)."""
+
+AMBIENT_INDEX = 1.00027
+"""Of air at 20 °C and one atmosphere, where nothing else is said."""
 
 LARGEST_INDEX = 4.0
 """Of gases, liquids and glasses."""

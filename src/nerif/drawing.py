@@ -27,6 +27,7 @@ __all__ = [
     "colour_range",
     "draw_displacement",
     "draw_slice",
+    "draw_slices",
     "label_of",
     "shown",
     "style",
@@ -126,6 +127,16 @@ def draw_slice(
     axes.set_xlabel(f"{across} [mm]")
     axes.set_ylabel(f"{up} [mm]")
     return axes
+
+
+def draw_slices(
+    line: Sequence[Axes], volume: Drawable, limits: tuple[float, float], colour_map: str | None = None, name: str = ""
+) -> None:
+    """Draw the middle slices across z, y and x side by side, each under where it lies (mm) and a name, if given."""
+    for axes, normal in zip(line, "zyx", strict=True):
+        draw_slice(axes, volume, normal, limits, colour_map)
+        along = volume.grid.axis(normal)
+        axes.set_title(f"{name}{', ' if name else ''}{normal} = {float(along[len(along) // 2]):.1f} mm")
 
 
 def colour_range(values: np.ndarray) -> tuple[float, float]:

@@ -21,7 +21,8 @@ from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
 from nerif.prediction import reproject
 from nerif.reprojection import Reprojection
 from nerif.result import VOLUME, ResultDirectory
-from nerif.volume import Volume, read_volume
+from nerif.volume import Volume
+from nerif.volume_file import read_volume
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 SIDE_BY_SIDE = 4  # views that are scored at a time: each of a megapixel takes some 0.1 GiB

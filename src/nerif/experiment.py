@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Box, Camera, Grid
@@ -23,7 +22,9 @@ from nerif.imaging.bundle import Pose
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.targets import CalibrationTarget
 from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
-from nerif.volume import Volume, write_netcdf
+from nerif.toml import write_toml
+from nerif.volume import Volume
+from nerif.volume_file import write_netcdf
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "target_poses", "world_axes"]
 
@@ -108,16 +109,13 @@ class Experiment:
 
     def _write_settings(self, path: Path, cameras: Sequence[Camera]) -> None:
         """Settings of nerif calibrate by which the rig's own world comes out."""
-        import tomli_w
-
         settings = {
             "world": "0",
             "axes": world_axes(cameras),
             "background_scale": background_scale(cameras),
             "target": asdict(self.target_for(cameras)),
         }
-        with atomic(path) as part:
-            part.write_text(tomli_w.dumps(settings))
+        write_toml(path, settings)
 
     def write_targets(
         self, folder: Path, cameras: Sequence[Camera], on_picture: Callable[[], None] = lambda: None

@@ -12,7 +12,8 @@ import torch
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
-from nerif.volume import Volume, write_netcdf
+from nerif.volume import Volume
+from nerif.volume_file import write_netcdf
 from nerif.vti import write_vti
 
 __all__ = ["FORMATS", "export", "write_csv", "write_mat", "write_npz"]

@@ -218,6 +218,22 @@ class Measurement:
             flow_mask=pick(self.flow_mask),
         )
 
+    def without(self, held_out: Sequence[str]) -> Measurement:
+        """Return the measurement that is left to reconstruct from when some views are held out.
+
+        Raises
+        ------
+        InputError
+            If there is no view of that name, or none is left.
+        """
+        for name in held_out:
+            if name not in self.names:
+                raise InputError(f"hold_out: expected views out of {', '.join(self.names)}, got '{name}'")
+        kept = [name for name in self.names if name not in held_out]
+        if not kept:
+            raise InputError("hold_out: every view is held out, so none is left to reconstruct from")
+        return self.select(kept)
+
     def summary(self, held_out: int = 0) -> list[tuple[str, str]]:
         """Return what was measured as names and values with units; `held_out` of the views were not used."""
         from nerif.notebook import number

@@ -20,9 +20,11 @@ from nerif.measurement_file import CONVENTIONS, MAPS, VARIABLES
 from nerif.netcdf import reading, values
 
 if TYPE_CHECKING:
+    import numpy as np
     import xarray as xr
+    import zarr
 
-__all__ = ["MeasurementSequence", "require_zarr"]
+__all__ = ["MeasurementSequence", "add_frames", "require_zarr"]
 
 WRITTEN = "written"
 """Variable (time,) that is 1 where a frame is complete; stores of other programs may lack it."""
@@ -34,6 +36,23 @@ def require_zarr() -> None:
         import zarr  # noqa: F401
     except ImportError:
         raise InputError("sequences: zarr is not installed; pip install 'nerif[sequence]'") from None
+
+
+def add_frames(
+    group: zarr.Group,
+    name: str,
+    frames: int,
+    sizes: tuple[int, ...],
+    dimensions: tuple[str, ...],
+    kind: str | np.dtype,
+    fill: float | str = float("nan"),
+    **about: Any,
+) -> None:
+    """Add an array with a leading dimension time and a chunk for each frame."""
+    group.create_array(
+        name, shape=(frames, *sizes), chunks=(1, *sizes), dtype=kind, fill_value=fill,
+        dimension_names=["time", *dimensions], attributes=about,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -150,14 +169,9 @@ class MeasurementSequence:
                 if name in dataset:
                     v = dataset[name]
                     fill = np.nan if v.dtype.kind == "f" else 0
-                    group.create_array(
-                        name, shape=(len(times), *v.shape), chunks=(1, *v.shape), dtype=v.dtype, fill_value=fill,
-                        dimension_names=["time", *map(str, v.dims)], attributes=dict(v.attrs),
-                    )  # fmt: skip
-            group.create_array(
-                WRITTEN, shape=(len(times),), chunks=(1,), dtype="int8", fill_value=0, dimension_names=["time"],
-                attributes={"long_name": "written last: the frame is complete"},
-            )  # fmt: skip
+                    add_frames(group, name, len(times), v.shape, tuple(map(str, v.dims)), v.dtype, fill, **v.attrs)
+            meaning = "written last: the frame is complete"
+            add_frames(group, WRITTEN, len(times), (), (), "int8", 0, long_name=meaning)
         return cls(path, tuple(float(t) for t in times))
 
     def write_frame(self, index: int, measurement: Measurement) -> None:

@@ -16,7 +16,7 @@ from nerif.drawing import (
     add_colour_bar,
     colour_range,
     draw_displacement,
-    draw_slice,
+    draw_slices,
     label_of,
     shown,
     style,
@@ -25,7 +25,7 @@ from nerif.drawing import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["number", "panel", "percent", "png", "show_slices", "show_views", "span"]
+__all__ = ["number", "panel", "percent", "picture", "show_slices", "show_views", "span"]
 
 VIEWS = 9  # that are drawn: of more, as many, evenly spread
 PIXELS = 120  # along an edge of a view, beyond which nothing more is seen
@@ -67,32 +67,30 @@ def panel(title: str, rows: Sequence[tuple[str, str]], picture: str, describes: 
     return f"<div><p><b>{escape(title)}</b></p>{image}<table><tbody>{cells}</tbody></table></div>"
 
 
-def png(draw: Callable[[Figure], object], width: float, height: float) -> str:
-    """Return a figure of that size (inches) as a PNG in a data address."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def picture(
+    draw: Callable[[Figure], object], width: float, height: float, size: float = 8.0, form: str = "png"
+) -> str:
+    """Return a figure of that size (inches), with text of `size` points, as a PNG or SVG in a data address."""
     from matplotlib.figure import Figure
 
-    with style(size=8):
+    with style(size):
         figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(figure)
         draw(figure)
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=110)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+        about = {"Date": None, "Creator": None} if form == "svg" else None  # the same page from the same result
+        figure.savefig(buffer, format=form, dpi=110, metadata=about)
+    return f"data:image/{'svg+xml' if form == 'svg' else form};base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def show_slices(volume: Drawable) -> str:
     """Return the three middle slices of a volume as a PNG in a data address."""
 
     def draw(figure: Figure) -> None:
-        limits = colour_range(shown(volume))
         line = list(figure.subplots(1, 3))
-        for axes, normal in zip(line, "zyx", strict=True):
-            draw_slice(axes, volume, normal, limits)
-            axes.set_title(f"{normal} = {volume.grid.box.centre['xyz'.index(normal)]:.3g} mm")
+        draw_slices(line, volume, colour_range(shown(volume)))
         add_colour_bar(line, label_of(volume.quantity))
 
-    return png(draw, 8.5, 2.8)
+    return picture(draw, 8.5, 2.8)
 
 
 def show_views(names: Sequence[str], maps: Sequence[Float[np.ndarray, "row column 2"]]) -> str:
@@ -110,4 +108,4 @@ def show_views(names: Sequence[str], maps: Sequence[Float[np.ndarray, "row colum
             grid[0, column].set_title(names[view], parse_math=False)
         add_colour_bar(list(grid.ravel()), "displacement [px]")
 
-    return png(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 2.8)
+    return picture(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 2.8)

@@ -7,7 +7,6 @@ is the mean of the texture at X. Without a field the same rays run straight: the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -227,7 +226,7 @@ def _movement(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float
     """How far (mm) on the plane refraction moves the point that each ray meets."""
     rays = rays.clip(box)
     moved = torch.zeros_like(rays.origin)
-    for part in _parts(rays):
+    for part in torch.split(rays.crosses.nonzero()[:, 0], 1 << 14):
         chosen = rays[part]
         position, heading = trace(field, chosen.to(dtype=torch.float32), steps, n_ambient)
         # in single precision the straight ray is off by 1e-4 mm: move only by what the field bends
@@ -242,10 +241,6 @@ def _movement(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float
 def _hit(position: Tensor, heading: Tensor, plane: Plane) -> Tensor:
     reach = (plane.offset - position @ plane.normal) / (heading @ plane.normal)
     return position + reach[:, None] * heading
-
-
-def _parts(rays: Rays) -> Iterator[Tensor]:
-    yield from torch.split(rays.crosses.nonzero()[:, 0], 1 << 14)
 
 
 def _between(movement: Float[Tensor, "row column 3"], dv: float, du: float) -> Float[Tensor, "row column 3"]:

@@ -1,224 +1,81 @@
-"""Spatial resolution by the octahedron phantom: edge spread, line spread, modulation transfer (paper, App. D).
+"""Modulation transfer function of an edge, and the resolution that follows from it (paper, App. D).
 
-The gradient of the phantom has a step at its eight faces. With N the outward normal of a face, t the distance from it
-along N and g the true step sqrt(3) amplitude / unit,
-
-    ESF(t) = N . grad n(t) / g,     LSF = d ESF / dt,     MTF(f) = |DFT(w LSF)|(f) / |DFT(w LSF)|(0)
+    LSF = d ESF / dt,     MTF(f) = |DFT(w LSF)|(f) / |DFT(w LSF)|(0)
 
 The resolution is the frequency at which the MTF first falls below 10 %. Of a Gaussian blur sigma, that is
 sqrt(2 ln 10) / (2 pi sigma).
 
-How the profiles are taken, and what error that makes:
+How it is computed, and what error that makes, for an edge spread over -L <= t <= L:
 
-- All have one half length L, so that places can be compared. They stand on the part of a face where they end a margin
-  (0.05 units) before the planes x, y, z = 0, beyond which the gradient steps again: |x|, |y|, |z| >= L / sqrt(3) +
-  margin. From there their outer end always lies within the box. L = 0.4 units leaves 44 % of every edge, 19 % of a
-  face.
 - The Tukey window w is 1 over |t| <= L / 2 and falls as a cosine to 0 at L: it leaves a narrow line spread as it is,
   and takes out what noise and slow slopes there are at the ends. Of an edge blurred by sigma, it changes the resolution
-  by less than 0.1 % up to sigma = L / 5 and 0.8 % up to L / 3; it makes it 13 % too fine at L / 2. Where the whole
-  phantom is blurred, the steps beyond the ends come in as well: 2 % at L / 4, 5 % (single patches 8 %) at L / 3. The
-  window alone has 0.6 / L (`coarsest`, 1.5 lp/unit): a field found near that is worse than that.
-- Zero-padding only draws the same transform more finely: 16 frequencies per lp/unit, interpolated linearly.
+  by less than 0.1 % up to sigma = L / 5 and 0.8 % up to L / 3; it makes it 13 % too fine at L / 2. The window alone has
+  0.6 / L (`COARSEST`): a field found near that is worse than that.
+- Zero-padding only draws the same transform more finely, and is interpolated linearly.
 - A difference over one sample h multiplies the MTF by sinc(f h), which is divided out.
-- Profiles are averaged before they are differentiated, since the derivative of a single one shows mostly noise. Where
-  the edge lies at different depths within an average, that counts as blur. Noise that is left lifts the MTF, and makes
-  the resolution seem finer as a rule; the scatter of neighbouring patches shows how much of it there is.
+- Profiles are to be averaged before: the derivative of a single one shows mostly noise. Where the edge lies at
+  different depths within an average, that counts as blur. Noise that is left lifts the MTF, and makes the resolution
+  seem finer as a rule.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import product
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
-from nerif.fields.base import Field, in_chunks
-from nerif.fields.phantoms import Octahedron
+__all__ = ["COARSEST", "MTF", "THRESHOLD"]
 
-__all__ = ["SIZE", "THRESHOLD", "Resolution", "measure_resolution"]
-
-SIZE = 1.5  # units from the centre of the octahedron to its corners
-MARGIN = 0.05  # units
 THRESHOLD = 0.1  # of the MTF
 FAINTEST = 0.1  # of the true step: less is no edge
-PADDING = 16  # frequencies per lp/unit
-COARSEST = 0.60  # of the window alone, line pairs in one half length
+PADDING = 20  # times as many zeros as samples
+COARSEST = 0.60  # of the window alone, line pairs in the half length L
 
 
 @dataclass(frozen=True)
-class Resolution:
-    """Spatial resolution of a reconstructed octahedron, over all faces and place by place.
-
-    A resolution of NaN is finer than the samples of a profile can tell: the MTF stays above 10 % up to their Nyquist
-    frequency. A resolution of 0 is no edge: the field has less than a tenth of the true step there.
+class MTF:
+    """Modulation transfer function of an edge, or of many.
 
     Parameters
     ----------
-    lp_per_mm : of the profile averaged over all faces, line pairs per mm
-    unit : mm
-    half_length : L of the profiles, mm
-    distance : (t,) from the face, outward, mm
-    edge_spread : (t,) ESF averaged over all faces, 1; the truth is -1 inside and 0 outside
-    line_spread : (t - 1,) LSF between those distances, before the window, 1/mm
-    frequency : (f,) up to the Nyquist frequency of the samples, lp/mm
-    mtf : (f,) 1
-    patches : (k, 3, 3) corners of the triangles of the faces, mm
-    local_lp_per_mm : (k,) of the profiles averaged over each triangle, lp/mm
+    frequency : (f,) up to the Nyquist frequency of the samples, line pairs (lp) per unit of length
+    transfer : (*batch, f) 1; NaN where there is no edge
     """
 
-    lp_per_mm: float
-    unit: float
-    half_length: float
-    distance: Float[Tensor, " t"]
-    edge_spread: Float[Tensor, " t"]
-    line_spread: Float[Tensor, " t-1"]
     frequency: Float[Tensor, " f"]
-    mtf: Float[Tensor, " f"]
-    patches: Float[Tensor, "k 3 3"]
-    local_lp_per_mm: Float[Tensor, " k"]
+    transfer: Float[Tensor, "*batch f"]
+
+    @classmethod
+    def of(cls, edge_spread: Float[Tensor, "*batch t"], step: float) -> MTF:
+        """Transform edge spread functions, sampled every `step` around the edge: the truth is a step from -1 to 0."""
+        line = edge_spread.diff(dim=-1)
+        line = line * _window(line.shape[-1])
+        padded = PADDING * edge_spread.shape[-1]
+        frequency = torch.arange(padded // 2 + 1, dtype=torch.float64) / (padded * step)
+        found = line.sum(-1, keepdim=True)
+        found = torch.where(found >= FAINTEST, found, math.nan)
+        return cls(frequency, torch.fft.rfft(line, padded).abs() / found / torch.sinc(frequency * step))
 
     @property
-    def lp_per_unit(self) -> float:
-        """Line pairs per unit of the paper, a quarter of the shortest edge of the box."""
-        return self.lp_per_mm * self.unit
+    def resolution(self) -> Float[Tensor, "*batch"]:
+        """Where the MTF first falls below 10 %, lp per unit of length.
 
-    @property
-    def local_lp_per_unit(self) -> Float[Tensor, " k"]:
-        """Line pairs per unit at every patch."""
-        return self.local_lp_per_mm * self.unit
-
-    @property
-    def coarsest(self) -> float:
-        """What the window alone has, lp/unit; nothing coarser can be found."""
-        return COARSEST / self.half_length * self.unit
-
-    @property
-    def positions(self) -> Float[Tensor, "k 3"]:
-        """Middles of the patches, mm."""
-        return self.patches.mean(dim=1)
-
-    @property
-    def normals(self) -> Float[Tensor, "k 3"]:
-        """Outward normals of the patches."""
-        return (self.positions - self.patches.mean(dim=(0, 1))).sign() / math.sqrt(3)
-
-
-@torch.no_grad()
-def measure_resolution(
-    field: Field,
-    phantom: Octahedron,
-    half_length: float = 0.4,
-    patches: int = 4,
-    points: int = 4,
-    samples: int = 256,
-    device: torch.device | str = "cpu",
-) -> Resolution:
-    """Measure the spatial resolution of a reconstruction of the octahedron.
-
-    Parameters
-    ----------
-    field : the reconstruction
-    phantom : what was to be reconstructed
-    half_length : L, units
-    patches : every face is split into patches^2 triangles of equal size
-    points : every such triangle has points^2 profiles, evenly spread
-    samples : per unit, along a profile; their Nyquist frequency is samples / 2 lp/unit
-    device : where the field is
-
-    Raises
-    ------
-    InputError
-        If no place of a face has room for a profile of that length, or a count is not positive.
-    """
-    longest = math.sqrt(3) * (SIZE / 3 - MARGIN)
-    if not 0 < half_length < longest:
-        raise InputError(
-            f"half_length: expected 0 to {longest:.2f} units, got {half_length}; it must fit the octahedron"
-        )
-    if min(patches, points) < 1 or samples * half_length < 4:
-        raise InputError(
-            "expected patches and points of at least 1 and at least 4 samples in half_length, "
-            f"got {patches}, {points} and {samples * half_length:g}"
-        )
-    unit = phantom.unit
-    triangles = _split(_inner_faces(phantom, half_length), patches)
-    places = _split(triangles, points).mean(dim=1)
-    normals = (places - places.new_tensor(phantom.box.centre)).sign() / math.sqrt(3)
-    count = round(samples * half_length)
-    # half a sample off the face, so that rounding does not decide on which side of the step one lies
-    distance = (torch.arange(-count, count, dtype=torch.float64) + 0.5) * (unit / samples)
-
-    true_step = math.sqrt(3) * phantom.amplitude / unit
-    spread = torch.empty(len(places), len(distance), dtype=torch.float64)
-    for rows in in_chunks(torch.arange(len(places)), max(1, (1 << 13) // len(distance))):
-        line = places[rows, None] + distance[:, None] * normals[rows, None]
-        gradient = field.gradient(line.reshape(-1, 3).to(device, torch.float32)).cpu().double()
-        spread[rows] = (gradient.reshape(line.shape) * normals[rows, None]).sum(-1) / true_step
-    local = spread.reshape(len(triangles), -1, len(distance)).mean(dim=1)
-    overall = local.mean(dim=0)
-
-    step = unit / samples
-    frequency, mtf = _transfer(overall, step, PADDING * samples)
-    return Resolution(
-        lp_per_mm=float(_cutoff(frequency, mtf)),
-        unit=unit,
-        half_length=half_length * unit,
-        distance=distance,
-        edge_spread=overall,
-        line_spread=overall.diff() / step,
-        frequency=frequency,
-        mtf=mtf,
-        patches=triangles,
-        local_lp_per_mm=_cutoff(*_transfer(local, step, PADDING * samples)),
-    )
-
-
-def _inner_faces(phantom: Octahedron, half_length: float) -> Float[Tensor, "8 3 3"]:
-    """Corners (mm) of what remains of each face where profiles of that half length (units) have room."""
-    least = half_length / math.sqrt(3) + MARGIN
-    corners = torch.full((3, 3), least, dtype=torch.float64)
-    corners.fill_diagonal_(SIZE - 2 * least)
-    signs = torch.tensor(list(product((1.0, -1.0), repeat=3)), dtype=torch.float64)
-    return signs[:, None] * corners * phantom.unit + corners.new_tensor(phantom.box.centre)
-
-
-def _split(triangles: Float[Tensor, "k 3 3"], n: int) -> Float[Tensor, "m 3 3"]:
-    """Split every triangle into n^2 equal ones, which follow each other."""
-    whole = [(i, j) for i in range(n) for j in range(n - i)]
-    upright = [[(i, j), (i + 1, j), (i, j + 1)] for i, j in whole]
-    turned = [[(i + 1, j + 1), (i, j + 1), (i + 1, j)] for i, j in whole if i + j < n - 1]
-    along = torch.tensor(upright + turned, dtype=triangles.dtype) / n
-    weights = torch.cat([1 - along.sum(-1, keepdim=True), along], dim=-1)  # of the three corners
-    return torch.einsum("pcb,kbx->kpcx", weights, triangles).reshape(-1, 3, 3)
+        NaN is finer than the samples can tell: the MTF stays above 10 % up to their Nyquist frequency. 0 is no edge,
+        less than a tenth of the true step.
+        """
+        frequency, transfer = self.frequency, self.transfer
+        first = ((transfer < THRESHOLD).cumsum(-1) == 0).sum(-1, keepdim=True)
+        i = first.clamp(1, len(frequency) - 1)
+        before, after = transfer.gather(-1, i - 1), transfer.gather(-1, i)
+        found = frequency[i - 1] + (before - THRESHOLD) / (before - after) * (frequency[1] - frequency[0])
+        found = torch.where(first < len(frequency), found, math.nan)
+        return torch.where(transfer[..., :1].isnan(), 0.0, found).squeeze(-1)
 
 
 def _window(n: int) -> Float[Tensor, " n"]:
     """Tukey's window at n places over (-L, L): 1 in the inner half, a cosine to 0 in the outer."""
     place = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2).abs() / ((n + 1) / 2)
     return 0.5 * (1 + torch.cos(math.pi * (2 * place - 1).clamp(min=0)))
-
-
-def _transfer(
-    edge_spread: Float[Tensor, "*batch t"], step: float, padded: int
-) -> tuple[Float[Tensor, " f"], Float[Tensor, "*batch f"]]:
-    """Frequencies (lp/mm) and MTF of edge spread functions sampled every `step` mm; NaN where there is no edge."""
-    line = edge_spread.diff(dim=-1) * _window(edge_spread.shape[-1] - 1)
-    frequency = torch.arange(padded // 2 + 1, dtype=torch.float64) / (padded * step)
-    found = line.sum(-1, keepdim=True)
-    found = torch.where(found >= FAINTEST, found, math.nan)
-    return frequency, torch.fft.rfft(line, padded).abs() / found / torch.sinc(frequency * step)
-
-
-def _cutoff(frequency: Float[Tensor, " f"], mtf: Float[Tensor, "*batch f"]) -> Float[Tensor, "*batch"]:
-    """Where the MTF first falls below the threshold, lp/mm; NaN where it does not, 0 where there is no edge."""
-    first = ((mtf < THRESHOLD).cumsum(-1) == 0).sum(-1, keepdim=True)
-    i = first.clamp(1, len(frequency) - 1)
-    before, after = mtf.gather(-1, i - 1), mtf.gather(-1, i)
-    found = frequency[i - 1] + (before - THRESHOLD) / (before - after) * (frequency[1] - frequency[0])
-    found = torch.where(first < len(frequency), found, math.nan)
-    return torch.where(mtf[..., :1].isnan(), 0.0, found).squeeze(-1)

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import shutil
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -24,7 +23,9 @@ from nerif.measurement import Measurement
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_state, write_field, write_state
 from nerif.reprojection import Reprojection
-from nerif.volume import Volume, read_volume, read_volumes
+from nerif.toml import read_toml, write_toml
+from nerif.volume import Volume
+from nerif.volume_file import read_volume, read_volumes
 
 __all__ = [
     "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions", "write_json",
@@ -145,21 +146,14 @@ class ResultDirectory:
 
     def write_settings(self, settings: Mapping[str, Any], about: Mapping[str, Any] | None = None) -> None:
         """Write run.toml: settings under the names of the flags, and what came out in the table [about]."""
-        import tomli_w
-
         table = {**settings, "about": {"nerif": __version__, **(about or {})}}
-        with atomic(self.path / RUN) as part:
-            part.write_text(RUN_HEAD + tomli_w.dumps(_without_none(table)))
+        write_toml(self.path / RUN, _without_none(table), RUN_HEAD)
 
     def write_field(self, result: Reconstruction) -> None:
         """Write the field and, where there is one, the checkpoint to go on from."""
         write_field(self.path, result)
         if result.state is not None:
-            self.write_state(result.state)
-
-    def write_state(self, state: State) -> None:
-        """Write the checkpoint."""
-        write_state(self.path, state)
+            write_state(self.path, result.state)
 
     def write_history(self, history: Sequence[Mapping[str, float]]) -> None:
         """Write history.csv, a line a record, blank where a record lacks a column."""
@@ -203,11 +197,7 @@ class ResultDirectory:
 
     def settings(self) -> dict[str, Any]:
         """Return run.toml as it is, with [about]; nothing where there is none."""
-        path = self.path / RUN
-        try:
-            return tomllib.loads(path.read_text()) if path.is_file() else {}
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: not a TOML file ({error})") from None
+        return read_toml(self.path / RUN) if self.has(RUN) else {}
 
     def metrics(self) -> dict[str, Any]:
         """Return metrics.json, refused as a whole where a part is not what nerif writes."""

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError
+from nerif.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
@@ -18,12 +18,11 @@ from nerif.geometry import Box, Camera, Grid
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.ray_tracing import background_points
-from nerif.volume import Volume, read_volume
+from nerif.volume import Volume
+from nerif.volume_file import read_volume
 from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["AMBIENT", "Simulation", "add_noise", "simulate", "view_displacement"]
-
-AMBIENT = 1.00027  # air at 20 °C
+__all__ = ["Simulation", "add_noise", "simulate", "view_displacement"]
 
 MOVING = ("flame", "2", "3", "4", "5", "6", "7")
 STEPS = 120  # Runge-Kutta steps through the box: 2e-4 of the rms displacement on the flame (tests/test_simulation.py)
@@ -146,25 +145,19 @@ class Simulation:
             raise InputError(f"truth_voxels: expected at least 1, got {self.truth_voxels}")
 
     def __call__(
-        self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None
+        self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None, frame: int = 0
     ) -> tuple[Measurement, Volume]:
-        """Return what the cameras would measure, and the truth as index excess.
+        """Return what the cameras would measure, and the truth as index excess; each frame has noise of its own.
 
         Raises
         ------
         InputError
             If there is no such phantom, or a volume file is none.
         """
-        return self._with_noise(self.seed, cameras, on_view)
-
-    def _with_noise(
-        self, seed: int, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None
-    ) -> tuple[Measurement, Volume]:
-        """The same phantom, with the noise of another seed."""
         field, box, n_ambient = self._field()
         measurement = simulate(
-            field, cameras, box, n_ambient, self.noise, seed, self.steps, self.wavelength_nm, self.ambient_faces,
-            on_view,
+            field, cameras, box, n_ambient, self.noise, self.seed + frame, self.steps, self.wavelength_nm,
+            self.ambient_faces, on_view,
         )  # fmt: skip
         grid = Grid.of_resolution(box, self.truth_voxels)
         return measurement, Volume(field.sample(grid), grid, attributes={"n_ambient": n_ambient})
@@ -188,7 +181,7 @@ class Simulation:
         if self.phantom not in MOVING:
             raise InputError(f"times: expected a phantom that moves (flame, 2-7), got '{self.phantom}'")
         for i, time in enumerate(times):
-            measurement, volume = replace(self, time=time)._with_noise(self.seed + i, cameras)
+            measurement, volume = replace(self, time=time)(cameras, frame=i)
             if i == 0:
                 sequence = MeasurementSequence.create(out, times, measurement, force)
                 store = VolumeSequence.create(truth, times, volume.grid, ("index_excess",), measurement.n_ambient)
@@ -201,13 +194,12 @@ class Simulation:
         """The field of index excess, its box, and the ambient it is counted from."""
         path = Path(self.phantom)
         if path.suffix not in (".nc", ".vti"):
-            x, y, z = (e / 2 for e in self.box)
-            box = Box((-x, -y, -z), (x, y, z))
-            n_ambient = AMBIENT if self.n_ambient is None else self.n_ambient
+            box = Box.around_origin(self.box)
+            n_ambient = AMBIENT_INDEX if self.n_ambient is None else self.n_ambient
             return make_phantom(self.phantom, box, self.seed, self.time), box, n_ambient
         volume = read_volume(path)
         try:
-            n_ambient = next(n for n in (self.n_ambient, volume.n_ambient, AMBIENT) if n is not None)
+            n_ambient = next(n for n in (self.n_ambient, volume.n_ambient, AMBIENT_INDEX) if n is not None)
             excess = volume.relative_to(n_ambient)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None

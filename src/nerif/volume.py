@@ -1,26 +1,16 @@
-"""A Volume: values at voxel centres, and the files it is written to and read from (.nc, .vti)."""
+"""A Volume: values at voxel centres."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.atomic import atomic
-from nerif.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError, ambient_index
-from nerif.geometry import Box, Grid
-from nerif.netcdf import opened, values
+from nerif.conventions import InputError, ambient_index
+from nerif.geometry import Grid
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-__all__ = ["QUANTITIES", "Volume", "describe", "read_volume", "read_volumes", "write_netcdf"]
+__all__ = ["QUANTITIES", "STATISTICS", "Volume", "describe"]
 
 QUANTITIES = {
     "index_excess": ("1", "refractive index minus that of the ambient"),
@@ -32,9 +22,6 @@ QUANTITIES = {
 
 STATISTICS = {"mean": "mean", "std": "standard_deviation"}
 """Endings of what an ensemble adds to a quantity (density_std), and CF's names for them."""
-
-TITLE = "Field of refractive index (background-oriented schlieren)"
-REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
 
 
 def describe(quantity: str) -> tuple[str, str]:
@@ -122,164 +109,3 @@ class Volume:
 
         title = describe(self.quantity)[1].capitalize()
         return panel(title, self.summary(), show_slices(self), f"{title} in the three middle slices")
-
-
-def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write volumes on one grid to a NetCDF-4 file by the CF conventions, coordinates in mm, atomically."""
-    from datetime import UTC, datetime
-
-    import xarray as xr
-
-    from nerif import __version__
-
-    grid = volumes[0].grid
-    coordinates = {
-        a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper(), "long_name": f"{a} of the voxel centre"})
-        for a in "zyx"
-    }
-    data: dict[str, tuple] = {}
-    attributes: dict[str, float | str] = {}
-    for v in volumes:
-        if v.grid != grid:
-            raise InputError(f"volume '{v.quantity}': expected the grid of '{volumes[0].quantity}', got another")
-        about = {"units": v.unit, "long_name": describe(v.quantity)[1], **_cf(v.quantity, volumes), **v.notes}
-        data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), about)
-        attributes |= v.attributes
-    dataset = xr.Dataset(data, coords=coordinates)
-    written = f"{datetime.now(UTC).isoformat(timespec='seconds')} written by nerif {__version__}"
-    dataset.attrs = {"Conventions": "CF-1.11", "title": TITLE, "source": f"nerif {__version__}", "history": written}
-    dataset.attrs |= {"references": REFERENCES, **attributes}
-    # the box cannot be told from one voxel centre alone
-    dataset.attrs["box_lower_mm"], dataset.attrs["box_upper_mm"] = list(grid.box.lower), list(grid.box.upper)
-    with atomic(path) as part:
-        dataset.to_netcdf(part, engine="h5netcdf", encoding={k: {"zlib": True, "complevel": 4} for k in data})
-
-
-def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
-    """How CF says that one variable is the spread of another."""
-    base, _, statistic = quantity.rpartition("_")
-    if statistic in STATISTICS and base in QUANTITIES:
-        return {"cell_methods": f"realization: {STATISTICS[statistic]}"}
-    beside = [v.quantity for v in volumes if v.quantity in (f"{quantity}_mean", f"{quantity}_std")]
-    return {"ancillary_variables": " ".join(beside)} if beside else {}
-
-
-def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
-    """Read one quantity of a .nc or .vti file as a Volume.
-
-    Without `quantity`, index_excess is taken, or n, or the only variable there is. n becomes the index excess where the
-    file says its n_ambient, and stays n, in double precision, where it does not.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, of another kind, or lacks the quantity.
-    """
-    arrays, grid, attributes = _read(Path(path))
-    if quantity is None:
-        known = [q for q in ("index_excess", "n") if q in arrays]
-        quantity = known[0] if known else next(iter(arrays)) if len(arrays) == 1 else None
-    if quantity is None or quantity not in arrays:
-        raise InputError(
-            f"{path}: expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}"
-        )
-    volume = _volume(quantity, arrays[quantity], grid, attributes)
-    index = quantity in ("index_excess", "n")
-    if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
-        raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
-    if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
-        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got some beyond {LARGEST_INDEX}")
-    try:
-        n_ambient = volume.n_ambient
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    if quantity == "n" and n_ambient is not None:
-        return Volume((volume.values - n_ambient).float(), grid, "index_excess", "1", volume.attributes)
-    return volume
-
-
-def read_volumes(path: str | os.PathLike[str]) -> dict[str, Volume]:
-    """Read every quantity of a .nc or .vti file, masked voxels as NaN.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind.
-    """
-    arrays, grid, attributes = _read(Path(path))
-    return {quantity: _volume(quantity, values, grid, attributes) for quantity, values in arrays.items()}
-
-
-def _read(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
-    """Arrays by name, and attributes: those of one quantity as density.assumption and the like."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a volume (.nc or .vti)")
-    if path.suffix == ".nc":
-        return _read_netcdf(path)
-    if path.suffix == ".vti":
-        from nerif.vti import read_vti
-
-        return read_vti(path)
-    raise InputError(f"{path}: expected a volume in .nc or .vti, got '{path.suffix or path.name}'")
-
-
-def _volume(quantity: str, values: Tensor, grid: Grid, attributes: dict[str, float | str]) -> Volume:
-    own = f"{quantity}."
-    notes = {k.removeprefix(own): v for k, v in attributes.items() if k.startswith(own) and k != f"{own}units"}
-    shared = {k: v for k, v in attributes.items() if "." not in k}
-    values = values.double() if quantity == "n" else values.float()
-    return Volume(values, grid, quantity, describe(quantity)[0], shared, notes)
-
-
-def _read_netcdf(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
-    with opened(path, "a volume (.nc or .vti)") as dataset:
-        return _contents(dataset)
-
-
-def _contents(dataset: xr.Dataset) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
-    for axis in "zyx":
-        if axis not in dataset.coords:
-            raise InputError(f"expected a volume with coordinates z, y, x in mm, got {list(dataset.coords)}")
-    ends = [_ends(dataset, axis) for axis in "xyz"]
-    lower, upper = zip(*ends, strict=True)
-    grid = Grid(Box(lower, upper), (dataset.sizes["z"], dataset.sizes["y"], dataset.sizes["x"]))
-    arrays = {}
-    for key, variable in dataset.data_vars.items():
-        name, unit = str(key), variable.attrs.get("units")
-        if set(variable.dims) == {"z", "y", "x"}:
-            expected = describe(name)[0]
-            if name in QUANTITIES and unit is not None and not (isinstance(unit, str) and unit == expected):
-                raise InputError(f"variable '{name}': expected units '{expected}', got '{unit}'")
-            numbers = values(variable.transpose("z", "y", "x"))
-            kind = np.float32 if numbers.dtype.itemsize <= 4 else np.float64
-            arrays[name] = torch.from_numpy(np.ascontiguousarray(numbers.astype(kind)))
-    found = dict(dataset.attrs)
-    for key, variable in dataset.data_vars.items():
-        found |= {f"{key}.{k}": v for k, v in variable.attrs.items()}
-    attributes: dict[str, float | str] = {
-        str(k): v if isinstance(v, str) else float(v)
-        for k, v in found.items()
-        if isinstance(v, str | int | float | np.number)
-    }
-    return arrays, grid, attributes
-
-
-def _ends(dataset: xr.Dataset, axis: str) -> tuple[float, float]:
-    """Where the box begins and ends along an axis, mm, by the attributes where they fit, else by the voxel centres."""
-    unit = dataset[axis].attrs.get("units", "mm")
-    if not (isinstance(unit, str) and unit == "mm"):
-        raise InputError(f"coordinate '{axis}': expected units 'mm', got '{unit}'")
-    centres = values(dataset[axis]).astype(np.float64)
-    if not (np.abs(centres) <= LARGEST_LENGTH).all():
-        raise InputError(f"coordinate '{axis}': expected voxel centres in mm, got {centres.tolist()[:4]} ...")
-    corners = [np.asarray(dataset.attrs.get(name)) for name in ("box_lower_mm", "box_upper_mm")]
-    if len(centres) and all(c.shape == (3,) and c.dtype.kind in "fiu" for c in corners):
-        lower, upper = (float(c["xyz".index(axis)]) for c in corners)
-        edge = (upper - lower) / len(centres)
-        # a part cut out of the volume has the whole's attributes, but not its coordinates
-        if np.allclose(centres, lower + (np.arange(len(centres)) + 0.5) * edge, rtol=0, atol=1e-3 * abs(edge)):
-            return lower, upper
-    steps = np.diff(centres)
-    if len(steps) == 0 or not steps.mean() > 0 or not np.allclose(steps, steps.mean(), rtol=1e-3):
-        raise InputError(f"expected equally spaced, rising voxel centres along {axis} (mm)")
-    return float(centres[0] - steps.mean() / 2), float(centres[-1] + steps.mean() / 2)

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any
 from nerif.atomic import atomic
 from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Box, Grid
-from nerif.measurement_sequence import require_zarr
+from nerif.measurement_sequence import add_frames, require_zarr
 from nerif.netcdf import reading
-from nerif.volume import REFERENCES, Volume, describe
+from nerif.volume import Volume, describe
+from nerif.volume_file import REFERENCES
 
 if TYPE_CHECKING:
     import numpy as np
     import zarr
 
-__all__ = ["VolumeSequence", "add_frames"]
+__all__ = ["VolumeSequence"]
 
 
 class VolumeSequence:
@@ -148,20 +149,3 @@ class VolumeSequence:
             raise InputError(f"{self.path}: expected one of {', '.join(self.quantities)}, got '{quantity}'")
         values = torch.from_numpy(self.read(quantity, index))
         return Volume(values, self.grid, quantity, describe(quantity)[0], {"n_ambient": self.n_ambient})
-
-
-def add_frames(
-    group: zarr.Group,
-    name: str,
-    frames: int,
-    sizes: tuple[int, ...],
-    dimensions: tuple[str, ...],
-    kind: str,
-    fill: float | str = float("nan"),
-    **about: Any,
-) -> None:
-    """Add an array with a leading dimension time and a chunk for each frame."""
-    group.create_array(
-        name, shape=(frames, *sizes), chunks=(1, *sizes), dtype=kind, fill_value=fill,
-        dimension_names=["time", *dimensions], attributes=about,
-    )  # fmt: skip

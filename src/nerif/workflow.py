@@ -8,16 +8,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
-from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
-from nerif.physics.quantities import GasSettings, derive, masked_lines
+from nerif.physics.quantities import GasSettings, masked_lines
 from nerif.prediction import reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
@@ -31,10 +28,9 @@ from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.result import REPORT, ResultDirectory, versions
-from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["METHODS", "Run", "check_gas", "reconstruct_into", "write_report", "write_sequence_report"]
+__all__ = ["METHODS", "Run", "reconstruct_into", "write_report", "write_sequence_report"]
 
 METHODS: dict[str, type[Reconstructor]] = {
     "nerif": NeRIF,
@@ -108,11 +104,9 @@ def reconstruct_into(
         voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
     if voxels < 1:
         raise InputError(f"voxels: expected at least 1, got {voxels}")
-    training = _without(measurement, run.hold_out)
+    training = measurement.without(run.hold_out)
     _check_ensemble(run, training)
-    if measurement.wavelength_nm is not None:
-        run = replace(run, gas=replace(run.gas, wavelength_nm=measurement.wavelength_nm))
-    check_gas(run.gas, measurement)
+    run = replace(run, gas=run.gas.for_measurement(measurement))
     if measurement.bad_pixels:
         where = "the measurement" if path is None else path
         what = "pixels left out whose displacement or sigma is NaN, infinite or impossible"
@@ -132,7 +126,6 @@ def reconstruct_into(
     with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
         callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
         result = reconstructor(training, compose(*callbacks), state, start if state is None else None)
-    monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
     begin(None)
     _write(out, measurement, result, run, settings, voxels, monitor)
     try:
@@ -175,13 +168,6 @@ def _say_size(path: Path, monitor: Monitor) -> None:
     monitor.say(f"{path}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")
 
 
-def check_gas(gas: GasSettings, measurement: Measurement) -> None:
-    """Refuse what density and temperature cannot be computed from before the long work, not after it."""
-    grid = Grid(measurement.box, (1, 1, 1))
-    ambient = Volume(torch.zeros(grid.shape), grid, attributes={"n_ambient": measurement.n_ambient})
-    derive(ambient, "temperature", gas)
-
-
 def _write(
     out: ResultDirectory,
     measurement: Measurement,
@@ -194,6 +180,7 @@ def _write(
     """Write what came out: the field first, it is the costliest; what only looks at it comes last."""
     out.write_field(result)
     out.write_history(result.history)
+    monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
     volumes = all_quantities(result, run.gas, voxels)
     out.write_volumes(volumes)
     for line in masked_lines(volumes):
@@ -221,16 +208,6 @@ def _write(
     monitor.say(
         f"{out.path}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView"
     )
-
-
-def _without(measurement: Measurement, names: tuple[str, ...]) -> Measurement:
-    for name in names:
-        if name not in measurement.names:
-            raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{name}'")
-    kept = [name for name in measurement.names if name not in names]
-    if not kept:
-        raise InputError("hold_out: every view is held out, so none is left to reconstruct from")
-    return measurement.select(kept)
 
 
 def _check_ensemble(run: Run, training: Measurement) -> None:

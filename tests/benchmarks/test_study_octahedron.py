@@ -11,9 +11,9 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Box, Grid, Ring
-from nerif.resolution import measure_resolution
 from nerif.result import write_json
 from study.octahedron import from_plain, pixels_per_unit, to_plain
+from study.resolution import measure_resolution
 
 PHANTOM = Octahedron(Box.cube(50.0))
 
@@ -35,8 +35,10 @@ def test_there_and_back_by_a_json_file(field, tmp_path):
     write_json(path, to_plain(resolution))
     plain = json.loads(path.read_text())
     back = from_plain(plain)
-    for name, value in vars(resolution).items():
-        torch.testing.assert_close(getattr(back, name), value, rtol=0, atol=0, equal_nan=True)
+    for before, after in ((vars(resolution), vars(back)), (vars(resolution.mtf), vars(back.mtf))):
+        for name, value in before.items():
+            if name != "mtf":
+                torch.testing.assert_close(after[name], value, rtol=0, atol=0, equal_nan=True)
     assert plain["lp_per_unit"] == pytest.approx(resolution.lp_per_unit) or plain["lp_per_unit"] is None
     assert plain["finest_lp_per_unit"] == pytest.approx(128)
 

@@ -122,3 +122,13 @@ def test_boxes_and_grids_that_cannot_be(unchecked):
         Grid.of_resolution(Box.cube(1.0), 0)
     with pytest.raises(InputError, match="grid: expected three positive"):
         Grid(Box.cube(1.0), (1.5, 2, 2))
+
+
+def test_a_box_around_the_origin_and_what_it_holds():
+    box = Box.around_origin((4.0, 6.0, 8.0))
+    assert (box.lower, box.upper) == ((-2.0, -3.0, -4.0), (2.0, 3.0, 4.0))
+    assert Box.cube(2.0) == Box.around_origin((2.0, 2.0, 2.0))
+    assert box.holds(box)
+    assert box.holds(Box((-2.0, 0.0, 0.0), (2.0, 3.0 + 1e-7, 1.0)))
+    assert not box.holds(Box((-2.0, 0.0, 0.0), (2.0, 3.1, 1.0)))
+    assert not box.holds(Box((-2.1, 0.0, 0.0), (2.0, 3.0, 1.0)))

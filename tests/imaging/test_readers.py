@@ -16,7 +16,7 @@ import pytest
 from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
 from nerif.conventions import InputError
 from nerif.imaging.crop import Crop
-from nerif.imaging.frames import Frames, good_frames
+from nerif.imaging.frames import Frames, read_each
 from nerif.imaging.readers import open_frames
 from nerif.imaging.views import View
 
@@ -44,6 +44,13 @@ def same(frames: Frames, stack: np.ndarray) -> None:
     for i, expected in enumerate(stack):
         assert frames[i].dtype == expected.dtype
         np.testing.assert_array_equal(frames[i], expected)
+
+
+def good_frames(frames: Frames) -> tuple[list[int], list[str]]:
+    """Numbers of the frames that can be read, and what is said of the others."""
+    found = dict(read_each(frames, range(len(frames))))
+    wrong = {i: str(x) for i, x in found.items() if isinstance(x, InputError)}
+    return [i for i in found if i not in wrong], [*wrong.values()]
 
 
 # --- images

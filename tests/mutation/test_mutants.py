@@ -31,7 +31,8 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.sequence.store import Frame, SequenceStore
 from nerif.simulation import simulate
-from nerif.volume import Volume, read_volume, write_netcdf
+from nerif.volume import Volume
+from nerif.volume_file import read_volume, write_netcdf
 
 pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from report.browsing import (
     text,
     wait_for,
 )
+from report.page_reading import quantity_of
 
 pytestmark = needs_browser
 
@@ -117,7 +119,7 @@ def test_the_value_at_the_cross_is_that_of_the_file(page, whole):
     excess = float(volumes["index_excess"].values[at])
     for quantity in ("n", "density", "temperature"):
         choose(page, "quantity", quantity)
-        formula = relation(quantity, volumes[quantity].attributes)
+        formula = partial(quantity_of, relation(quantity, volumes[quantity].attributes))
         field, true = (float(formula(np.array(x))) for x in (excess, excess - float(error.values[at])))
         expected = {"value": field, "truth": true, "error": field - true}
         for statistic in ("mean", "std"):

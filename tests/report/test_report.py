@@ -19,11 +19,13 @@ from nerif.notebook import number
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import html, packing
 from nerif.report.pages import residuals_over_sigma
+from nerif.report.scene import scene_of
 from nerif.report.summary import headline, trust
 from nerif.report.view_images import _shrink, lattice_step, view_images
 from nerif.reprojection import Reprojection
 from nerif.result import Result, ResultDirectory
 from nerif.volume import Volume
+from report.page_reading import quantity_of, unpack
 
 PARTS = ("run.toml", "metrics.json", "history.csv", "volume.nc", "reprojection.nc")
 
@@ -70,15 +72,15 @@ def test_what_is_packed_comes_back():
     values = volume.values.double().numpy()
     values[1, 2, 3] = np.nan
     packed = packing.pack(values)
-    back = packing.unpack(packed, values.shape)
+    back = unpack(packed, values.shape)
     assert np.isnan(back[1, 2, 3])
     assert np.isnan(back).sum() == 1
     half_a_step = 0.5 * packed["step"]
     assert packed["step"] == pytest.approx((np.nanmax(values) - np.nanmin(values)) / 65534)
     assert np.nanmax(np.abs(back - values)) <= 1.001 * half_a_step
     flat = packing.pack(np.full((2, 3, 4), 5.0))
-    np.testing.assert_allclose(packing.unpack(flat, (2, 3, 4)), 5.0)
-    assert np.isnan(packing.unpack(packing.pack(np.full((2, 3, 4), np.nan)), (2, 3, 4))).all()
+    np.testing.assert_allclose(unpack(flat, (2, 3, 4)), 5.0)
+    assert np.isnan(unpack(packing.pack(np.full((2, 3, 4), np.nan)), (2, 3, 4))).all()
 
 
 @pytest.mark.parametrize("quantity", ["n", "density", "temperature"])
@@ -87,7 +89,7 @@ def test_relations_are_those_of_the_files(quantity):
     volume.values[0, 0, :3] = torch.tensor([-2.8e-4, -2.6999e-4, 3e-4])  # below vacuum, far too hot, too cold
     derived = derive(volume, quantity, GasSettings("N2", pressure_pa=9e4))
     expected = derived.values.double().numpy() - (quantity == "n")
-    found = packing.relation(quantity, derived.attributes)(volume.values.double().numpy())
+    found = quantity_of(packing.relation(quantity, derived.attributes), volume.values.double().numpy())
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     np.testing.assert_allclose(found, expected, rtol=2e-6)
 
@@ -100,9 +102,9 @@ def test_statistics_are_masked_on_the_page_where_they_are_in_the_file(tmp_path):
     std = Volume(torch.full(excess.grid.shape, 4e-3), excess.grid, "density_std", "kg m-3")
     std.values[1, 2, 3] = float("nan")
     found = {v.quantity: v for v in (excess, density, spread, replace(spread, quantity="index_excess_mean"), std)}
-    scene, arrays = html._scene(Result(tmp_path, volumes=found))
+    scene, arrays = scene_of(Result(tmp_path, volumes=found))
     assert scene is not None
-    shown = packing.unpack({**scene["arrays"]["density_std"], "text": arrays["density_std"]}, excess.grid.shape)
+    shown = unpack({**scene["arrays"]["density_std"], "text": arrays["density_std"]}, excess.grid.shape)
     np.testing.assert_array_equal(np.isnan(shown), np.isnan(std.values.numpy()))
     assert "density_mean" not in scene["arrays"]  # nowhere masked: a function of the index excess
 
@@ -274,7 +276,7 @@ def test_tables_of_another_kind_are_refused_not_drawn(copy, name, text, words):
     assert main(["report", str(copy)]) == 0
 
 
-def scene_of(page: Path) -> str:
+def scene_in(page: Path) -> str:
     """The JSON that the page draws from."""
     match = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page.read_text())
     assert match is not None
@@ -288,7 +290,7 @@ def test_the_gas_is_doubted_in_a_liquid(tmp_path):
     statements = trust(Result(tmp_path, volumes={"index_excess": water, **found}))
     assert any("do not apply here" in s.text and s.level == "warning" for s in statements)
     html.write(html.render(Result(tmp_path, volumes={"index_excess": water, **found})), tmp_path / "r.html")
-    assert "NaN" not in scene_of(tmp_path / "r.html")
+    assert "NaN" not in scene_in(tmp_path / "r.html")
 
 
 def test_residuals_are_those_of_every_ray_through_the_box(measurement):

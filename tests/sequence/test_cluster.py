@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
+from nerif.sequence.plan import SequenceSettings
+from nerif.sequence.reconstruct import reconstruct_sequence
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 CHUNKS = ["--workers", "2", "--threads", "1", "--chunk", "6"]
@@ -143,7 +146,7 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     from nerif.sequence import run
     from nerif.sequence.run import run_sequence
 
-    plan = _plan(film, tmp_path / "out.zarr")
+    plan = _plan(film, tmp_path / "out.zarr", 6)
     deadly = tmp_path / "deadly.py"
     monkeypatch.syspath_prepend(tmp_path)  # workers get it
     deadly.write_text(
@@ -160,7 +163,7 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     module = importlib.import_module("deadly")
     monkeypatch.setattr(run, "_in_worker", module.work)
     with open_cluster("local", 2) as (client, _):
-        progress = run_sequence(client, plan, 6)
+        progress = run_sequence(client, plan)
     store = SequenceStore(plan.out)
     assert np.flatnonzero(store.status == FAILED).tolist() == [7]
     assert (store.status == DONE).sum() == 23
@@ -173,7 +176,7 @@ def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(fi
 
     from nerif.sequence import run
 
-    plan, real = _plan(five, tmp_path / "out.zarr"), run.reconstruct_frames
+    plan, real = _plan(five, tmp_path / "out.zarr", 3), run.reconstruct_frames
 
     def work(plan, first, last, event):
         real(plan, first, min(last, 1), event)
@@ -183,23 +186,22 @@ def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(fi
 
     monkeypatch.setattr(run, "reconstruct_frames", work)
     with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
-        progress = run.run_sequence(client, plan, 3)
+        progress = run.run_sequence(client, plan)
     store = SequenceStore(plan.out)
     assert store.status.tolist() == [DONE, FAILED, FAILED, DONE, DONE]
     assert store.reasons[1] == "KeyError: 'layer 7'"
     assert (progress.done, progress.failed) == (3, 2)
 
 
-def _plan(film: Path, out: Path):
-    from dataclasses import replace
-
+def _plan(film: Path, out: Path, chunk: int):
     from nerif.geometry import Grid
     from nerif.sequence.plan import SequencePlan
 
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.first_good().box, 10)
     SequenceStore.begin(out, sequence, grid, ("index_excess",), COLD.network, {})
-    return SequencePlan(film, out, COLD, replace(COLD, max_steps=10), 10, ("index_excess",), threads=1)
+    settings = SequenceSettings(chunk=chunk, warm_steps=10, voxels=10, quantities=("index_excess",))
+    return SequencePlan(film, out, COLD, settings, threads=1)
 
 
 def test_a_scheduler_that_is_there_already_is_used(five, tmp_path):
@@ -302,6 +304,7 @@ def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["--workers", "-1"], "workers: expected 0 or more"),
         (["--chunk", "0"], "chunk: expected 1 or more"),
         (["--quantities", "pressure"], "quantities: expected some of"),
         (["--time-limit", "5"], "time_limit: expected none in a sequence"),
@@ -325,3 +328,21 @@ def test_a_store_begun_with_other_settings_is_left_alone(film, tmp_path, capsys)
     assert "seed: expected 0, with which it was begun, got 4" in capsys.readouterr().err
     assert main(["sequence", str(film), "-o", str(tmp_path / "o.nc"), *QUICK]) == 2
     assert "ending in .zarr" in capsys.readouterr().err
+
+
+def test_from_python_in_one_call(five, tmp_path):
+    out, said, told = tmp_path / "r.zarr", [], []
+    settings = SequenceSettings(chunk=3, warm_steps=10, voxels=10)
+    arguments = {"workers": 1, "threads": 1, "say": said.append}
+    store = reconstruct_sequence(out, five, COLD, settings, on_progress=told.append, **arguments)
+    assert (store.status == DONE).all()
+    assert {*store.quantities} == {"index_excess", "density"}
+    assert store.attributes["gas"]["wavelength_nm"] == MeasurementSequence.read(five).first_good().wavelength_nm
+    assert said[0].endswith("r.zarr: 5 of 5 frames to do, in chunks of 3")
+    assert said[-1].startswith("5 of 5 frames done")
+    assert told[-1].done == 5
+    said.clear()
+    reconstruct_sequence(str(out), str(five), COLD, settings, **arguments)
+    assert len(said) == 1  # nothing is done twice
+    with pytest.raises(InputError, match="chunk: expected 3, with which it was begun, got 4"):
+        reconstruct_sequence(out, five, COLD, replace(settings, chunk=4), **arguments)

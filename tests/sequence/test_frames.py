@@ -18,7 +18,7 @@ from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.sequence import frames
 from nerif.sequence.frames import reconstruct_frames
-from nerif.sequence.plan import SequencePlan
+from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.run import chunks_of, outcome_table
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 from sequence_films import COLD, blank
@@ -26,12 +26,11 @@ from sequence_films import COLD, blank
 
 def begun(measurement: Path, out: Path, **changes: object) -> SequencePlan:
     """A plan, and its store with every frame missing."""
-    quantities = ("index_excess", "temperature")
-    plan = replace(SequencePlan(measurement, out, COLD, replace(COLD, max_steps=15), 10, quantities), **changes)
+    settings = SequenceSettings(warm_steps=15, voxels=10, quantities=("index_excess", "temperature"))
+    plan = SequencePlan(measurement, out, COLD, replace(settings, **changes))
     sequence = MeasurementSequence.read(measurement)
-    grid = Grid.of_resolution(sequence.first_good().box, plan.voxels)
-    about = {"hold_out": list(plan.hold_out), "settings": asdict(COLD)}
-    SequenceStore.begin(out, sequence, grid, plan.quantities, COLD.network, about)
+    grid = Grid.of_resolution(sequence.first_good().box, 10)
+    SequenceStore.begin(out, sequence, grid, plan.settings.quantities, COLD.network, plan.kept)
     return plan
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from nerif.reconstruction.training_data import FrameData
 from nerif.sequence import joint
 from nerif.sequence.chunk_data import ChunkData
 from nerif.sequence.joint import reconstruct_jointly
-from nerif.sequence.plan import SequencePlan
+from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
 from nerif.simulation import simulate
 from sequence_films import QUICK, blank
@@ -120,11 +120,14 @@ def test_instants_of_a_chunk_run_from_minus_one_to_one():
 
 def begun(film: Path, out: Path, steps: int, **changes: object) -> SequencePlan:
     settings = replace(SETTINGS, **changes)
-    plan = SequencePlan(film, out, settings, settings, 10, joint_steps=steps, time_octaves=2)
     sequence = MeasurementSequence.read(film)
+    asked = SequenceSettings(
+        chunk=len(sequence), temporal="joint", joint_steps=steps, time_octaves=2, voxels=10,
+        quantities=("index_excess",),
+    )  # fmt: skip
+    plan = SequencePlan(film, out, settings, asked)
     grid = Grid.of_resolution(sequence.first_good().box, 10)
-    about = {"temporal": "joint", "time_octaves": 2, "chunk": len(sequence), "settings": asdict(settings)}
-    SequenceStore.begin(out, sequence, grid, plan.quantities, SHAPE, about)
+    SequenceStore.begin(out, sequence, grid, asked.quantities, SHAPE, plan.kept)
     return plan
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from nerif.commands.output import say
+from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.consistency import Consistency, check_consistency
 from nerif.conventions import InputError
@@ -36,17 +36,11 @@ class Check(Settings):
 
 def run(settings: Check) -> Consistency:
     """Compare the views, and say what was found."""
-    from rich.console import Console
-    from rich.progress import Progress
-
     if settings.voxels < 8:
         raise InputError(f"voxels: expected at least 8, got {settings.voxels}")
     measurement = Measurement.read(settings.measurement)
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("comparing views", total=None)
-        result = check_consistency(
-            measurement, settings.voxels, lambda done, total: bar.update(task, completed=done, total=total)
-        )
+    with counting_bar("comparing views") as bar:
+        result = check_consistency(measurement, settings.voxels, bar)
     if result.views:
         say(f"{'view':<14}{'valid':>8}{'agreement':>11}{'gain':>7}")
     for view in result.views:

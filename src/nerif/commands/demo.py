@@ -10,11 +10,12 @@ import tyro
 
 from nerif.commands import evaluate, reconstruct, simulate
 from nerif.commands.methods import ReconstructNeRIF
-from nerif.commands.output import MONITOR, check_directory, say
+from nerif.commands.output import MONITOR, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
+from nerif.result import ResultDirectory
 from nerif.simulation import Simulation
 from nerif.workflow import Run, write_report
 
@@ -45,7 +46,7 @@ def run(settings: Demo) -> None:
         raise InputError(f"pixels: expected at least 8, got {settings.pixels}")
     if not settings.time_limit > 0:
         raise InputError(f"time_limit: expected seconds above 0, got {settings.time_limit}")
-    check_directory(settings.out, settings.force)
+    ResultDirectory(settings.out).check_free(settings.force)
     settings.out.mkdir(parents=True, exist_ok=True)
     measured = settings.out / "measurement.nc"
     between = 95.625  # degrees, halfway between the fifth and the sixth of nine views

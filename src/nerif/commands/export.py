@@ -46,21 +46,16 @@ class Export(Settings):
 
 def run(settings: Export) -> None:
     """Write the file."""
-    if settings.voxels < 1:
-        raise InputError(f"voxels: expected at least 1, got {settings.voxels}")
     if not settings.quantities:
         raise InputError("quantities: expected at least one, got none")
     if settings.out.suffix not in FORMATS:
         raise InputError(f"out: expected a name ending in {', '.join(FORMATS)}, got '{settings.out.name}'")
     check_file(settings.out, settings.force)
     index, whole, n_ambient = ResultDirectory(settings.result).field()
-    lower, upper = settings.lower or whole.lower, settings.upper or whole.upper
-    box = Box(lower, upper)
-    if any(a < w - 1e-6 for a, w in zip(lower, whole.lower, strict=True)) or any(
-        b > w + 1e-6 for b, w in zip(upper, whole.upper, strict=True)
-    ):
+    box = Box(settings.lower or whole.lower, settings.upper or whole.upper)
+    if not whole.holds(box):
         whole_box = f"{whole.lower} to {whole.upper} mm"
-        raise InputError(f"lower, upper: expected a part of the box {whole_box}, got {lower} to {upper}")
+        raise InputError(f"lower, upper: expected a part of the box {whole_box}, got {box.lower} to {box.upper}")
     grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
     excess = Volume(index.sample(grid), grid, attributes={"n_ambient": n_ambient})
     volumes = [derive(excess, q, settings.gas) for q in settings.quantities]

@@ -15,7 +15,8 @@ from nerif.measurement import Measurement
 from nerif.measurement_file import CONVENTIONS
 from nerif.netcdf import opened
 from nerif.result import METRICS, ResultDirectory
-from nerif.volume import Volume, read_volume
+from nerif.volume import Volume
+from nerif.volume_file import read_volume
 
 __all__ = ["Info", "main", "run"]
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Grid
 from nerif.imaging.masks import MaskSettings, drawn_masks, with_flow_masks
@@ -38,7 +38,7 @@ class Mask(Settings):
     """Take the masks out instead."""
     force: bool = False
     """Overwrite existing files."""
-    masks: Annotated[MaskSettings, tyro.conf.arg(name="")] = field(default_factory=MaskSettings)
+    masks: Annotated[MaskSettings, Flat] = field(default_factory=MaskSettings)
 
 
 def run(settings: Mask) -> Measurement:

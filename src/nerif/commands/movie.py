@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
 from nerif.report.movie import Movie, frames_there
 from nerif.volume_sequence import VolumeSequence
@@ -29,7 +29,7 @@ class MovieCommand(Settings):
     """Take every so many frames."""
     force: bool = False
     """Overwrite an existing file."""
-    look: Annotated[Movie, tyro.conf.arg(name="")] = field(default_factory=Movie)
+    look: Annotated[Movie, Flat] = field(default_factory=Movie)
 
 
 def run(settings: MovieCommand) -> None:

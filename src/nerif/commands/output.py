@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -12,16 +13,19 @@ from pathlib import Path
 from nerif.conventions import InputError
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import OnStep, Step, compose
-from nerif.result import ResultDirectory
 
-__all__ = ["MONITOR", "check_directory", "check_file", "counting_bar", "interruptible", "progress_bar", "say"]
+__all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say"]
 
 SAME_SIGNAL = 0.5  # seconds
 
 
 def say(text: str) -> None:
-    """Print a line for the user."""
-    print(text, flush=True)
+    """Print a line for the user; where nobody reads any more, as in nerif info FILE | head -2, end in silence."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
+        raise SystemExit(141) from None
 
 
 def check_file(path: Path, force: bool, *others: Path) -> None:
@@ -33,11 +37,6 @@ def check_file(path: Path, force: bool, *others: Path) -> None:
             raise InputError(f"{file}: expected the name of a file to write, got a folder")
         if file.exists() and not force:
             raise InputError(f"{file}: exists already and was left as it is; give another --out, or --force")
-
-
-def check_directory(path: Path, force: bool) -> None:
-    """Refuse an output directory that holds anything, unless forced."""
-    ResultDirectory(path).check_free(force)
 
 
 @contextmanager
@@ -85,25 +84,43 @@ def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[...,
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[OnStep]:
-    """Show a bar of the training: a callable for each Step, with epoch, loss terms, rays/s and time left."""
+def figures_bar(title: str) -> Iterator[Callable[[float, str, float], None]]:
+    """Show a bar with figures beside it: a callable that is told the share done, the figures, and the seconds so far.
+
+    Without a terminal it is a line every 15 s, and one at the end.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
     console = Console(stderr=True)
     columns = (TextColumn(title), BarColumn(bar_width=20), TextColumn("{task.percentage:3.0f}% {task.fields[figures]}"))
     last = [0.0]
-    with Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=4) as bar:
-        task = bar.add_task(title, total=1.0, figures="")
+    bar = Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=4)
+    task = bar.add_task(title, total=1.0, figures="")
+
+    def update(share: float, figures: str, seconds: float) -> None:
+        bar.start()
+        bar.update(task, completed=share, figures=figures)
+        if not console.is_terminal and (share >= 1 or seconds - last[0] >= 15):
+            last[0] = seconds
+            print(f"{title} {share:4.0%} {figures}", file=sys.stderr, flush=True)
+
+    try:
+        yield update
+    finally:
+        bar.stop()
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[OnStep]:
+    """Show a bar of the training: a callable for each Step, with epoch, loss terms, rays/s and time left."""
+    with figures_bar(title) as bar:
 
         def update(step: Step) -> None:
             left = step.seconds * (1 / step.progress - 1) if step.progress > 0.001 else float("nan")
             terms = " ".join(f"{k} {v:.3g}" for k, v in step.losses.items())
             figures = f"epoch {step.epoch:.1f} | {terms} | {step.rays_per_second:.3g} rays/s | {left:.0f} s left"
-            bar.update(task, completed=step.progress, figures=figures)
-            if not console.is_terminal and step.seconds - last[0] >= 15:
-                last[0] = step.seconds
-                print(f"{title} {step.progress:4.0%} {figures}", file=sys.stderr, flush=True)
+            bar(step.progress, figures, step.seconds)
 
         yield update
 

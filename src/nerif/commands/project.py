@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.measurement import Measurement
@@ -37,7 +37,7 @@ class Project(Settings):
     """Samples (or Runge-Kutta steps) along a ray."""
     force: bool = False
     """Overwrite an existing file."""
-    ring: Annotated[Ring, tyro.conf.arg(name="")] = field(default_factory=Ring)
+    ring: Annotated[Ring, Flat] = field(default_factory=Ring)
 
 
 def run(settings: Project) -> Measurement:

@@ -9,12 +9,13 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_directory, counting_bar, say
+from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
+from nerif.conventions import AMBIENT_INDEX
 from nerif.experiment import Experiment
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.simulation import AMBIENT
+from nerif.result import ResultDirectory
 
 __all__ = ["Render", "main", "run"]
 
@@ -36,7 +37,7 @@ class Render(Settings):
     """Of the phantom."""
     box: tuple[float, float, float] = (50.0, 50.0, 50.0)
     """Edges of the box around the origin, along x y z, mm."""
-    n_ambient: float = AMBIENT
+    n_ambient: float = AMBIENT_INDEX
     """Refractive index around the flow."""
     truth_voxels: int = 100
     """Voxels of the truth along the longest edge."""
@@ -48,10 +49,9 @@ class Render(Settings):
 
 def run(settings: Render) -> None:
     """Write pictures and truth."""
-    check_directory(settings.out, settings.force)
+    ResultDirectory(settings.out).check_free(settings.force)
     cameras, pictures = settings.ring.cameras(), settings.pictures
-    x, y, z = (e / 2 for e in settings.box)
-    box = Box((-x, -y, -z), (x, y, z))
+    box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
     with counting_bar("rendering", pictures.pictures(len(cameras))) as bar:

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import inspect
 import io
 import json
 import re
-import tomllib
 import typing
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +21,9 @@ from typing import Any, TypeVar
 import tyro
 
 from nerif.conventions import InputError
+from nerif.toml import check_known, read_toml
 
-__all__ = ["Flat", "Settings", "flag_value", "merge", "parse", "read_settings", "read_toml", "value_given"]
+__all__ = ["Flat", "Settings", "flag_value", "merge", "parse", "read_settings", "value_given"]
 
 T = TypeVar("T")
 
@@ -59,14 +58,14 @@ def read_settings(default: T, arguments: list[str], verb: str, file: Path | None
     """
     file = _config(arguments) or file
     if file is not None:
-        default = merge(default, read_toml(file), str(file))
+        default = merge(default, _settings_file(file), str(file))
     return parse(default, arguments, f"nerif {verb}", inspect.getdoc(type(default)) or "")
 
 
 def value_given(name: str, arguments: list[str], default: str, file: Path | None = None) -> str:
     """Return what flag or settings file say of one setting on which the defaults of the others depend."""
     file = _config(arguments) or file
-    given = flag_value(arguments, f"--{name}") or (read_toml(file).get(name) if file is not None else None)
+    given = flag_value(arguments, f"--{name}") or (_settings_file(file).get(name) if file is not None else None)
     return str(given or default)
 
 
@@ -75,20 +74,8 @@ def _config(arguments: list[str]) -> Path | None:
     return Path(config) if config else None
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a settings file.
-
-    Raises
-    ------
-    InputError
-        If it is missing or no TOML.
-    """
-    try:
-        return {k: v for k, v in tomllib.loads(path.read_text()).items() if k not in IGNORED}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such settings file (--config)") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise InputError(f"{path}: not a TOML file ({error})") from None
+def _settings_file(path: Path) -> dict[str, Any]:
+    return {k: v for k, v in read_toml(path, "settings file (--config)").items() if k not in IGNORED}
 
 
 def flat_names(cls: type) -> dict[str, tuple[str, ...]]:
@@ -127,11 +114,9 @@ def merge(default: T, values: dict[str, Any], source: str) -> T:
     names = flat_names(cls)
     groups: dict[str, dict[str, Any]] = {}
     changes: dict[str, Any] = {}
+    values = {key.replace("-", "_"): value for key, value in values.items()}
+    check_known(values, names, source)
     for key, value in values.items():
-        key = key.replace("-", "_")
-        if key not in names:
-            near = difflib.get_close_matches(key, names, n=1, cutoff=0)
-            raise InputError(f"{source}: unknown key '{key}'; the nearest known one is '{near[0]}'")
         where = names[key]
         if len(where) == 2:
             groups.setdefault(where[0], {})[where[1]] = value

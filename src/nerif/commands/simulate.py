@@ -13,7 +13,7 @@ from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.simulation import Simulation
-from nerif.volume import write_netcdf
+from nerif.volume_file import write_netcdf
 
 __all__ = ["Simulate", "main", "run"]
 

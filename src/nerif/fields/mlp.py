@@ -126,11 +126,6 @@ class Network(nn.Module):
         h, _ = self._trunk(p, [])
         return self._head(0, h, activate)[0]
 
-    def head_gradient(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return the gradient as the three gradient heads predict it."""
-        h, _ = self._trunk(p, [])
-        return self._gradient_heads(h)
-
     def value_and_gradient(
         self, p: Float[Tensor, "n k"], heads: bool = False
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:

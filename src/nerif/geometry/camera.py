@@ -181,8 +181,6 @@ class Camera:
     def _undistort(self, distorted: Pixels) -> Pixels:
         """Invert the distortion by Newton's method (at most 20 steps)."""
         ideal = distorted
-        if not bool(self.distortion.any()):
-            return ideal
         for _ in range(20):
             value, jacobian = self._distort(ideal)
             residual = distorted - value

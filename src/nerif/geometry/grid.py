@@ -45,7 +45,13 @@ class Box:
     @classmethod
     def cube(cls, edge: float) -> Box:
         """Return a cube of `edge` mm centred on the origin."""
-        return cls((-edge / 2,) * 3, (edge / 2,) * 3)
+        return cls.around_origin((edge,) * 3)
+
+    @classmethod
+    def around_origin(cls, edges: tuple[float, float, float]) -> Box:
+        """Return a box with edges along x, y, z (mm), centred on the origin."""
+        x, y, z = (e / 2 for e in edges)
+        return cls((-x, -y, -z), (x, y, z))
 
     @property
     def edges(self) -> tuple[float, float, float]:
@@ -58,6 +64,11 @@ class Box:
         """Centre, mm."""
         x, y, z = ((a + b) / 2 for a, b in zip(self.lower, self.upper, strict=True))
         return (x, y, z)
+
+    def holds(self, other: Box) -> bool:
+        """Whether another box lies within this one, to a nanometre."""
+        pairs = (*zip(self.lower, other.lower, strict=True), *zip(other.upper, self.upper, strict=True))
+        return all(a <= b + 1e-6 for a, b in pairs)
 
     def face_points(self, face: str, unit: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
         """Map points of the unit square onto a face such as ``"x-"``, mm."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from nerif.conventions import DEFAULT_AMBIENT_FACES
+from nerif.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES
 from nerif.geometry import Box, Camera
 from nerif.imaging.displacement import DisplacementMap
 from nerif.measurement import Measurement
@@ -23,7 +23,7 @@ Mask = Bool[np.ndarray, "row column"]
 class Surroundings:
     """The gas around the flow, and the light through it."""
 
-    n_ambient: float = 1.00027
+    n_ambient: float = AMBIENT_INDEX
     """Refractive index around the flow."""
     wavelength_nm: float = 532.0
     """Wavelength of the light, nm."""

@@ -15,12 +15,9 @@ offset = -500.0                         # mm
 
 from __future__ import annotations
 
-import difflib
 import os
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,9 +25,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.atomic import atomic
 from nerif.conventions import InputError, Matrix3
 from nerif.geometry import Camera, Plane
+from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = [
     "FORMAT", "CalibratedCamera", "check_model", "checked", "five", "image_size", "numbers", "plane", "read_cameras",
@@ -206,8 +203,6 @@ def write_cameras(
     path: str | os.PathLike[str], cameras: Sequence[CalibratedCamera], about: dict[str, Any] | None = None
 ) -> None:
     """Write cameras, and what else is worth keeping under [about], atomically and in full precision."""
-    import tomli_w
-
     tables = []
     for camera in cameras:
         table: dict[str, Any] = {"name": camera.name}
@@ -218,8 +213,7 @@ def write_cameras(
         if camera.background is not None:
             table["background"] = {"normal": camera.background.normal.tolist(), "offset": camera.background.offset}
         tables.append(table)
-    with atomic(path) as part:
-        part.write_text(tomli_w.dumps({"format": FORMAT, "camera": tables, **({"about": about} if about else {})}))
+    write_toml(path, {"format": FORMAT, "camera": tables, **({"about": about} if about else {})})
 
 
 def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
@@ -230,13 +224,7 @@ def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
     InputError
         If it is missing, no TOML, of another format, or a camera in it cannot be one; names file, camera and key.
     """
-    path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a calibration") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise InputError(f"{path}: not a TOML file ({error})") from None
+    table = read_toml(path, "file; expected a calibration")
     if table.get("format") != FORMAT:
         raise InputError(f"{path}: expected format = '{FORMAT}', got {table.get('format')!r}")
     tables = table.get("camera", [])
@@ -252,10 +240,7 @@ def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
 def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
     name = str(table.get("name", f"camera {index}"))
     where = f"{path}: camera '{name}'"
-    for key in table:
-        if key not in KEYS:
-            near = difflib.get_close_matches(key, KEYS, n=1, cutoff=0)[0]
-            raise InputError(f"{where}: unknown key '{key}'; the nearest known one is '{near}'")
+    check_known(table, KEYS, where)
     for key in ("name", "intrinsics", "rotation", "translation"):
         if key not in table:
             raise InputError(f"{where}: '{key}' is missing")

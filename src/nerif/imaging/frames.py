@@ -13,7 +13,7 @@ import numpy as np
 
 from nerif.conventions import InputError
 
-__all__ = ["Frames", "Layout", "SelectedFrames", "good_frames", "size_in_words"]
+__all__ = ["Frames", "Layout", "SelectedFrames", "read_each", "size_in_words"]
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
 
@@ -199,14 +199,3 @@ def read_each(frames: Frames, indices: Iterable[int]) -> Iterator[tuple[int, np.
             yield i, read(i)
         except InputError as error:
             yield i, error
-
-
-def good_frames(frames: Frames) -> tuple[list[int], list[str]]:
-    """Return the indices of the frames that can be used, and for each other one a line that says what is wrong."""
-    good, lines = [], []
-    for i, found in read_each(frames, range(len(frames))):
-        if isinstance(found, InputError):
-            lines.append(str(found))
-        else:
-            good.append(i)
-    return good, lines

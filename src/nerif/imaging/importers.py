@@ -17,11 +17,11 @@ from nerif.imaging.matlab import read_matlab
 from nerif.imaging.nerfstudio import read_transforms
 from nerif.imaging.opencv import ENDINGS as OPENCV
 from nerif.imaging.opencv import read_opencv, read_opencv_folder
-from nerif.imaging.tables import read_csv, read_toml
+from nerif.imaging.tables import read_csv, read_tables
 
 __all__ = ["ImportSettings", "import_cameras", "is_calibration"]
 
-READERS = {".toml": read_toml, ".csv": read_csv, ".json": read_transforms, **dict.fromkeys(OPENCV, read_opencv)}
+READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms, **dict.fromkeys(OPENCV, read_opencv)}
 ENDINGS = (*READERS, ".mat")
 
 

@@ -52,11 +52,7 @@ def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: floa
 
             iio.imwrite(part, np.round(raster * 255).astype(np.uint8), dpi=(25.4 / pixel, 25.4 / pixel))
         else:
-            import matplotlib.pyplot as plt
-
-            figure = _page(raster, pixel, pattern.label)
-            figure.savefig(part)
-            plt.close(figure)
+            _page(raster, pixel, pattern.label).savefig(part)
 
 
 def paper_for(path: Path, pattern: Background | CalibrationTarget) -> str:
@@ -68,11 +64,11 @@ def paper_for(path: Path, pattern: Background | CalibrationTarget) -> str:
 
 def _page(raster: np.ndarray, pixel: float, label: str) -> Figure:
     """A page of the pattern's own size with a margin, one millimetre of data to a millimetre of paper."""
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     height, width = (n * pixel for n in raster.shape)
     page = width + 2 * MARGIN, height + 2 * MARGIN
-    figure = plt.figure(figsize=(page[0] / 25.4, page[1] / 25.4), dpi=25.4 / pixel)
+    figure = Figure(figsize=(page[0] / 25.4, page[1] / 25.4), dpi=25.4 / pixel)
     axes = figure.add_axes((0, 0, 1, 1), xlim=(0, page[0]), ylim=(page[1], 0), autoscale_on=False)
     axes.axis("off")
     extent = (MARGIN, MARGIN + width, MARGIN + height, MARGIN)

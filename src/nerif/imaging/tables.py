@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import math
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +11,14 @@ import torch
 
 from nerif.conventions import InputError
 from nerif.imaging.cameras_file import FORMAT, CalibratedCamera, five, image_size, numbers, plane, read_cameras, upright
+from nerif.toml import check_known, read_toml
 
-__all__ = ["read_csv", "read_toml"]
+__all__ = ["read_csv", "read_tables"]
 
-def read_toml(path: Path) -> list[CalibratedCamera]:
+
+def read_tables(path: Path) -> list[CalibratedCamera]:
     """Ours, or a table a camera: [cam1] K = ..., R = ..., t = ..., distortion = ..., image_size = [height, width]."""
-    try:
-        table = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file ({error})") from None
+    table = read_toml(path)
     if "format" in table or "camera" in table:
         return list(read_cameras(path))
     known = ("K", "R", "t", "distortion", "image_size", "normal", "offset")
@@ -30,10 +27,7 @@ def read_toml(path: Path) -> list[CalibratedCamera]:
         where = f"{path}: camera '{name}'"
         if not isinstance(own, dict):
             raise InputError(f"{path}: expected format = '{FORMAT}' or a table [{name}] with K, R and t, got {own!r}")
-        for key in own:
-            if key not in known:
-                near = difflib.get_close_matches(key, known, n=1, cutoff=0)[0]
-                raise InputError(f"{where}: unknown key '{key}'; the nearest known one is '{near}'")
+        check_known(own, known, where)
         for key in ("K", "R", "t"):
             if key not in own:
                 raise InputError(f"{where}: '{key}' is missing")
@@ -66,10 +60,7 @@ def read_csv(path: Path) -> list[CalibratedCamera]:
         raise InputError(f"{path}: expected a line of column names and one line a camera, got {len(lines)} lines")
     rows = list(csv.DictReader(lines, delimiter=";" if ";" in lines[0] else ",", skipinitialspace=True))
     names = [str(n).strip() for n in rows[0]]
-    for column in names:
-        if column not in COLUMNS:
-            near = difflib.get_close_matches(column, COLUMNS, n=1, cutoff=0)[0]
-            raise InputError(f"{path}: unknown column '{column}'; the nearest known one is '{near}'")
+    check_known(names, COLUMNS, str(path), "column")
     for column in NEEDED:
         if column not in names:
             raise InputError(f"{path}: column '{column}' is missing")

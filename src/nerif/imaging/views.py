@@ -18,9 +18,7 @@ A `views.toml` in the folder takes the place of that layout. What stands above t
 
 from __future__ import annotations
 
-import difflib
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -36,6 +34,7 @@ from nerif.imaging.frames import Frames, read_each, size_in_words
 from nerif.imaging.masks import read_mask
 from nerif.imaging.readers import open_frames
 from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
+from nerif.toml import check_known, read_toml
 
 __all__ = ["SOURCES", "Pictures", "View", "find_targets", "find_views", "good_pictures"]
 
@@ -169,20 +168,15 @@ def _natural(path: Path) -> tuple[list[float], str]:
 
 
 def _from_file(file: Path) -> list[View]:
-    try:
-        table = tomllib.loads(file.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not a TOML file ({error})") from None
+    table = read_toml(file)
     tables = table.pop("views", {})
     if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
         raise InputError(f"{file}: expected a table [views.NAME] for each view")
     views = []
     for name, own in tables.items():
         entries = {**table, **own}
+        check_known(entries, (*SOURCES, *CROP), str(file))
         for key, value in entries.items():
-            if key not in (*SOURCES, *CROP):
-                near = difflib.get_close_matches(key, (*SOURCES, *CROP), n=1, cutoff=0)[0]
-                raise InputError(f"{file}: unknown key '{key}'; the nearest known one is '{near}'")
             wanted = str if key in (*SOURCES, "flip") else int
             if not isinstance(value, wanted) or isinstance(value, bool):
                 raise InputError(f"{file}: '{key}' of view '{name}': expected {wanted.__name__}, got {value!r}")

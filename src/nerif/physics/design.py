@@ -7,7 +7,7 @@ Measurement sensitivity and resolution for background oriented schlieren, J. Vis
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -150,7 +150,7 @@ def expect(ring: Ring, flow: DesignSettings) -> Expectation:
         resolution=math.sqrt(cone**2 + window**2 + airy**2),
         notes=(),
     )
-    return Expectation(**{**result.__dict__, "notes": tuple(_notes(result, ring, flow))})
+    return replace(result, notes=tuple(_notes(result, ring, flow)))
 
 
 def _notes(e: Expectation, ring: Ring, flow: DesignSettings) -> list[str]:

@@ -29,7 +29,6 @@ __all__ = [
     "density_from_index",
     "density_from_temperature",
     "gladstone_dale",
-    "index_excess_from_density",
     "molar_mass",
     "parse_mixture",
     "temperature_from_density",
@@ -248,14 +247,6 @@ def density_from_index(index_excess: Quantity, n_ambient: float, K: float) -> Qu
         If n_ambient < 1 or K <= 0.
     """
     return (index_excess + _refractivity(n_ambient)) / _positive("K", K, "m^3/kg", "see gladstone_dale")
-
-
-def index_excess_from_density(density: Quantity, n_ambient: float, K: float) -> Quantity:
-    """Return the index excess n - n_ambient = K rho - (n_ambient - 1) (1): `density_from_index` turned round.
-
-    `density` is (...) in kg/m^3; `n_ambient`, `K`, errors and dtype are those of `density_from_index`.
-    """
-    return density * _positive("K", K, "m^3/kg", "see gladstone_dale") - _refractivity(n_ambient)
 
 
 def temperature_from_density(density: Quantity, pressure_pa: float, molar_mass: float) -> Quantity:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -11,6 +12,9 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
 from nerif.volume import QUANTITIES, Volume
+
+if TYPE_CHECKING:
+    from nerif.measurement import Measurement
 
 __all__ = ["TEMPERATURE_RANGE", "GasSettings", "derive", "derive_all", "masked_lines"]
 
@@ -32,6 +36,19 @@ class GasSettings:
     def __post_init__(self) -> None:
         if not self.pressure_pa > 0:
             raise InputError(f"pressure_pa: expected a positive pressure in Pa, got {self.pressure_pa}")
+
+    def for_measurement(self, measurement: Measurement) -> GasSettings:
+        """Return the settings at the wavelength of a measurement, if it tells one.
+
+        Raises
+        ------
+        InputError
+            If density and temperature cannot be computed of it: before the long work, not after it.
+        """
+        wavelength = measurement.wavelength_nm
+        gas = self if wavelength is None else replace(self, wavelength_nm=wavelength)
+        density_from_index(0.0, measurement.n_ambient, gladstone_dale(gas.composition, gas.wavelength_nm))
+        return gas
 
 
 def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:

@@ -52,14 +52,12 @@ def draw_residuals(axes: Axes, residuals: np.ndarray, size: tuple[int, int], sca
 
 def save_errors(path: Path, calibration: Calibration) -> None:
     """Write a picture of the errors of every picture and of the residuals over each camera's picture."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     count = len(calibration.names)
     columns = min(5, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(12, 3.2 + 2.4 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(rows + 1, columns, height_ratios=[1.2] + [1] * rows)
     draw_errors(figure.add_subplot(grid[0, :]), calibration)
     typical = np.median([np.linalg.norm(r[:, 2:], axis=1).mean() for r in calibration.residuals])

@@ -20,6 +20,8 @@ __all__ = ["draw_displacement", "draw_plan", "draw_resolution", "save_design"]
 
 def draw_plan(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
     """Draw the rig from above: cameras, what they see, backgrounds and the flow; mm."""
+    from matplotlib.patches import Circle
+
     view = expect(ring, flow)
     for angle in np.radians(ring.angles):
         towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
@@ -29,7 +31,7 @@ def draw_plan(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
         axes.fill(*np.stack([lens, *edges]).T, color="#0072B2", alpha=0.08, linewidth=0)
         axes.plot(*np.stack(edges).T, color="black", linewidth=2)
         axes.plot(*lens, marker="o", color="#0072B2", markersize=5)
-    axes.add_patch(_circle(flow.flow_size / 2))
+    axes.add_patch(Circle((0, 0), flow.flow_size / 2, color="#D55E00", alpha=0.7))
     axes.set_aspect("equal")
     axes.set_xlabel("x [mm]")
     axes.set_ylabel("y [mm]")
@@ -75,20 +77,12 @@ def draw_resolution(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
 
 def save_design(path: Path, ring: Ring, flow: DesignSettings) -> None:
     """Write the three drawings side by side, as PNG or PDF by the ending."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
     first, second, third = figure.subplots(1, 3)
     draw_plan(first, ring, flow)
     draw_displacement(second, ring, flow)
     draw_resolution(third, ring, flow)
     with atomic(path) as part:
         figure.savefig(part, dpi=130)
-
-
-def _circle(radius: float):  # type: ignore[no-untyped-def]
-    from matplotlib.patches import Circle
-
-    return Circle((0, 0), radius, color="#D55E00", alpha=0.7)

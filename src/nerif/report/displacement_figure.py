@@ -17,7 +17,6 @@ MOST = 512  # px along the longer edge of a view
 
 def save_displacements(path: Path, measurement: Measurement) -> None:
     """Write a picture with u and v (px) of every view on one scale; what is not valid is left grey."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     step = _step(measurement)
@@ -28,7 +27,6 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
     columns = min(count, 5)
     rows = -(-count // columns)
     figure = Figure(figsize=(2.6 * columns + 1, 4.6 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(2 * rows, columns, squeeze=False)
     for axes in grid.flat:
         axes.set_visible(False)
@@ -53,7 +51,6 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
 
 def save_masks(path: Path, measurement: Measurement) -> None:
     """Write a picture with |d| (px) of every view and the outline of its flow mask."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     assert measurement.flow_mask is not None
@@ -66,7 +63,6 @@ def save_masks(path: Path, measurement: Measurement) -> None:
     count = len(measurement.cameras)
     columns = min(count, 5)
     figure = Figure(figsize=(2.6 * columns + 1, 2.5 * -(-count // columns)), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(-(-count // columns), columns, squeeze=False)
     for axes in grid.flat[count:]:
         axes.set_visible(False)

@@ -1,6 +1,6 @@
 """Volumes packed small enough to travel inside a page: 16 bit, differences along x, bytes apart, deflated, base64.
 
-The page holds the index excess once; n, density and temperature are simple functions of it (`Relation`), so that three
+The page holds the index excess once; n, density and temperature are simple functions of it (`relation`), so that three
 quantities take the room of one. What stands beside it (spread, error) has 12 bits. 65535 stands for a masked voxel.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import zlib
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,53 +19,31 @@ from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.volume import Volume
 
-__all__ = ["COARSE", "FINE", "LARGEST", "Relation", "coarsen", "pack", "relation", "unpack"]
+__all__ = ["COARSE", "FINE", "LARGEST", "MASKED", "coarsen", "pack", "relation"]
 
 LARGEST = 128  # voxels along the longest edge; finer volumes are averaged down, and the page says so
 MASKED = 65535
 FINE, COARSE = 65534, 4095
 
 
-@dataclass(frozen=True)
-class Relation:
-    """A quantity q of the index excess x: q = (x + offset) factor, or q = factor / (x + offset); masked out of bounds.
+def relation(quantity: str, attributes: dict[str, float | str]) -> dict[str, Any]:
+    """Return how n - 1, density or temperature q follow from the index excess x, by the attributes of the file.
 
-    Parameters
-    ----------
-    kind : "linear" or "reciprocal"
-    offset : 1
-    factor : unit of q
-    lower, upper : q is masked unless lower < q and lower <= q <= upper; None for no bound
+        linear: q = (x + offset) factor,      reciprocal: q = factor / (x + offset)
+
+    With a `lower` (None for no bound) q is masked unless x + offset > 0, with an `upper` unless lower <= q <= upper.
     """
-
-    kind: str
-    offset: float
-    factor: float
-    lower: float | None = None
-    upper: float | None = None
-
-    def __call__(self, x: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Return the quantity of an index excess, NaN where masked."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shifted = x.astype(np.float64) + self.offset
-            q = shifted * self.factor if self.kind == "linear" else self.factor / shifted
-            good = shifted > 0 if self.lower is not None else np.isfinite(q)
-            if self.lower is not None and self.upper is not None:
-                good &= (q >= self.lower) & (q <= self.upper)
-            return np.where(good, q, np.nan)
-
-
-def relation(quantity: str, attributes: dict[str, float | str]) -> Relation:
-    """Return how n - 1, density or temperature follow from the index excess, by the attributes of the file."""
     refractivity = float(attributes["n_ambient"]) - 1
+    found = {"kind": "linear", "offset": refractivity, "factor": 1.0, "lower": None, "upper": None}
     if quantity == "n":
-        return Relation("linear", refractivity, 1.0)
+        return found
     k = float(attributes["gladstone_dale_m3_kg-1"])
     if quantity == "density":
-        return Relation("linear", refractivity, 1 / k, lower=0.0)
+        return {**found, "factor": 1 / k, "lower": 0.0}
     pressure, mass = float(attributes["pressure_pa"]), float(attributes["molar_mass_kg_mol-1"])
     low, high = TEMPERATURE_RANGE
-    return Relation("reciprocal", refractivity, pressure * mass * k / GAS_CONSTANT, low, high)
+    factor = pressure * mass * k / GAS_CONSTANT
+    return {**found, "kind": "reciprocal", "factor": factor, "lower": low, "upper": high}
 
 
 def coarsen(volume: Volume, largest: int = LARGEST) -> Volume:
@@ -90,17 +67,3 @@ def pack(values: Float[np.ndarray, "z y x"], levels: int = FINE) -> dict[str, An
     data = np.concatenate([(steps & 255).astype(np.uint8), (steps >> 8).astype(np.uint8)])
     text = base64.b64encode(zlib.compress(data.tobytes(), 6)).decode()
     return {"low": low, "step": span / levels, "text": text}
-
-
-def unpack(packed: dict[str, Any], shape: tuple[int, ...]) -> Float[np.ndarray, "z y x"]:
-    """Return what `pack` was given, to within half a step: the page's own reading, written once more for tests."""
-    data = np.frombuffer(zlib.decompress(base64.b64decode(packed["text"])), dtype=np.uint8).astype(np.uint16)
-    steps = data[: len(data) // 2] | (data[len(data) // 2 :] << 8)
-    codes = np.cumsum(steps, dtype=np.uint16)
-    values = packed["low"] + codes * packed["step"]
-    return np.where(codes == MASKED, np.nan, values).reshape(shape)
-
-
-def as_plain(found: Relation) -> dict[str, Any]:
-    """Return a relation as what JSON can hold."""
-    return asdict(found)

@@ -16,7 +16,7 @@ from nerif.drawing import (
     add_colour_bar,
     colour_range,
     draw_displacement,
-    draw_slice,
+    draw_slices,
     label_of,
     shown,
     style,
@@ -42,12 +42,9 @@ TO_DRAW = ("n", "density", "temperature", "n_std", "density_std", "temperature_s
 
 def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi: int = 300) -> list[Path]:
     """Write NAME.pdf and NAME.png of every figure that the result has data for, and return the paths."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     paths = []
     with style():
         for name, figure in figures_of(result, *JOURNALS[journal]):
-            FigureCanvasAgg(figure)
             for ending in ("pdf", "png"):
                 paths.append(directory / f"{name}.{ending}")
                 with atomic(paths[-1]) as part:
@@ -106,12 +103,8 @@ def slices(volume: Volume, width: float) -> Figure:
     ratios = [ex, ex, ey]
     tallest = max(ey, ez)
     figure = _page(width, max(0.2, 0.80 * tallest / sum(ratios)) + 0.06)
-    limits = colour_range(shown(volume))
     line = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
-    for axes, normal in zip(line, "zyx", strict=True):
-        draw_slice(axes, volume, normal, limits)
-        n = volume.grid.shape["zyx".index(normal)]
-        axes.set_title(f"{normal} = {float(volume.grid.axis(normal)[n // 2]):.1f} mm")
+    draw_slices(line, volume, colour_range(shown(volume)))
     add_colour_bar(line, label_of(volume.quantity))
     return figure
 
@@ -122,12 +115,9 @@ def isosurface(volume: Volume, width: float) -> Figure:
     axes: Any = figure.add_axes((0.02, 0.04, 0.90, 0.88), projection="3d")
     level = default_level(volume)
     draw_isosurface(axes, volume, level)
-    figure.suptitle(f"{label_of(volume.quantity).partition(' [')[0]} = {level:.4g} {_unit(volume)}".rstrip(), y=0.97)
+    name, unit = label_of(volume.quantity).removesuffix("]").split(" [")
+    figure.suptitle(f"{name} = {level:.4g} {'' if unit == '1' else unit}".rstrip(), y=0.97)
     return figure
-
-
-def _unit(volume: Volume) -> str:
-    return "" if volume.unit == "1" else volume.unit.replace("m-3", "m$^{-3}$")
 
 
 def view(reprojection: Reprojection, i: int, width: float) -> Figure:
@@ -191,10 +181,7 @@ def comparison(excess: Volume, error: Volume, width: float) -> Figure:
     grid = figure.subplots(3, 3, gridspec_kw={"width_ratios": [ex, ex, ey]})
     rows = (("reconstruction", excess, limits), ("truth", truth, limits), ("error", error, (-reach, reach)))
     for (name, volume, scale), line in zip(rows, grid, strict=True):
-        for axes, normal in zip(line, "zyx", strict=True):
-            draw_slice(axes, volume, normal, scale, DIVERGING if name == "error" else None)
-            n = volume.grid.shape["zyx".index(normal)]
-            axes.set_title(f"{name}, {normal} = {float(volume.grid.axis(normal)[n // 2]):.1f} mm")
+        draw_slices(line, volume, scale, DIVERGING if name == "error" else None, name)
         add_colour_bar(list(line), "error of n [1]" if name == "error" else label_of("index_excess"))
     return figure
 
@@ -208,9 +195,7 @@ def error_of(result: Result) -> Volume | None:
         return None
     if excess.grid == truth.grid:
         return Volume(excess.values - truth.values, excess.grid)
-    inside = all(a >= b - 1e-6 for a, b in zip(excess.grid.box.lower, truth.grid.box.lower, strict=True))
-    inside &= all(a <= b + 1e-6 for a, b in zip(excess.grid.box.upper, truth.grid.box.upper, strict=True))
-    if not inside:
+    if not truth.grid.box.holds(excess.grid.box):
         return None
     field = VoxelField.through(truth.values, truth.grid)
     with torch.no_grad():

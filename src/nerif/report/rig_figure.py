@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,8 +46,7 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
         away = (0.09, 0.2)[around[i] % 2] * reach  # names of neighbours are not in each other's way
         name_at = camera.centre.numpy() + away * outward
         axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center", parse_math=False)
-        everything.append(name_at[None])
-        everything.append(hits)
+        everything += [name_at[None], hits]
     if box is not None:
         _draw_box(axes, box)
     for axis, (name, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
@@ -90,12 +90,10 @@ def draw_two_sides(figure: Figure, cameras: Sequence[Camera], box: Box | None = 
 def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> None:
     """Write a picture of the rig from two sides."""
     import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     with mpl.rc_context({"font.size": 8, "axes.titlesize": 9}):
         figure = Figure(figsize=(12, 6.2))
-        FigureCanvasAgg(figure)
         draw_two_sides(figure, cameras, box)
         with atomic(path) as part:
             figure.savefig(part, dpi=130)
@@ -116,14 +114,7 @@ def _close(axes: Axes3D, corners: np.ndarray, **style: object) -> None:
 
 
 def _draw_box(axes: Axes3D, box: Box) -> None:
-    lower, upper = np.array(box.lower), np.array(box.upper)
-    for axis in range(3):
-        for first in (0, 1):
-            for second in (0, 1):
-                a = lower.copy()
-                others = [k for k in range(3) if k != axis]
-                a[others[0]] = (lower, upper)[first][others[0]]
-                a[others[1]] = (lower, upper)[second][others[1]]
-                b = a.copy()
-                b[axis] = upper[axis]
-                axes.plot(*np.stack([a, b]).T, color="black", linewidth=1)
+    corners = np.array(list(itertools.product(*zip(box.lower, box.upper, strict=True))))
+    for a, b in itertools.combinations(corners, 2):
+        if np.count_nonzero(a != b) == 1:
+            axes.plot(*np.stack([a, b]).T, color="black", linewidth=1)

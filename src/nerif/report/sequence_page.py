@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.drawing import COLOUR_MAPS, colour_range
 from nerif.notebook import number
-from nerif.physics.quantities import GasSettings, derive
-from nerif.report import packing
-from nerif.report.html import QUANTITIES, flat, render_page, svg
-from nerif.report.isosurface import default_level
+from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import frames_there
+from nerif.report.scene import scene_over_time
 from nerif.report.summary import Statement
-from nerif.report.view_images import colour_table
-from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
 
 if TYPE_CHECKING:
@@ -25,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["render_sequence"]
 
-LARGEST = 48  # voxels along the longest edge: a page holds dozens of volumes
 MOST = 60  # frames on the page
 
 
@@ -43,7 +37,7 @@ def render_sequence(store: VolumeSequence) -> str:
     if "index_excess" not in store.quantities:
         raise InputError(f"{store.path}: expected index_excess among its quantities, got {', '.join(store.quantities)}")
     chosen = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST)).round().astype(int))]
-    scene, arrays = _scene(store, chosen)
+    scene, arrays = scene_over_time(store, chosen)
     statements = _statements(store)
     measured = store.attributes.get("measurement")
     return render_page(
@@ -59,51 +53,6 @@ def render_sequence(store: VolumeSequence) -> str:
         + flat(store.attributes.get("settings", {})),
         shown_of=(len(chosen), len(there)),
     )
-
-
-def _scene(store: VolumeSequence, chosen: list[int]) -> tuple[dict[str, Any], dict[str, str]]:
-    """What the page draws from, and the packed volumes by name."""
-    small = [packing.coarsen(store.volume(i, "index_excess"), LARGEST) for i in chosen]
-    packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
-    gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
-    quantities: dict[str, dict[str, Any]] = {}
-    for name, (button, label, unit) in QUANTITIES.items():
-        if name != "n" and gas is None:
-            continue
-        some = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
-        values = [v.values.double().numpy() - (name == "n") for v in some]
-        ends = [colour_range(v) for v in values]
-        quantities[name] = {
-            "button": button,
-            "label": label,
-            "unit": unit,
-            "relation": packing.as_plain(packing.relation(name, some[0].attributes)),
-            "colours": COLOUR_MAPS.get(name, "viridis"),
-            "level": float(np.median([default_level(v) for v in some])),
-            "range": [min(e[0] for e in ends), max(e[1] for e in ends)],
-        }
-    grid: Volume = small[0]
-    scene = {
-        "shape": grid.grid.shape,
-        "full_shape": store.grid.shape,
-        "lower": store.grid.box.lower,
-        "upper": store.grid.box.upper,
-        "arrays": {"value": {"low": packed[0]["low"], "step": packed[0]["step"]}},
-        "frames": [
-            {"index": i, "time": store.times[i], "low": p["low"], "step": p["step"]}
-            for i, p in zip(chosen, packed, strict=True)
-        ],
-        "quantities": quantities,
-        "variants": {"value": "Reconstruction"},
-        "diverging": "",
-        "tables": {
-            name: [c for rgb in colour_table(name) for c in rgb]
-            for name in sorted({q["colours"] for q in quantities.values()})
-        },
-        "cameras": [],
-    }
-    arrays = {"value": packed[0]["text"]}
-    return scene, arrays | {f"frame-{k}": p["text"] for k, p in enumerate(packed)}
 
 
 def _statements(store: VolumeSequence) -> list[Statement]:

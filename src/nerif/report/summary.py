@@ -9,9 +9,9 @@ import numpy as np
 
 from nerif.drawing import shown
 from nerif.notebook import number, percent, span
-from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
+from nerif.report.packing import relation
 from nerif.result import METRICS, VOLUME, Result
 
 __all__ = ["Statement", "came_out", "headline", "measured", "trust", "trust_figures"]
@@ -78,10 +78,8 @@ def _ambient_temperature(result: Result) -> float | None:
     volume = result.volumes.get("temperature")
     if volume is None:
         return None
-    a = volume.attributes
-    refractivity = float(a["n_ambient"]) - 1
-    k, p, mass = (float(a[key]) for key in ("gladstone_dale_m3_kg-1", "pressure_pa", "molar_mass_kg_mol-1"))
-    return p * mass * k / (GAS_CONSTANT * refractivity) if refractivity > 0 else None
+    found = relation("temperature", volume.attributes)
+    return found["factor"] / found["offset"] if found["offset"] > 0 else None
 
 
 def trust_figures(result: Result) -> list[tuple[str, str]]:
@@ -157,18 +155,15 @@ def _largest(views: list[dict[str, Any]], key: str) -> float | None:
 
 def _of_outcome(result: Result) -> list[Statement]:
     outcome, message = result.metrics.get("outcome"), result.metrics.get("message", "")
-    if outcome is None:
-        return []
-    if outcome == "diverged":
-        return [Statement("bad", f"The run diverged. {message}".strip())]
-    if outcome == "collapsed":
-        return [Statement("bad", f"The run found no field. {message}".strip())]
-    if outcome == "interrupted":
-        return [Statement("warning", f"The run was interrupted; --resume continues it. {message}".strip())]
-    if outcome in ("time_limit", "steps"):
-        limit = "time limit" if outcome == "time_limit" else "limit of steps"
-        return [Statement("note", f"The run ended at its {limit}; a longer one may be more accurate.")]
-    return []
+    ended = "The run ended at its {}; a longer one may be more accurate."
+    known = {
+        "diverged": ("bad", f"The run diverged. {message}"),
+        "collapsed": ("bad", f"The run found no field. {message}"),
+        "interrupted": ("warning", f"The run was interrupted; --resume continues it. {message}"),
+        "time_limit": ("note", ended.format("time limit")),
+        "steps": ("note", ended.format("limit of steps")),
+    }
+    return [Statement(level, text.strip()) for level, text in (known[outcome],)] if outcome in known else []
 
 
 def _of_held_out(result: Result) -> list[Statement]:

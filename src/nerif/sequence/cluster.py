@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import logging
 import os
@@ -15,11 +14,12 @@ import torch
 
 from nerif import __version__
 from nerif.conventions import InputError
+from nerif.toml import check_known
 
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["check_workers", "open_cluster", "slurm_cluster", "worker_count"]
+__all__ = ["check_workers", "open_cluster", "slurm_cluster"]
 
 CONFIG = {
     "distributed.scheduler.allowed-failures": 0,  # deaths are counted by frame, in run.py
@@ -29,21 +29,6 @@ CONFIG = {
 }
 NO_PROFILE = "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False"  # a job does not inherit CONFIG
 PREFIX = ("tcp://", "tls://", "ucx://", "ws://", "wss://")
-
-
-def require_dask() -> None:
-    """Raise InputError, with the remedy, where Dask is not installed."""
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise InputError("cluster: Dask is not installed; pip install 'nerif[sequence]'") from None
-
-
-def worker_count(workers: int) -> int:
-    """Return the workers of this machine: as asked, or one for each GPU, or one for each two cores."""
-    if workers < 0:
-        raise InputError(f"workers: expected 1 or more, or 0 for as many as fit, got {workers}")
-    return workers or torch.cuda.device_count() or max(1, _cores() // 2)
 
 
 def _cores() -> int:
@@ -59,17 +44,18 @@ def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
     Parameters
     ----------
     where : "local"; "tcp://host:port" of a scheduler; or a YAML file for SLURM (docs/sequences.md)
-    workers : of a local cluster; 0 for as many as fit
+    workers : of a local cluster; 0 for one for each GPU, or for each two cores
 
     Raises
     ------
     InputError
         If there is no such file or scheduler, or the file is not understood.
     """
-    require_dask()
-    import dask
-    from distributed import Client
-
+    try:
+        import dask
+        from distributed import Client
+    except ImportError:
+        raise InputError("cluster: Dask is not installed; pip install 'nerif[sequence]'") from None
     if where.startswith(PREFIX):
         with dask.config.set({"distributed.comm.timeouts.connect": "5s"}):
             try:
@@ -82,7 +68,7 @@ def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
         return
     with dask.config.set(CONFIG):
         if where == "local":
-            count = worker_count(workers)
+            count = workers or torch.cuda.device_count() or max(1, _cores() // 2)
             cluster, threads = _local_cluster(count), max(1, _cores() // count)
         else:
             cluster, threads = slurm_cluster(Path(where)), 0
@@ -166,11 +152,7 @@ def slurm_cluster(path: Path) -> Any:
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise InputError("cluster: dask-jobqueue is not installed; pip install 'nerif[cluster]'") from None
-    known = _slurm_names()
-    for name in settings:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0)[0]
-            raise InputError(f"{path}: unknown key '{name}'; the nearest known one is '{near}'; see docs/sequences.md")
+    check_known(settings, _slurm_names(), str(path), more="; see docs/sequences.md")
     cluster = SLURMCluster(**settings)
     cluster.scale(jobs=jobs)
     return cluster

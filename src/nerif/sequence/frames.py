@@ -26,7 +26,6 @@ from nerif.metrics import correlation
 from nerif.physics.deflection import Deflection, project
 from nerif.physics.quantities import derive
 from nerif.reconstruction.base import OnStep, Step
-from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
@@ -58,9 +57,6 @@ def end_without(parent: int) -> OnStep:
 
 def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event = lambda told: None) -> None:
     """Reconstruct the frames first to last - 1 that the store lacks."""
-    if plan.threads:
-        torch.set_num_threads(plan.threads)
-    keep_freed_memory()
     sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
     watch = end_without(os.getppid())
     before: NeuralField | None = None
@@ -100,7 +96,7 @@ def _frame(
     plan: SequencePlan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, watch: OnStep
 ) -> Frame:
     begun = time.perf_counter()
-    training = measurement.select([name for name in measurement.names if name not in plan.hold_out])
+    training = measurement.select([name for name in measurement.names if name not in plan.settings.hold_out])
     result = settings(training, watch, None, start)
     if result.outcome.failed:
         raise ArithmeticError(result.outcome.message)
@@ -112,9 +108,9 @@ def _frame(
 
 def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return what is written of a field: its volumes, and how it compares with what was measured."""
-    grid = Grid.of_resolution(measurement.box, plan.voxels)
+    grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
     excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})
-    volumes = [derive(excess, quantity, plan.gas) for quantity in plan.quantities]
+    volumes = [derive(excess, quantity, plan.settings.gas) for quantity in plan.settings.quantities]
     cc, rms = _against_measured(plan.cold.model, field, measurement, device)
     return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)
 

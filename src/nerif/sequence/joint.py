@@ -18,7 +18,6 @@ from torch import Tensor
 from nerif.fields.space_time import SpaceTimeField
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step, compose
-from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.files import CHECKPOINT, checkpoints, read_state
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.training_data import FrameData
@@ -35,9 +34,6 @@ TELL_EVERY = 50  # steps
 
 def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event = lambda told: None) -> None:
     """Reconstruct the frames first to last - 1 by one network, if the store lacks any of them."""
-    if plan.threads:
-        torch.set_num_threads(plan.threads)
-    keep_freed_memory()
     sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
     missing = [i for i in range(first, last) if store.status[i] == MISSING]
     if not missing:
@@ -80,7 +76,7 @@ def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event 
         try:
             field = data.field(trained.field, place)
             found = finished_frame(plan, field, sequence.frame(i), trained.device)
-            found = replace(found, seconds=seconds + time.perf_counter() - begun, steps=plan.joint_steps)
+            found = replace(found, seconds=seconds + time.perf_counter() - begun, steps=plan.settings.joint_steps)
             store.write_frame(i, found)
         except FAILURES as error:
             fail(i, error, 1)
@@ -94,7 +90,7 @@ def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event 
 def _read(plan: SequencePlan, sequence: MeasurementSequence, index: int) -> FrameData:
     """A frame without the views held out."""
     frame = sequence.frame(index)
-    training = frame.select([name for name in frame.names if name not in plan.hold_out])
+    training = frame.select([name for name in frame.names if name not in plan.settings.hold_out])
     return FrameData(replace(plan.cold, device="cpu"), training, coarsest=1)
 
 
@@ -104,10 +100,10 @@ def _trained(
     """The network, from the last checkpoint if there is one; after a failure anew, with half the learning rate."""
     reason = ""
     for attempt in range(ATTEMPTS):
-        rate, steps = plan.cold.learning_rate / 2**attempt, plan.joint_steps * len(frames)
+        rate, steps = plan.cold.learning_rate / 2**attempt, plan.settings.joint_steps * len(frames)
         settings = replace(plan.cold, learning_rate=rate, max_steps=steps)
         try:
-            data = ChunkData(settings, frames, tau, plan.time_octaves)
+            data = ChunkData(settings, frames, tau, plan.settings.time_octaves)
             training = Training(settings, data, _resumable(kept, data))
             result = training.run(compose(on_step, checkpoints(kept, CHECKPOINT_EVERY)))
             if result.outcome.failed:

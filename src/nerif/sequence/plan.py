@@ -1,20 +1,61 @@
-"""What every worker of a sequence has to know, wherever it runs."""
+"""How the frames of a sequence are reconstructed, and what every worker has to know, wherever it runs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+from nerif.conventions import InputError
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
+from nerif.volume import QUANTITIES
 
-__all__ = ["Event", "SequencePlan", "warm"]
+__all__ = ["Event", "SequencePlan", "SequenceSettings"]
 
 WARM_UP = 10  # steps over which the learning rate rises from weights that are good already
 
 Event = Callable[[dict[str, object]], None]
 """Told {"frame", "what": "begun" | "share" | "done" | "failed", ...} as a frame goes along."""
+
+LEAST = {"chunk": 1, "warm_steps": 1, "joint_steps": 1, "time_octaves": 0, "voxels": 1}
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """How the frames of a sequence are reconstructed, beside the settings of the network; kept in the store."""
+
+    chunk: int = 32
+    """Frames of a chunk of time; the first of each starts from nothing."""
+    warm_steps: int = 300
+    """Steps of a frame that starts from the one before."""
+    warm_rate: float = 0.7
+    """Share of the learning rate such a frame begins with."""
+    temporal: str = "frames"
+    """A network for each frame ("frames"), or one over space and time for each chunk ("joint")."""
+    joint_steps: int = 300
+    """Steps for each frame of a joint network."""
+    time_octaves: int = 3
+    """Of the encoding of time in a joint network."""
+    hold_out: tuple[str, ...] = ()
+    """Views kept out of the reconstruction, and compared with it."""
+    voxels: int = 100
+    """Voxels of the volumes along the longest edge of the box."""
+    quantities: tuple[str, ...] = ("index_excess", "density")
+    """Written of every frame: index_excess, n, density, temperature."""
+    gas: GasSettings = field(default_factory=GasSettings)
+    """What density and temperature are computed for."""
+
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        for quantity in self.quantities:
+            if quantity not in QUANTITIES:
+                raise InputError(f"quantities: expected some of {', '.join(QUANTITIES)}, got '{quantity}'")
+        if self.temporal not in ("frames", "joint"):
+            raise InputError(f"temporal: expected frames or joint, got '{self.temporal}'")
 
 
 @dataclass(frozen=True)
@@ -25,29 +66,23 @@ class SequencePlan:
     ----------
     measurement, out : stores
     cold : settings of a frame that starts from nothing
-    warm : settings of a frame that starts from the one before
-    voxels : of the volumes, along the longest edge
-    quantities : written
-    gas : what density and temperature are computed for
-    hold_out : views kept out
+    settings : of the sequence
     threads : of a worker on a CPU; 0 for its share of the cores
-    joint_steps : of training for each frame of a network over space and time; 0 for a network for each frame
-    time_octaves : of the encoding of time in it
     """
 
     measurement: Path
     out: Path
     cold: NeRIF
-    warm: NeRIF
-    voxels: int = 100
-    quantities: tuple[str, ...] = ("index_excess",)
-    gas: GasSettings = field(default_factory=GasSettings)
-    hold_out: tuple[str, ...] = ()
+    settings: SequenceSettings = field(default_factory=SequenceSettings)
     threads: int = 0
-    joint_steps: int = 0
-    time_octaves: int = 3
 
+    @property
+    def warm(self) -> NeRIF:
+        """Settings of a frame that starts from the one before: fewer steps, at a share of the learning rate."""
+        asked, warm_up = self.settings, min(self.cold.warm_up, WARM_UP)
+        return replace(self.cold, max_steps=asked.warm_steps, rate_after_fit=asked.warm_rate, warm_up=warm_up)
 
-def warm(cold: NeRIF, steps: int, rate: float) -> NeRIF:
-    """Return the settings of a frame that starts from the one before: fewer steps, at a share of the learning rate."""
-    return replace(cold, max_steps=steps, rate_after_fit=rate, warm_up=min(cold.warm_up, WARM_UP))
+    @property
+    def kept(self) -> dict[str, Any]:
+        """What the store keeps of it, JSON; none of it may change before the store is complete."""
+        return {"measurement": str(self.measurement), **asdict(self.settings), "settings": asdict(self.cold)}

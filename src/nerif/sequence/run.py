@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
+from nerif.reconstruction.device import keep_freed_memory
 from nerif.sequence.frames import ATTEMPTS, reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan
@@ -70,19 +72,18 @@ def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[in
 
 
 def run_sequence(
-    client: Client, plan: SequencePlan, length: int, on_progress: Callable[[Progress], None] = lambda progress: None
+    client: Client, plan: SequencePlan, on_progress: Callable[[Progress], None] = lambda progress: None
 ) -> Progress:
     """Reconstruct every missing frame of a store; whatever happens to workers, the rest goes on.
 
     Parameters
     ----------
     client : of a Dask cluster
-    length : frames of a chunk of time
     on_progress : told as frames are settled
     """
     from distributed import KilledWorker, as_completed
 
-    store = SequenceStore(plan.out)
+    store, length = SequenceStore(plan.out), plan.settings.chunk
     status = store.status
     missing = np.flatnonzero(status == MISSING).tolist()
     progress, topic = Progress(len(missing)), f"nerif-{uuid.uuid4()}"
@@ -145,9 +146,9 @@ def _in_worker(plan: SequencePlan, first: int, last: int, topic: str) -> None:
     from distributed import get_worker
 
     worker = get_worker()
-    if not plan.threads:
-        plan = replace(plan, threads=max(1, CPU_COUNT // worker.state.nthreads))
-    work = reconstruct_jointly if plan.joint_steps else reconstruct_frames
+    torch.set_num_threads(plan.threads or max(1, CPU_COUNT // worker.state.nthreads))
+    keep_freed_memory()
+    work = reconstruct_jointly if plan.settings.temporal == "joint" else reconstruct_frames
     work(plan, first, last, lambda told: worker.log_event(topic, told))
 
 
@@ -167,5 +168,5 @@ def outcome_table(store: SequenceStore) -> str:
         lines.append(f"{int((status == FAILED).sum())} failed:")
         lines += [f"  frame {i}: {reasons[i]}" for i in np.flatnonzero(status == FAILED)]
     if (status == MISSING).any():
-        lines.append(f"{int((status == MISSING).sum())} missing; the same command does them")
+        lines.append(f"{int((status == MISSING).sum())} missing; the same command again does them")
     return "\n".join(lines)

@@ -23,10 +23,10 @@ from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Grid
-from nerif.measurement_sequence import MeasurementSequence
+from nerif.measurement_sequence import MeasurementSequence, add_frames
 from nerif.netcdf import reading
 from nerif.volume import Volume
-from nerif.volume_sequence import VolumeSequence, add_frames
+from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore", "chunk_tau"]
 
@@ -103,12 +103,9 @@ class SequenceStore(VolumeSequence):
             def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
                 add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
 
-            nan = float("nan")
-            for name, unit, meaning in (("cc", "1", "correlation with"), ("rms_px", "px", "rms difference to")):
-                add_frames(
-                    group, name, frames, (views,), ("view",), "float64",
-                    units=unit, long_name=f"{meaning} what the view measured",
-                )  # fmt: skip
+            nan, seen = float("nan"), ((views,), ("view",), "float64")
+            add_frames(group, "cc", frames, *seen, units="1", long_name="correlation with what the view measured")
+            add_frames(group, "rms_px", frames, *seen, units="px", long_name="rms difference to what the view measured")
             add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
             add("index_scale", "float64", nan, "index excess of one unit of network output")
             add("offset", "float64", nan, "network output that counts as ambient")

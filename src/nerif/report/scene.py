@@ -1,0 +1,151 @@
+"""What the pages draw their own pictures from: grids, quantities and colours as JSON, and packed arrays beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerif.drawing import COLOUR_MAPS, DIVERGING, colour_range, shown
+from nerif.geometry import Grid
+from nerif.physics.quantities import GasSettings, derive
+from nerif.report import packing
+from nerif.report.isosurface import default_level
+from nerif.report.pages import error_of
+from nerif.report.rig_figure import picture_corners
+from nerif.report.view_images import colour_table
+from nerif.result import Result
+from nerif.volume import Volume
+from nerif.volume_sequence import VolumeSequence
+
+__all__ = ["QUANTITIES", "scene_of", "scene_over_time"]
+
+LARGEST = 48  # voxels of a sequence along the longest edge: its page holds dozens of volumes
+QUANTITIES = {
+    "n": ("Refractive index", "n − 1", ""),
+    "density": ("Density", "density", "kg m⁻³"),
+    "temperature": ("Temperature", "temperature", "K"),
+}
+"""Button, label of the colour bar, and unit."""
+
+
+def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
+    """Return what the page of a result draws from: grid, quantities, cameras; and the packed arrays by name."""
+    excess = result.volumes.get("index_excess")
+    if excess is None or "n_ambient" not in excess.attributes:
+        return None, {}
+    small = packing.coarsen(excess)
+    sources: dict[str, Volume] = {"value": small}
+    error = error_of(result)
+    if error is not None:
+        sources["error"] = packing.coarsen(error)
+    for statistic in ("mean", "std"):
+        if f"index_excess_{statistic}" in result.volumes:
+            sources[statistic] = packing.coarsen(result.volumes[f"index_excess_{statistic}"])
+        for quantity in ("density", "temperature"):
+            volume = result.volumes.get(f"{quantity}_{statistic}")
+            if volume is not None and _own(quantity, volume):
+                sources[volume.quantity] = packing.coarsen(volume)
+    packed = {
+        name: packing.pack(volume.values.double().numpy(), packing.FINE if name == "value" else packing.COARSE)
+        for name, volume in sources.items()
+    }
+    quantities = {
+        name: _quantity(name, result.volumes[name], default_level(result.volumes[name]))
+        for name in QUANTITIES
+        if name in result.volumes
+    }
+    if not quantities:
+        return None, {}
+    scene = {
+        **_scene(small.grid, excess.grid, quantities, _variants(sources), (DIVERGING, "cividis")),
+        "arrays": {name: {"low": p["low"], "step": p["step"]} for name, p in packed.items()},
+        "cameras": _cameras(result),
+    }
+    return scene, {name: p["text"] for name, p in packed.items()}
+
+
+def scene_over_time(store: VolumeSequence, chosen: list[int]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return what the page of a sequence draws from, of the frames chosen; and the packed volumes by name."""
+    small = [packing.coarsen(store.volume(i, "index_excess"), LARGEST) for i in chosen]
+    packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
+    gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
+    quantities = {}
+    for name in QUANTITIES if gas is not None else ("n",):
+        some = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
+        ends = [colour_range(shown(v)) for v in some]
+        quantities[name] = {
+            **_quantity(name, some[0], float(np.median([default_level(v) for v in some]))),
+            "range": [min(e[0] for e in ends), max(e[1] for e in ends)],
+        }
+    scales = [{"low": p["low"], "step": p["step"]} for p in packed]
+    scene = {
+        **_scene(small[0].grid, store.grid, quantities, {"value": "Reconstruction"}),
+        "arrays": {"value": scales[0]},
+        "frames": [{"index": i, "time": store.times[i], **s} for i, s in zip(chosen, scales, strict=True)],
+        "cameras": [],
+    }
+    arrays = {"value": packed[0]["text"]}
+    return scene, arrays | {f"frame-{k}": p["text"] for k, p in enumerate(packed)}
+
+
+def _quantity(name: str, volume: Volume, level: float) -> dict[str, Any]:
+    """How a quantity is called and coloured, and how it follows from the index excess; `level` of its isosurface."""
+    button, label, unit = QUANTITIES[name]
+    relation = packing.relation(name, volume.attributes)
+    colours = COLOUR_MAPS.get(name, "viridis")
+    return {"button": button, "label": label, "unit": unit, "relation": relation, "colours": colours, "level": level}
+
+
+def _scene(
+    small: Grid, full: Grid, quantities: dict[str, dict[str, Any]], variants: dict[str, str], more: Sequence[str] = ()
+) -> dict[str, Any]:
+    """What every scene has: grids, quantities, what can be switched to, and colours, `more` beside the quantities'."""
+    maps = sorted({q["colours"] for q in quantities.values()} | {*more})
+    return {
+        "shape": small.shape,
+        "full_shape": full.shape,
+        "lower": full.box.lower,
+        "upper": full.box.upper,
+        "quantities": quantities,
+        "variants": variants,
+        "diverging": DIVERGING if DIVERGING in maps else "",
+        "tables": {name: [c for rgb in colour_table(name) for c in rgb] for name in maps},
+    }
+
+
+def _own(quantity: str, volume: Volume) -> bool:
+    """Whether a statistic has to be packed for itself: it is no linear function of the excess, or masked somewhere."""
+    return quantity == "temperature" or not bool(torch.isfinite(volume.values).all())
+
+
+def _variants(sources: dict[str, Volume]) -> dict[str, str]:
+    """What can be switched to, and its button."""
+    found = {"value": "Reconstruction"}
+    if "mean" in sources:
+        found |= {"mean": "Ensemble mean", "std": "Standard deviation"}
+    if "error" in sources:
+        found |= {"truth": "Truth", "error": "Error"}
+    return found
+
+
+def _cameras(result: Result) -> list[dict[str, Any]]:
+    """Centre, directions of the picture's corners and where they meet the background, of every camera; mm."""
+    if result.measurement is None:
+        return []
+    held_out = () if result.reprojection is None else result.reprojection.held_out
+    found = []
+    for camera in result.measurement.cameras:
+        directions, hits = picture_corners(camera)
+        found.append(
+            {
+                "name": camera.name,
+                "held_out": camera.name in held_out,
+                "centre": camera.centre.tolist(),
+                "directions": np.round(directions, 6).tolist(),
+                "background": np.round(hits, 3).tolist(),
+            }
+        )
+    return found

@@ -1,0 +1,98 @@
+"""From a film to a store of volumes: all that `nerif sequence` does, as a Python call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from nerif.conventions import InputError
+from nerif.geometry import Grid
+from nerif.measurement_sequence import MeasurementSequence
+from nerif.reconstruction.neural import NeRIF
+from nerif.sequence.cluster import check_workers, open_cluster
+from nerif.sequence.plan import SequencePlan, SequenceSettings
+from nerif.sequence.run import Progress, outcome_table, run_sequence
+from nerif.sequence.store import MISSING, SequenceStore
+
+__all__ = ["reconstruct_sequence"]
+
+
+def reconstruct_sequence(
+    out: str | os.PathLike[str],
+    measurement: str | os.PathLike[str],
+    reconstructor: NeRIF,
+    settings: SequenceSettings | None = None,
+    *,
+    cluster: str = "local",
+    workers: int = 0,
+    threads: int = 0,
+    retry: bool = False,
+    force: bool = False,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> SequenceStore:
+    """Reconstruct every frame of a measurement sequence that a store lacks.
+
+    A script that calls it has to have an `if __name__ == "__main__":` around the call, since workers of this machine
+    are processes that import the script.
+
+    Parameters
+    ----------
+    out : store to make (.zarr), or to go on with
+    measurement : store of the measurement sequence
+    reconstructor : settings of the method
+    settings : of the sequence
+    cluster : "local", tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md)
+    workers : of a local cluster; 0 for one for each GPU, or for each two cores
+    threads : of each worker on a CPU; 0 for its share of the cores
+    retry : try again frames that failed in an earlier run
+    force : begin anew, whatever `out` holds
+    on_progress : told as frames are settled
+    say : told lines about how the work goes
+
+    Raises
+    ------
+    InputError
+        If anything asked cannot be, or `out` was begun with other settings; what is there stays as it is.
+    """
+    out, measurement, settings = Path(out), Path(measurement), settings or SequenceSettings()
+    for name, value in (("workers", workers), ("threads", threads)):
+        if value < 0:
+            raise InputError(f"{name}: expected 0 or more, got {value}")
+    if out.suffix != ".zarr":
+        raise InputError(f"out: expected a name ending in .zarr, got '{out.name}'")
+    if reconstructor.time_limit:
+        raise InputError("time_limit: expected none in a sequence, whose frames are to be repeatable; give --max-steps")
+    sequence = MeasurementSequence.read(measurement)
+    like = sequence.first_good()
+    like.without(settings.hold_out)
+    settings = replace(settings, gas=settings.gas.for_measurement(like))
+    plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)
+    store = _store(plan, sequence, force)
+    if retry:
+        say(f"{store.forget_failures()} failed frames are tried again")
+    missing = int((store.status == MISSING).sum())
+    try:
+        if missing:
+            say(f"{out}: {missing} of {len(sequence)} frames to do, in chunks of {settings.chunk}")
+            with open_cluster(cluster, workers) as (client, share):
+                if client.dashboard_link:
+                    say(f"dashboard: {client.dashboard_link}")
+                check_workers(client)
+                run_sequence(client, replace(plan, threads=threads or share), on_progress)
+    finally:  # interrupted or not
+        say(outcome_table(store))
+    return store
+
+
+def _store(plan: SequencePlan, sequence: MeasurementSequence, force: bool) -> SequenceStore:
+    """The store that is there if it was begun with the same settings, else a new one."""
+    kept = {"frames": len(sequence), **plan.kept}
+    if plan.out.exists() and not force:
+        store = SequenceStore(plan.out)
+        store.check_same(kept)
+        return store
+    grid = Grid.of_resolution(sequence.first_good().box, plan.settings.voxels)
+    return SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, plan.cold.network, kept)

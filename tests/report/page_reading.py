@@ -1,0 +1,31 @@
+"""What the page's JavaScript does with what is packed into it, written once more."""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from typing import Any
+
+import numpy as np
+
+from nerif.report.packing import MASKED
+
+
+def unpack(packed: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Return what `pack` was given, to within half a step."""
+    data = np.frombuffer(zlib.decompress(base64.b64decode(packed["text"])), dtype=np.uint8).astype(np.uint16)
+    steps = data[: len(data) // 2] | (data[len(data) // 2 :] << 8)
+    codes = np.cumsum(steps, dtype=np.uint16)
+    values = packed["low"] + codes * packed["step"]
+    return np.where(codes == MASKED, np.nan, values).reshape(shape)
+
+
+def quantity_of(relation: dict[str, Any], x: np.ndarray) -> np.ndarray:
+    """Return the quantity of an index excess, NaN where masked."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shifted = x.astype(np.float64) + relation["offset"]
+        q = shifted * relation["factor"] if relation["kind"] == "linear" else relation["factor"] / shifted
+        good = shifted > 0 if relation["lower"] is not None else np.isfinite(q)
+        if relation["upper"] is not None:
+            good &= (q >= relation["lower"]) & (q <= relation["upper"])
+        return np.where(good, q, np.nan)
