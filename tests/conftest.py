@@ -47,7 +47,7 @@ torch.set_num_threads(1)  # tests run side by side
 
 GROUPS = {"whole": "report", "experiment": "pictures"}
 """Fixtures of more than one file, by the group of the tests that use them."""
-LONGEST = ("test_docs", "pictures", "report", "test_consistency", "test_neural", "test_cluster", "test_joint", "test_cli")
+LONGEST = ("test_docs", "pictures", "report", "test_cluster", "test_consistency", "test_neural", "test_joint")
 """Groups to begin with, so that both processes end at about the same time."""
 
 

@@ -1,7 +1,7 @@
 """A random order without a list of it: a permutation that is computed where it is asked.
 
-A Feistel network on pairs of numbers below a = ceil(sqrt(count)) exchanges the two, each time adding to one, modulo a, a
-hash of the other; that is one-to-one whatever the hash. The few numbers that it carries to count or beyond are sent
+A Feistel network on pairs of numbers below a = ceil(sqrt(count)) exchanges the two, each time adding a hash of one to
+the other, modulo a; that is one-to-one whatever the hash. The few numbers that it carries to count or beyond are sent
 through it again until they are below.
 
 Source: Black & Rogaway, Ciphers with arbitrary finite domains, CT-RSA (2002).
