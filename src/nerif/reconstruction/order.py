@@ -8,6 +8,8 @@ Source: Black & Rogaway, Ciphers with arbitrary finite domains, CT-RSA (2002).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -15,6 +17,7 @@ from torch import Tensor
 __all__ = ["shuffled"]
 
 ROUNDS = 6
+BLOCK = 1 << 14  # places computed at once
 MULTIPLIER = 0x9E3779B1  # 2^32 / golden ratio, odd
 
 
@@ -27,10 +30,20 @@ def shuffled(first: int, length: int, count: int, seed: int) -> Int[Tensor, " n"
     count : things to put in order
     seed : of the order; each epoch has its own
     """
-    place = torch.arange(first, first + length)
-    epochs = torch.div(place, count, rounding_mode="floor")
-    keys = {epoch: _hash(seed * MULTIPLIER + epoch) for epoch in epochs.unique().tolist()}
-    return torch.cat([_permuted(place[epochs == epoch] % count, count, key) for epoch, key in keys.items()])
+    place, end, parts = first, first + length, [torch.empty(0, dtype=torch.long)]
+    while place < end:
+        epoch, inside = divmod(place, count)
+        start = inside - inside % BLOCK
+        part = _block(start, count, _hash(seed * MULTIPLIER + epoch))[inside - start :][: end - place]
+        parts.append(part)
+        place += len(part)
+    return torch.cat(parts)
+
+
+@lru_cache(maxsize=4)  # of batches that are smaller, several are cut out of one block
+def _block(start: int, count: int, key: int) -> Int[Tensor, " n"]:
+    """Up to BLOCK places of an epoch."""
+    return _permuted(torch.arange(start, min(start + BLOCK, count)), count, key)
 
 
 def _permuted(x: Int[Tensor, " n"], count: int, key: int) -> Int[Tensor, " n"]:
