@@ -45,16 +45,16 @@ from nerif.simulation import simulate
 torch.set_num_threads(1)  # tests run side by side
 
 
-GROUPS = {"whole": "report", "site": "docs", "experiment": "pictures"}
+GROUPS = {"whole": "report", "site": "docs", "experiment": "pictures", "five": "films", "film": "films"}
 """Fixtures that take long: tests that use one run in one process, so that it is made once."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep tests together that share a costly fixture."""
+    """Keep tests together that share a costly fixture, and otherwise those of a file, which share the lesser ones."""
     for item in items:
-        for fixture, group in GROUPS.items():
-            if fixture in getattr(item, "fixturenames", ()):
-                item.add_marker(pytest.mark.xdist_group(group))
+        used = getattr(item, "fixturenames", ())
+        group = next((name for fixture, name in GROUPS.items() if fixture in used), str(item.path))
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture
