@@ -53,7 +53,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep tests together that share a costly fixture, and otherwise those of a file, which share the lesser ones."""
     for item in items:
         used = getattr(item, "fixturenames", ())
-        group = next((name for fixture, name in GROUPS.items() if fixture in used), str(item.path))
+        group = next((name for fixture, name in GROUPS.items() if fixture in used), item.path.stem)
         item.add_marker(pytest.mark.xdist_group(group))
 
 
