@@ -45,9 +45,9 @@ from nerif.simulation import simulate
 torch.set_num_threads(1)  # tests run side by side
 
 
-GROUPS = {"whole": "report", "experiment": "pictures"}
+GROUPS = {"whole": "report", "experiment": "pictures", "five": "films", "film": "films"}
 """Fixtures of more than one file, by the group of the tests that use them."""
-LONGEST = ("test_docs", "pictures", "report", "test_cluster", "test_consistency", "test_neural", "test_joint")
+LONGEST = ("test_docs", "pictures", "films", "report", "test_cluster", "test_consistency", "test_neural", "test_joint")
 """Groups to begin with, so that both processes end at about the same time."""
 
 

@@ -93,6 +93,7 @@ def test_run_toml_repeats_the_run(work, tmp_path):
         str(work / "tv" / "run.toml"),
         "-o",
         str(tmp_path / "r"),
+        "--no-report",
     ]
     assert main(arguments) == 0
     again, first = read_field(tmp_path / "r")[0], read_field(work / "tv")[0]
@@ -102,7 +103,7 @@ def test_run_toml_repeats_the_run(work, tmp_path):
 def test_penalty_basis_model_and_bounds_are_options(work, tmp_path):
     arguments = ["reconstruct", str(work / "m.nc"), "--method", "tikhonov", "-o", str(tmp_path / "r"), "--voxels", "12"]
     arguments += ["--penalty", "laplacian", "--basis", "linear", "--model", "paraxial", "--regularisation", "1e-3"]
-    arguments += ["--upper", "0", "--lower", "-3e-4", "--iterations", "12", "--device", "cpu"]
+    arguments += ["--upper", "0", "--lower", "-3e-4", "--iterations", "12", "--device", "cpu", "--no-report"]
     assert main(arguments) == 0
     field = read_field(tmp_path / "r")[0]
     assert field.degree == 1
@@ -115,7 +116,7 @@ def test_start_from_another_result(work, tmp_path, source):
     small = [
         "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "5", "--samples",
         "12", "16", "--sample-jitter", "2", "--points-per-batch", "600", "--voxels", "12", "--device", "cpu",
-        "--precision", "float32", "--fit-steps", "300",
+        "--precision", "float32", "--fit-steps", "300", "--no-report",
     ]  # fmt: skip
     m, warm, cold = str(work / "m.nc"), tmp_path / "warm", tmp_path / "cold"
     assert main(["reconstruct", m, "-o", str(warm), "--start-from", str(work / "tv"), *small]) == 0
@@ -128,7 +129,8 @@ def test_start_from_another_result(work, tmp_path, source):
     assert rms[0] < rms[1]
     if source == "nerif":
         arguments = ["--method", "tikhonov", "--start-from", str(warm), "--voxels", "14", "--iterations", "2"]
-        assert main(["reconstruct", m, "-o", str(tmp_path / "t"), *arguments, "--device", "cpu"]) == 0
+        arguments += ["--device", "cpu", "--no-report"]
+        assert main(["reconstruct", m, "-o", str(tmp_path / "t"), *arguments]) == 0
         with (tmp_path / "t" / "history.csv").open() as file:
             assert {float(r["voxels"]) for r in csv.DictReader(file)} == {14.0}
 

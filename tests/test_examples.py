@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +15,10 @@ from nerif.measurement import Measurement
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def test_own_data(tmp_path):
+def test_own_data(tmp_path, monkeypatch):
     path = tmp_path / "mine.nc"
-    subprocess.run([sys.executable, str(EXAMPLES / "own_data.py"), str(path)], check=True)
+    monkeypatch.setattr(sys, "argv", ["own_data.py", str(path)])
+    runpy.run_path(str(EXAMPLES / "own_data.py"), run_name="__main__")
     m = Measurement.read(path)
     assert m.names == ("left", "right")
     assert len(m.rays()[0]) > 10_000

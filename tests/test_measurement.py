@@ -16,7 +16,7 @@ from nerif.measurement_file import VARIABLES
 from nerif.simulation import simulate
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def full(ball, box) -> Measurement:
     """Views of different size, with everything that is optional."""
     cameras = Ring(views=2, arc=(0, 60), image_size=(10, 14), pixel_pitch=0.2).cameras()

@@ -50,7 +50,7 @@ def test_default_steps_are_enough_for_the_flame():
     cameras, box = paper_rig(pixels=24)
     flame = Flame(box)
     rays = cameras[3].rays(cameras[3].pixel_grid().reshape(-1, 2)).clip(box)
-    rays = rays[rays.crosses].to(dtype=torch.float32)
+    rays = rays[rays.crosses][::4].to(dtype=torch.float32)
     fine = CurvedRays(4 * STEPS, 1.00027)(flame, rays)
     assert float((CurvedRays(STEPS, 1.00027)(flame, rays) - fine).norm() / fine.norm()) < 5e-4
 

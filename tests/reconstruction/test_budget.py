@@ -14,12 +14,12 @@ def test_the_time_limit_is_of_training_alone(measurement, monkeypatch):
 
     class Slow(training.NetworkOptimiser):
         def __init__(self, *arguments, **more):
-            time.sleep(3.0)
+            time.sleep(1.3)
             super().__init__(*arguments, **more)
 
     NeRIF(network=NetworkShape(depth=1, width=8), points_per_batch=64, max_steps=1, device="cpu")(measurement)
     monkeypatch.setattr(training, "NetworkOptimiser", Slow)
     settings = NeRIF(
-        network=NetworkShape(depth=1, width=8), points_per_batch=64, time_limit=2.5, max_steps=1, device="cpu"
+        network=NetworkShape(depth=1, width=8), points_per_batch=64, time_limit=1.0, max_steps=1, device="cpu"
     )
     assert settings(measurement).history

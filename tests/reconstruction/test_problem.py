@@ -79,7 +79,7 @@ def test_tikhonov_solves_the_stacked_least_squares_problem(problem, kind):
     matrix = np.vstack([columns(problem.forward, SHAPE), math.sqrt(weight) * columns(Penalty(problem, kind), SHAPE)])
     right = np.concatenate([problem.data.numpy().ravel(), np.zeros(matrix.shape[0] - problem.data.numel())])
     exact = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    iterate = last(Tikhonov(penalty=kind).iterate(problem, problem.zero(), weight), 300)
+    iterate = last(Tikhonov(penalty=kind).iterate(problem, problem.zero(), weight), 100)
     assert np.linalg.norm(iterate.x.numpy().ravel() - exact) < 1e-6 * np.linalg.norm(exact)
     misfit = matrix @ exact - right
     assert iterate.residual + weight * iterate.penalty == pytest.approx(float(misfit @ misfit), rel=1e-9)
@@ -89,7 +89,7 @@ def test_pinned_voxels_stay_ambient_and_the_rest_fits_without_them(measurement):
     free = torch.zeros(SHAPE, dtype=torch.bool)
     free[1:3, 1:4, 2:5] = True
     problem = make(measurement, free)
-    iterate = last(Tikhonov().iterate(problem, problem.zero(), 1e-3), 300)
+    iterate = last(Tikhonov().iterate(problem, problem.zero(), 1e-3), 100)
     assert float(iterate.x[~free].abs().max()) == 0
     chosen = free.numpy().ravel()
     stack = np.vstack([
@@ -103,7 +103,7 @@ def test_pinned_voxels_stay_ambient_and_the_rest_fits_without_them(measurement):
 def test_bounds_are_kept_and_the_solution_is_the_bounded_one(measurement):
     problem = make(measurement, bounds=(-4e-5, 1e-5))
     weight = 1e-3
-    iterate = last(Tikhonov().iterate(problem, problem.zero(), weight), 1500)
+    iterate = last(Tikhonov().iterate(problem, problem.zero(), weight), 200)
     low, high = problem.bounds
     assert low <= float(iterate.x.min())
     assert float(iterate.x.max()) <= high
@@ -113,7 +113,7 @@ def test_bounds_are_kept_and_the_solution_is_the_bounded_one(measurement):
     right = np.concatenate([problem.data.numpy().ravel(), np.zeros(matrix.shape[0] - problem.data.numel())])
     exact = scipy.optimize.lsq_linear(matrix, right, (low, high), tol=1e-12)
     assert int((exact.active_mask != 0).sum()) > 3  # the bounds matter
-    assert np.linalg.norm(iterate.x.numpy().ravel() - exact.x) < 1e-3 * np.linalg.norm(exact.x)
+    assert np.linalg.norm(iterate.x.numpy().ravel() - exact.x) < 1e-6 * np.linalg.norm(exact.x)
 
 
 @pytest.mark.parametrize("momentum", [False, True])
@@ -160,7 +160,7 @@ def test_faces_weigh_as_the_voxels_beside_them(problem):
 def test_total_variation_falls_to_a_minimum(problem):
     """Its objective falls from round to round, and no small step from the end of them lowers it."""
     weight, method = 1e-2, TotalVariation(softness=0.1, round=10)
-    path = list(itertools.islice(method.iterate(problem, problem.zero(), weight), 600))
+    path = list(itertools.islice(method.iterate(problem, problem.zero(), weight), 200))
     objective = [p.residual + weight * p.penalty for p in path]
     assert all(b <= a + 1e-9 for a, b in itertools.pairwise(objective[9::10]))
     end = path[-1].x

@@ -15,7 +15,7 @@ from nerif.geometry import Grid
 from nerif.reconstruction import kernels_torch
 from nerif.reconstruction import operator as operator_module
 from nerif.reconstruction import voxels as voxels_module
-from nerif.reconstruction.base import State, Step
+from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.files import read_field, read_state, write_field, write_state
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.problem import Iterate
@@ -31,6 +31,12 @@ METHODS = [
 NAMES = ["tikhonov", "landweber", "tv"]
 LEAST_CC = {"Tikhonov": 0.94, "Landweber": 0.86, "TotalVariation": 0.98}  # five views are few
 FIXED = Tikhonov(voxels=24, device="cpu", regularisation=1e-3, iterations=8, tolerance=0)
+
+
+@pytest.fixture(scope="module")
+def fixed(measurement) -> Reconstruction:
+    """What FIXED makes of the measurement."""
+    return FIXED(measurement)
 
 
 def error(result, ball, n_ambient: float) -> dict[str, float]:
@@ -62,12 +68,11 @@ def test_without_sigma_the_data_alone_decide(measurement, ball, method):
         assert "L-curve" in result.outcome.message
 
 
-def test_result_survives_the_disc(measurement, tmp_path):
-    result = FIXED(measurement)
-    write_field(tmp_path, result)
+def test_result_survives_the_disc(fixed, measurement, tmp_path):
+    write_field(tmp_path, fixed)
     field, box, n_ambient = read_field(tmp_path)
     points = Grid(box, (4, 5, 6)).points()
-    assert torch.equal(field(points), result.field(points))
+    assert torch.equal(field(points), fixed.field(points))
     assert (box, n_ambient) == (measurement.box, measurement.n_ambient)
 
 
@@ -125,9 +130,9 @@ def test_bounds_hold_everywhere(measurement):
     assert float(values.max()) <= 1e-9
 
 
-def test_open_faces_drop_rays(measurement):
-    everything, fewer = FIXED(measurement), replace(FIXED, open_faces=("z+",))(measurement)
-    assert not torch.equal(everything.field.coefficients, fewer.field.coefficients)
+def test_open_faces_drop_rays(fixed, measurement):
+    fewer = replace(FIXED, open_faces=("z+",))(measurement)
+    assert not torch.equal(fixed.field.coefficients, fewer.field.coefficients)
 
 
 def test_coarse_start_is_ahead_of_none(measurement):
@@ -147,15 +152,15 @@ def test_starting_from_a_field_skips_the_coarse_grids(measurement, ball):
     assert [r["voxels"] for r in on.history] == [24] * 3
 
 
-def test_double_precision_agrees_with_single(measurement):
-    single, double = FIXED(measurement), replace(FIXED, precision="float64")(measurement)
+def test_double_precision_agrees_with_single(fixed, measurement):
+    single, double = fixed, replace(FIXED, precision="float64")(measurement)
     assert double.field.coefficients.dtype == torch.float64
     difference = (single.field.coefficients - double.field.coefficients).norm() / double.field.coefficients.norm()
     assert float(difference) < 1e-3
 
 
 @pytest.mark.parametrize("level", [12, 24])
-def test_interrupted_run_is_usable_and_goes_on(measurement, tmp_path, level):
+def test_interrupted_run_is_usable_and_goes_on(fixed, measurement, tmp_path, level):
     def stop(step: Step) -> bool:
         return step.losses["voxels"] == level and step.step % 4 == 3
 
@@ -168,12 +173,11 @@ def test_interrupted_run_is_usable_and_goes_on(measurement, tmp_path, level):
     assert again.outcome.reason == "iterations"
     assert len(again.history) == 2 * FIXED.iterations  # each grid has had its iterations, none twice
     assert again.seconds > first.seconds
-    through = FIXED(measurement)
-    assert again.history[-1]["residual"] == pytest.approx(through.history[-1]["residual"], rel=0.2)
+    assert again.history[-1]["residual"] == pytest.approx(fixed.history[-1]["residual"], rel=0.2)
 
 
-def test_resume_goes_on_with_more_iterations(measurement):
-    first = FIXED(measurement)
+def test_resume_goes_on_with_more_iterations(fixed, measurement):
+    first = fixed
     more = replace(FIXED, iterations=14)(measurement, resume=first.state)
     assert len(more.history) == len(first.history) + 6
     assert more.history[-1]["objective"] < first.history[-1]["objective"]
@@ -211,9 +215,8 @@ def test_run_that_turns_non_finite_says_so(measurement, tmp_path):
     assert again.outcome.reason == "iterations"
 
 
-def test_settings_are_recorded(measurement):
-    result = FIXED(measurement)
-    assert result.settings == dataclasses.asdict(FIXED)
+def test_settings_are_recorded(fixed):
+    assert fixed.settings == dataclasses.asdict(FIXED)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -241,7 +244,7 @@ def test_settings_that_cannot_be_right(method, changes, words):
         method(**changes)
 
 
-def test_data_that_cannot_be_reconstructed(measurement, monkeypatch):
+def test_data_that_cannot_be_reconstructed(fixed, measurement, monkeypatch):
     with pytest.raises(InputError, match="ambient_faces: expected at least one face"):
         FIXED(replace(measurement, ambient_faces=()))
     with pytest.raises(InputError, match="flow_mask: the masks leave no voxel"):
@@ -249,7 +252,7 @@ def test_data_that_cannot_be_reconstructed(measurement, monkeypatch):
     with pytest.raises(InputError, match="open_faces: every ray crosses one"):
         replace(FIXED, open_faces=("x-", "x+", "y-", "y+", "z-", "z+"))(measurement)
     with pytest.raises(InputError, match="resume: the checkpoint is of another method or grid"):
-        replace(FIXED, voxels=30)(measurement, resume=FIXED(measurement).state)
+        replace(FIXED, voxels=30)(measurement, resume=fixed.state)
     monkeypatch.setattr(voxels_module, "available_memory", lambda device: 1 << 16)
     with pytest.raises(InputError, match=r"would need [\d.]+ GiB on cpu, which has 0.0 GiB free; give fewer --voxels"):
         FIXED(measurement)

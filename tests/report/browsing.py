@@ -34,7 +34,7 @@ def open_browser(profile: Path, *more: str) -> Any:
     return webdriver.Chrome(options=options, service=webdriver.ChromeService(executable_path=DRIVER))
 
 
-def show(driver: Any, page: Path, width: int = 1440, height: int = 900) -> None:
+def show(driver: Any, page: Path, width: int = 960, height: int = 640) -> None:
     """Open a page at a window's size and wait until it says that it is ready."""
     size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)

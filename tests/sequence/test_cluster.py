@@ -24,6 +24,7 @@ from nerif import __version__
 from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.sequence import cluster
 from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
 from nerif.sequence.plan import SequenceSettings
 from nerif.sequence.reconstruct import reconstruct_sequence
@@ -208,10 +209,11 @@ def test_a_scheduler_that_is_there_already_is_used(five, tmp_path):
     from distributed import LocalCluster
 
     out = tmp_path / "out.zarr"
-    with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-        address = cluster.scheduler_address
-        arguments = [*QUICK, "--chunk", "12", "--threads", "1", "--cluster", address]
-        assert main(["sequence", str(five), "-o", str(out), *arguments]) == 0
+    network = {"processes": False, "protocol": "tcp://", "dashboard_address": None}  # words go by sockets all the same
+    with LocalCluster(n_workers=1, threads_per_worker=1, **network) as running:
+        address = running.scheduler_address
+        arguments = [*QUICK, "--max-steps", "4", "--warm-steps", "2", "--chunk", "12", "--threads", "1"]
+        assert main(["sequence", str(five), "-o", str(out), *arguments, "--cluster", address]) == 0
     assert (status_of(out) == DONE).all()
 
 
@@ -246,8 +248,9 @@ def test_workers_that_could_not_read_the_job_are_refused():
         ("nowhere.yaml", "expected local, tcp://HOST:PORT or a YAML file"),
     ],
 )
-def test_a_cluster_that_is_not_there_is_refused(where, words, film, tmp_path, capsys):
-    assert main(["sequence", str(film), "-o", str(tmp_path / "o.zarr"), *QUICK, "--cluster", where]) == 2
+def test_a_cluster_that_is_not_there_is_refused(where, words, five, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cluster, "ANSWER_WITHIN", "0.2s")
+    assert main(["sequence", str(five), "-o", str(tmp_path / "o.zarr"), *QUICK, "--cluster", where]) == 2
     assert words in capsys.readouterr().err
 
 
@@ -274,8 +277,8 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path):
 
     settings = read_slurm(file)
     settings.pop("jobs")
-    with SLURMCluster(**settings) as cluster:
-        script = cluster.job_script()
+    with SLURMCluster(**settings) as jobs:
+        script = jobs.job_script()
     for line in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=8", "#SBATCH -t 02:00:00", "#SBATCH --gres=gpu:1"):
         assert line in script
     assert "--nthreads 1" in script
@@ -312,21 +315,21 @@ def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
         (["--hold-out", "0deg", "85deg", "170deg"], "every view is held out"),
     ],
 )
-def test_wrong_settings_are_refused_before_anything_is_made(arguments, words, film, tmp_path, capsys):
+def test_wrong_settings_are_refused_before_anything_is_made(arguments, words, five, tmp_path, capsys):
     out = tmp_path / "o.zarr"
-    assert main(["sequence", str(film), "-o", str(out), *QUICK, *arguments]) == 2
+    assert main(["sequence", str(five), "-o", str(out), *QUICK, *arguments]) == 2
     assert words in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_a_store_begun_with_other_settings_is_left_alone(film, tmp_path, capsys):
+def test_a_store_begun_with_other_settings_is_left_alone(five, tmp_path, capsys):
     out = tmp_path / "o.zarr"
-    arguments = ["sequence", str(film), "-o", str(out), *QUICK, "--cluster", "nowhere.yaml"]
+    arguments = ["sequence", str(five), "-o", str(out), *QUICK, "--cluster", "nowhere.yaml"]
     assert main(arguments) == 2  # the store is there now
     capsys.readouterr()
     assert main([*arguments, "--seed", "4"]) == 2
     assert "seed: expected 0, with which it was begun, got 4" in capsys.readouterr().err
-    assert main(["sequence", str(film), "-o", str(tmp_path / "o.nc"), *QUICK]) == 2
+    assert main(["sequence", str(five), "-o", str(tmp_path / "o.nc"), *QUICK]) == 2
     assert "ending in .zarr" in capsys.readouterr().err
 
 

@@ -6,6 +6,7 @@ By default the side faces of the box; where flow masks are given, all that lies 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -80,10 +81,19 @@ class AmbientRegion:
         """Draw about `count` random points, half of them outside the hull where there is one, mm."""
         points = []
         share = count // 2 if len(self.empty) and self.faces else count
-        for face in self.faces:
-            points.append(self.box.face_points(face, torch.rand(-(-share // len(self.faces)), 2, generator=generator)))
+        if self.faces:
+            corner, edges = self._face_frames
+            unit = torch.rand(len(self.faces), -(-share // len(self.faces)), 2, generator=generator)
+            points.append((corner + unit @ edges).reshape(-1, 3))
         if len(self.empty):
             chosen = torch.randint(len(self.empty), (share,), generator=generator)
             shift = (torch.rand(share, 3, generator=generator) - 0.5) * torch.tensor(self.voxel)
             points.append(self.empty[chosen] + shift)
         return torch.cat(points)
+
+    @cached_property
+    def _face_frames(self) -> tuple[Float[Tensor, "face 1 3"], Float[Tensor, "face 2 3"]]:
+        """A corner of each face, and the two edges that leave it, mm."""
+        unit = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        found = torch.stack([self.box.face_points(face, unit) for face in self.faces])
+        return found[:, :1], found[:, 1:] - found[:, :1]

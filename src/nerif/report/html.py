@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
 
 if TYPE_CHECKING:
+    import jinja2
     from matplotlib.axes import Axes
 
 __all__ = ["flat", "render", "render_page", "svg", "write"]
@@ -78,12 +80,7 @@ def render(result: Result) -> str:
 
 def render_page(scene: dict[str, Any] | None, **parts: Any) -> str:
     """Return the page of what report.html.j2 is given; parts that are left out are not shown."""
-    import jinja2
-
-    loader = jinja2.FileSystemLoader(ASSETS)
-    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["number"] = number
-    return environment.get_template("report.html.j2").render(
+    return _template().render(
         version=__version__,
         scene=scene,
         scene_json=_json(scene),
@@ -94,6 +91,16 @@ def render_page(scene: dict[str, Any] | None, **parts: Any) -> str:
         script="\n".join((ASSETS / name).read_text() for name in ("volume3d.js", "slices.js", "report.js")),
         **parts,
     )
+
+
+@cache  # to parse it takes half a second
+def _template() -> jinja2.Template:
+    import jinja2
+
+    loader = jinja2.FileSystemLoader(ASSETS)
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["number"] = number
+    return environment.get_template("report.html.j2")
 
 
 def _curves(result: Result) -> list[tuple[str, str]]:

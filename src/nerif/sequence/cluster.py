@@ -27,6 +27,7 @@ CONFIG = {
     "distributed.comm.timeouts.connect": "60s",
     "distributed.worker.profile.enabled": False,  # an hour of stack samples is a gigabyte
 }
+ANSWER_WITHIN = "5s"  # a scheduler that is there already
 NO_PROFILE = "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False"  # a job does not inherit CONFIG
 PREFIX = ("tcp://", "tls://", "ucx://", "ws://", "wss://")
 
@@ -57,7 +58,7 @@ def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
     except ImportError:
         raise InputError("cluster: Dask is not installed; pip install 'nerif[sequence]'") from None
     if where.startswith(PREFIX):
-        with dask.config.set({"distributed.comm.timeouts.connect": "5s"}):
+        with dask.config.set({"distributed.comm.timeouts.connect": ANSWER_WITHIN}):
             try:
                 client = Client(where)
             except (OSError, TimeoutError, ValueError) as error:
