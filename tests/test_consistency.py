@@ -193,7 +193,7 @@ def test_binning_keeps_rays_and_displacements(clean):
 
 def test_the_command_names_the_view(clean, tmp_path, capsys):
     path = tmp_path / "m.nc"
-    spoilt(clean.select(clean.names[:4]), in_view(2, lambda d: -d)).write(path)
+    spoilt(clean.select(clean.names[::2]), in_view(1, lambda d: -d)).write(path)
     assert main(["check", str(path), "--voxels", "16", "--strict"]) == 1
     said = capsys.readouterr().out
     assert "FOUND: view 60deg: the sign of the displacement is flipped" in said

@@ -74,7 +74,8 @@ def test_three_terms_of_the_paper_agree_on_a_fitted_field(measurement):
     )
     result = settings(measurement)
     assert set(result.history[-1]) >= {"consistency", "numerical", "head", "gauge", "loss"}
-    assert result.history[-1]["loss"] < 0.25 * result.history[0]["loss"]
+    last = [record["loss"] for record in result.history[-4:]]  # each of a batch of 70 rays
+    assert sum(last) / len(last) < 0.25 * result.history[0]["loss"]
     field = result.field
     grid = Grid.of_resolution(measurement.box, 12)
     p = field.normalise(grid.points().reshape(-1, 3))
