@@ -1,5 +1,5 @@
 # make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo
-# make test   set up, lint, check types, run the tests (some nine minutes on 2 slow cores)
+# make test   set up, run the tests, lint and types among them (five minutes on 2 cores; make test-all: the long ones too)
 # make docs   the documentation site: open docs/_build/html/index.html
 # make study  the paper's numerical study (hours; benchmarks/study): out/study; make study-quick: a small one, out/study-quick
 
@@ -12,10 +12,10 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 demo: .venv/.run
 	$(BIN)/nerif demo --out out/demo --force
 
-test: .venv/.dev lint
+test: .venv/.dev
 	$(PYTEST) -m "not slow"
 
-test-all: .venv/.dev lint
+test-all: .venv/.dev
 	$(PYTEST)
 
 lint: .venv/.dev
