@@ -301,6 +301,7 @@ def test_each_frame_of_a_joint_network_is_found_within_its_own_masks(moving, tmp
         assert abs(there) < 0.3e-4
 
 
+@pytest.mark.slow
 def test_the_command_reconstructs_jointly(short, tmp_path, capsys):
     out = tmp_path / "r.zarr"
     arguments = ["sequence", str(short), "-o", str(out), *QUICK, "--temporal", "joint", "--joint-steps", "8"]
