@@ -64,7 +64,7 @@ def run(
     octaves = int(changes.get("time_octaves", 3))
     settings = SequenceSettings(
         chunk=len(sequence), temporal="joint" if joint else "frames", joint_steps=int(joint) or 1, time_octaves=octaves,
-        warm_steps=int(steps) or 1, warm_rate=rate, voxels=voxels, quantities=("index_excess",),
+        warm_steps=int(steps) or 1, warm_rate=rate or 0.7, voxels=voxels, quantities=("index_excess",),
     )  # fmt: skip
     plan = SequencePlan(film, out, cold, settings)
     store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)

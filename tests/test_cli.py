@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -188,13 +189,28 @@ def test_export(work, tmp_path, ending):
     assert 0.05 < density.min() < density.max() < 1.6
 
 
-def test_a_reader_that_has_seen_enough_ends_a_command_in_silence(work):
+@pytest.fixture
+def nobody() -> Iterator[int]:
+    """A pipe that nobody reads."""
     read, write = os.pipe()
-    os.close(read)  # nobody reads
-    command = [sys.executable, "-m", "nerif", "info", str(work / "m.nc")]
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(read)
+    yield write
     os.close(write)
+
+
+@pytest.mark.parametrize("words", [["info", "m.nc"], ["--help"], pytest.param(["info", "-h"], marks=pytest.mark.slow)])
+def test_a_reader_that_has_seen_enough_ends_a_command_in_silence(work, nobody, words):
+    command = [sys.executable, "-m", "nerif", *words]
+    done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, text=True, cwd=work)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.slow
+def test_a_reconstruction_goes_on_when_nobody_reads_what_it_says(work, nobody, tmp_path):
+    command = [sys.executable, "-m", "nerif", "reconstruct", str(work / "m.nc"), "-o", str(tmp_path / "r"), *QUICK]
+    done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "r/report.html").is_file()
 
 
 def test_info_of_each_kind(work, capsys):

@@ -192,3 +192,21 @@ def test_truncated_file_is_refused_in_silence(full, tmp_path, capfd):
         with pytest.raises(InputError, match=r"cut.nc: not a readable NetCDF-4 file, or truncated"):
             Measurement.read(tmp_path / "cut.nc")
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.1])
+def test_rows_and_corners_without_a_wanted_pixel_are_passed_over(measurement, monkeypatch, distortion):
+    """Pixels are traced in blocks of rows; one that is masked, or beyond a smaller picture, has none."""
+    monkeypatch.setattr("nerif.measurement.CHUNK", 3 * measurement.displacement.shape[2])
+    cameras = [replace(c, distortion=torch.tensor([distortion, 0, 0, 0, 0]).double()) for c in measurement.cameras]
+    height, width = cameras[1].image_size
+    cameras[1] = cameras[1].view(0, 0, height - 12, width)
+    valid = torch.ones(measurement.displacement.shape[:3], dtype=torch.bool)
+    valid[0, :10] = False
+    rays, _, _ = replace(measurement, cameras=tuple(cameras), valid=valid).rays()
+    for i, camera in enumerate(cameras):
+        rows = slice(10, None) if i == 0 else slice(None, height - 12) if i == 1 else slice(None)
+        pixels = measurement.cameras[i].pixel_grid()[rows].reshape(-1, 2)
+        expected = camera.rays(pixels).clip(measurement.box)
+        mine = rays[(rays.origin - camera.centre.float()).norm(dim=-1) < 1e-2]
+        assert len(mine) == int(expected.crosses.sum()) > 0

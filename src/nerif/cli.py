@@ -37,7 +37,18 @@ def main(arguments: list[str] | None = None) -> int:
     0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted, 141 nobody reads
     what it prints any more.
     """
-    words = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        code = _run(sys.argv[1:] if arguments is None else list(arguments))
+        sys.stdout.flush()
+    except BrokenPipeError:  # nerif info FILE | head -2
+        from nerif.commands.output import silence
+
+        silence()
+        return 141
+    return code
+
+
+def _run(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         print("usage: nerif VERB [options]      (nerif VERB --help tells all options, units and defaults)\n")
         print("Refractive index, density and temperature in 3-D from background-oriented schlieren pictures.\n")
@@ -66,6 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     except SystemExit as stop:
         return int(stop.code or 0)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         return _refuse(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0

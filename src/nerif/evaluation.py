@@ -25,7 +25,7 @@ from nerif.volume import Volume
 from nerif.volume_file import read_volume
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
-SIDE_BY_SIDE = 4  # views that are scored at a time: each of a megapixel takes some 0.1 GiB
+AT_A_TIME = 8e6  # pixels of the views that are scored side by side: a megapixel takes some 0.1 GiB
 
 __all__ = ["FLOW", "evaluate", "evaluate_views", "evaluate_volume", "score_lines"]
 
@@ -96,7 +96,8 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
             view["rms_over_sigma"] = float(residual.square().mean().sqrt())
         return view
 
-    with ThreadPoolExecutor(min(torch.get_num_threads(), SIDE_BY_SIDE)) as threads:
+    side_by_side = int(min(torch.get_num_threads(), AT_A_TIME // compared[0].numel()))
+    with ThreadPoolExecutor(max(side_by_side, 1)) as threads:
         return list(threads.map(scores, range(len(measurement.cameras))))
 
 

@@ -24,7 +24,7 @@ def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict
         If it is missing (`expected` says what should be there), or no TOML.
     """
     try:
-        return tomllib.loads(Path(path).read_text())
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such {expected}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
@@ -36,7 +36,7 @@ def write_toml(path: str | os.PathLike[str], table: Mapping[str, Any], head: str
     import tomli_w
 
     with atomic(path) as part:
-        part.write_text(head + tomli_w.dumps(table))
+        part.write_text(head + tomli_w.dumps(table), encoding="utf-8")
 
 
 def check_known(words: Iterable[str], known: Iterable[str], where: str, what: str = "key", more: str = "") -> None:

@@ -317,6 +317,23 @@ def test_opencv_cameras_of_other_models_are_refused(tmp_path, key, value):
         import_cameras(path)
 
 
+def test_opencv_matrices_where_numbers_belong_are_refused(tmp_path):
+    a, path = arrays(ONE), tmp_path / "odd.yml"
+    write_opencv(path, {**a, "image_width": np.ones((2, 2)), "image_height": 160})
+    with pytest.raises(InputError, match=r"odd.yml: image_height, image_width: expected 2 numbers"):
+        import_cameras(path)
+    write_opencv(path, {**a, "xi": np.ones((1, 1))})
+    with pytest.raises(InputError, match=r"odd.yml.*undistort the pictures"):
+        import_cameras(path)
+
+
+def test_more_coefficients_than_there_is_a_place_for_are_refused(tmp_path):
+    path = tmp_path / "c.mat"
+    scipy.io.savemat(path, {**camera_parameters(1, "R2022b"), "RadialDistortion": np.ones(5)})
+    with pytest.raises(InputError, match="at most 3 radial and 2 tangential coefficients, got 5 and 2"):
+        import_cameras(path)
+
+
 def test_opencv_cameras_of_browns_model_are_read(tmp_path):
     a, path = arrays(ONE), tmp_path / "brown.yml"
     more = {"fisheye_model": 0, "distortion_model": "plumb_bob"}

@@ -38,3 +38,5 @@ def test_refusals():
         derive(volume, "density", GasSettings("phlogiston"))
     with pytest.raises(InputError, match="pressure_pa"):
         GasSettings(pressure_pa=-1)
+    with pytest.raises(InputError, match="pressure_pa"):
+        GasSettings(pressure_pa=float("inf"))

@@ -230,6 +230,7 @@ def view(held_out: bool, cc: float, noise: float | None) -> dict:
         ({"outcome": "diverged", "message": "loss is NaN"}, "bad", "loss is NaN"),
         ({"outcome": "collapsed", "message": "nothing there"}, "bad", "found no field. nothing there"),
         ({"outcome": "interrupted"}, "warning", "--resume"),
+        ({"outcome": ["steps"]}, "warning", "not compared with any view"),
         ({"outcome": "time_limit", "views": [view(False, 0.99, 1.0), view(True, 0.98, 1.1)]}, "note", "time limit"),
     ],
 )

@@ -309,6 +309,7 @@ def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
     [
         (["--workers", "-1"], "workers: expected 0 or more"),
         (["--chunk", "0"], "chunk: expected 1 or more"),
+        (["--warm-rate", "0"], "warm_rate: expected a share above 0"),
         (["--quantities", "pressure"], "quantities: expected some of"),
         (["--time-limit", "5"], "time_limit: expected none in a sequence"),
         (["--hold-out", "nobody"], "hold_out: expected views out of"),

@@ -14,18 +14,27 @@ from nerif.conventions import InputError
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import OnStep, Step, compose
 
-__all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say"]
+__all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say", "silence"]
 
 SAME_SIGNAL = 0.5  # seconds
 
 
 def say(text: str) -> None:
-    """Print a line for the user; where nobody reads any more, as in nerif info FILE | head -2, end in silence."""
+    """Print a line for the user."""
+    print(text, flush=True)
+
+
+def say_on(text: str) -> None:
+    """Print a line of long work, which goes on where nobody reads any more."""
     try:
-        print(text, flush=True)
+        say(text)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
-        raise SystemExit(141) from None
+        silence()
+
+
+def silence() -> None:
+    """Let what is still printed go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def check_file(path: Path, force: bool, *others: Path) -> None:
@@ -95,7 +104,10 @@ def figures_bar(title: str) -> Iterator[Callable[[float, str, float], None]]:
     console = Console(stderr=True)
     columns = (TextColumn(title), BarColumn(bar_width=20), TextColumn("{task.percentage:3.0f}% {task.fields[figures]}"))
     last = [0.0]
-    bar = Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=4)
+    bar = Progress(
+        *columns, console=console, disable=not console.is_terminal, refresh_per_second=4,
+        redirect_stdout=sys.stdout.isatty(),  # a file gets its lines, the bar or none
+    )  # fmt: skip
     task = bar.add_task(title, total=1.0, figures="")
 
     def update(share: float, figures: str, seconds: float) -> None:
@@ -132,5 +144,5 @@ def _training(title: str) -> Iterator[OnStep]:
         yield compose(bar, lambda _: asked[0])
 
 
-MONITOR = Monitor(say, _training, counting_bar)
+MONITOR = Monitor(say_on, _training, counting_bar)
 """The terminal, as the library tells it how the work goes."""

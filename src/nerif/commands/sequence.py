@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import figures_bar, say
+from nerif.commands.output import MONITOR, figures_bar
 from nerif.commands.settings import Flat, Settings, read_settings, value_given
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
@@ -58,12 +58,12 @@ def run(settings: Sequence) -> SequenceStore:
             figures += f" | {progress.failed} failed"
             if progress.settled:
                 figures += f" | {progress.seconds_left:.0f} s left"
-            bar(progress.settled / progress.total, figures, progress.seconds)
+            bar(progress.settled / max(progress.total, 1), figures, progress.seconds)
 
         return reconstruct_sequence(
             settings.out, settings.measurement, settings.reconstructor, settings.frames,
             cluster=settings.cluster, workers=settings.workers, threads=settings.threads,
-            retry=settings.retry, force=settings.force, on_progress=update, say=say,
+            retry=settings.retry, force=settings.force, on_progress=update, say=MONITOR.say,
         )  # fmt: skip
 
 

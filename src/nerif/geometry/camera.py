@@ -180,6 +180,8 @@ class Camera:
 
     def _undistort(self, distorted: Pixels) -> Pixels:
         """Invert the distortion by Newton's method (at most 20 steps)."""
+        if not (distorted.numel() and bool(self.distortion.any())):
+            return distorted
         ideal = distorted
         for _ in range(20):
             value, jacobian = self._distort(ideal)

@@ -30,8 +30,8 @@ from nerif.geometry import Camera, Plane
 from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = [
-    "FORMAT", "CalibratedCamera", "check_model", "checked", "five", "image_size", "numbers", "plane", "read_cameras",
-    "upright", "write_cameras",
+    "FORMAT", "CalibratedCamera", "check_model", "checked", "five", "flat", "image_size", "numbers", "plane",
+    "read_cameras", "upright", "write_cameras",
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"

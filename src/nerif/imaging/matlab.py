@@ -120,6 +120,10 @@ def _toolbox(
     radial, tangential = (
         flat(content.get(f"{kind}Distortion", []), f"{where}: {kind}Distortion") for kind in ("Radial", "Tangential")
     )
+    if radial.size > 3 or tangential.size > 2:
+        raise InputError(
+            f"{where}: expected at most 3 radial and 2 tangential coefficients, got {radial.size} and {tangential.size}"
+        )
     k1, k2, k3 = np.concatenate([radial, np.zeros(3)])[:3]
     p1, p2 = np.concatenate([tangential, np.zeros(2)])[:2]
     return CalibratedCamera(
@@ -179,8 +183,9 @@ def _size(content: dict[str, Any], key: str, where: str) -> tuple[int, int] | No
 def _bouguet(content: dict[str, Any], path: Path, pose: int) -> CalibratedCamera:
     """fc, cc, alpha_c, kc, and the pose of one picture."""
     rotation, translation = content.get(f"Rc_{pose}"), content.get(f"Tc_{pose}")
-    if rotation is None or translation is None or not np.isfinite(flat(rotation, f"{path}: Rc_{pose}")).all():
-        there = sorted(k for k in content if k.startswith("Rc_"))
+    # of a picture that was not used they are NaN
+    there = sorted(k for k in content if k.startswith("Rc_") and np.isfinite(flat(content[k], f"{path}: {k}")).all())
+    if f"Rc_{pose}" not in there or translation is None:
         raise InputError(
             f"{path}: expected the pose of picture {pose} (Rc_{pose}, Tc_{pose}), got {', '.join(there) or 'no pose'}; "
             "give the number of another --pose, or save the extrinsic parameters in one world frame"

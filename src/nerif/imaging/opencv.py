@@ -62,7 +62,7 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
         if values.get(key) is not None:
             check_model(values[key], f"{path}: {key}")
     for key in OTHER_MODELS:
-        if values.get(key):
+        if np.any(values.get(key)):
             check_model(key, str(path))
 
     def find(what: str, suffix: str) -> Any:
@@ -108,6 +108,6 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
 
 def _size(values: dict[str, Any], where: str) -> tuple[int, int] | None:
     for width, height in (("image_width", "image_height"), ("Image_Width", "Image_Height"), ("width", "height")):
-        if values.get(width) and values.get(height):
+        if values.get(width) is not None and values.get(height) is not None:
             return image_size([values[height], values[width]], f"{where}: {height}, {width}")
     return None

@@ -34,7 +34,7 @@ class GasSettings:
     """Pressure, Pa; assumed uniform."""
 
     def __post_init__(self) -> None:
-        if not self.pressure_pa > 0:
+        if not 0 < self.pressure_pa < math.inf:
             raise InputError(f"pressure_pa: expected a positive pressure in Pa, got {self.pressure_pa}")
 
     def for_measurement(self, measurement: Measurement) -> GasSettings:

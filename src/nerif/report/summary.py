@@ -163,7 +163,8 @@ def _of_outcome(result: Result) -> list[Statement]:
         "time_limit": ("note", ended.format("time limit")),
         "steps": ("note", ended.format("limit of steps")),
     }
-    return [Statement(level, text.strip()) for level, text in (known[outcome],)] if outcome in known else []
+    level, text = known.get(str(outcome), ("", ""))
+    return [Statement(level, text.strip())] if text else []
 
 
 def _of_held_out(result: Result) -> list[Statement]:

@@ -48,6 +48,11 @@ class SequenceSettings:
     """What density and temperature are computed for."""
 
     def __post_init__(self) -> None:
+        for name in ("hold_out", "quantities"):
+            if isinstance(getattr(self, name), str):
+                raise InputError(f"{name}: expected a tuple of names, got the text '{getattr(self, name)}'")
+        if not self.warm_rate > 0:
+            raise InputError(f"warm_rate: expected a share above 0, got {self.warm_rate}")
         for name, least in LEAST.items():
             if getattr(self, name) < least:
                 raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")

@@ -63,6 +63,8 @@ def reconstruct_sequence(
             raise InputError(f"{name}: expected 0 or more, got {value}")
     if out.suffix != ".zarr":
         raise InputError(f"out: expected a name ending in .zarr, got '{out.name}'")
+    if not isinstance(reconstructor, NeRIF):
+        raise InputError(f"reconstructor: expected NeRIF for a sequence, got {type(reconstructor).__name__}")
     if reconstructor.time_limit:
         raise InputError("time_limit: expected none in a sequence, whose frames are to be repeatable; give --max-steps")
     sequence = MeasurementSequence.read(measurement)
@@ -74,16 +76,19 @@ def reconstruct_sequence(
     if retry:
         say(f"{store.forget_failures()} failed frames are tried again")
     missing = int((store.status == MISSING).sum())
-    try:
-        if missing:
-            say(f"{out}: {missing} of {len(sequence)} frames to do, in chunks of {settings.chunk}")
+    if missing:
+        say(f"{out}: {missing} of {len(sequence)} frames to do, in chunks of {settings.chunk}")
+        try:
             with open_cluster(cluster, workers) as (client, share):
                 if client.dashboard_link:
                     say(f"dashboard: {client.dashboard_link}")
+                say("waiting for workers")
                 check_workers(client)
                 run_sequence(client, replace(plan, threads=threads or share), on_progress)
-    finally:  # interrupted or not
-        say(outcome_table(store))
+        except KeyboardInterrupt:
+            say(outcome_table(store))
+            raise
+    say(outcome_table(store))
     return store
 
 
