@@ -198,7 +198,7 @@ def nobody() -> Iterator[int]:
     os.close(write)
 
 
-@pytest.mark.parametrize("words", [["info", "m.nc"], ["--help"], pytest.param(["info", "-h"], marks=pytest.mark.slow)])
+@pytest.mark.parametrize("words", [["--help"], *(pytest.param(w, marks=pytest.mark.slow) for w in (["info", "m.nc"], ["info", "-h"]))])
 def test_a_reader_that_has_seen_enough_ends_a_command_in_silence(work, nobody, words):
     command = [sys.executable, "-m", "nerif", *words]
     done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, text=True, cwd=work)

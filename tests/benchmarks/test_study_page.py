@@ -110,6 +110,7 @@ def test_forward_models_show_where_they_are_known():
     assert "| paraxial | 0.0456 | 4.000% |" in text
 
 
+@pytest.mark.slow
 def test_written_page_needs_nothing_else(tmp_path):
     path = write_page(tmp_path, pairs(), ABOUT)
     assert path == tmp_path / "study.html"

@@ -199,8 +199,8 @@ def test_a_field_that_is_lost_is_taken_back(measurement, monkeypatch):
 @pytest.mark.parametrize(
     ("octaves", "width", "depth"),
     [
-        (0, 32, 8),
         (8, 32, 2),
+        pytest.param(0, 32, 8, marks=pytest.mark.slow),
         pytest.param(8, 128, 8, marks=pytest.mark.slow),
         pytest.param(5, 512, 2, marks=pytest.mark.slow),
     ],
