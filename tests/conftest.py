@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 # tests run side by side, each in a thread; threads that wait must not take the cores of other tests
 os.environ |= {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -42,6 +43,7 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
 from nerif.measurement import Measurement
+from nerif.reconstruction.training import Training
 from nerif.simulation import simulate
 
 torch.set_num_threads(1)  # tests run side by side
@@ -62,6 +64,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         group[item] = shared[0] if shared else item.path.stem
         item.add_marker(pytest.mark.xdist_group(group[item]))
     items.sort(key=lambda item: LONGEST.index(group[item]) if group[item] in LONGEST else len(LONGEST))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def checked_steps() -> Iterator[None]:
+    """Shapes are checked in the first step of a training; the others are like it, and many."""
+    run = Training.run
+
+    def run_checked_once(self: Training, on_step: Any = None) -> Any:
+        before = jaxtyping.config.jaxtyping_disable
+
+        def told(step: Any) -> Any:
+            jaxtyping.config.update("jaxtyping_disable", True)
+            return None if on_step is None else on_step(step)
+
+        try:
+            return run(self, told)
+        finally:
+            jaxtyping.config.update("jaxtyping_disable", before)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Training, "run", run_checked_once)
+        yield
 
 
 @pytest.fixture

@@ -198,7 +198,10 @@ def nobody() -> Iterator[int]:
     os.close(write)
 
 
-@pytest.mark.parametrize("words", [["--help"], *(pytest.param(w, marks=pytest.mark.slow) for w in (["info", "m.nc"], ["info", "-h"]))])
+SLOWER = [pytest.param(words, marks=pytest.mark.slow) for words in (["info", "m.nc"], ["info", "-h"])]
+
+
+@pytest.mark.parametrize("words", [["--help"], *SLOWER])
 def test_a_reader_that_has_seen_enough_ends_a_command_in_silence(work, nobody, words):
     command = [sys.executable, "-m", "nerif", *words]
     done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, text=True, cwd=work)
