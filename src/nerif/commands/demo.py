@@ -28,7 +28,7 @@ class Demo(Settings):
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
     """Directory to write."""
-    time_limit: float = 60.0
+    time_limit: float = 130.0
     """Seconds of training."""
     pixels: int = 64
     """Pixels along an edge of each view (the paper has 200)."""
