@@ -52,7 +52,7 @@ def rig(views: int, arc: float, pixels: int, sensor: float, seed: int) -> tuple[
                 rotation=rotation,
                 translation=-rotation @ (camera.centre + torch.from_numpy(rng.normal(0, 5, 3))),
                 intrinsics=k,
-                background=Plane(turn(0.03) @ camera.background.normal, -500.0 + float(rng.normal(0, 5))),
+                background=Plane(turn(0.03) @ camera.plane.normal, -500.0 + float(rng.normal(0, 5))),
                 distortion=torch.tensor([-0.15, 0.1, 0.0005, -0.0004, 0.0], dtype=torch.float64),
             )
         )
@@ -64,7 +64,7 @@ def between_planes(camera: Camera, normal: np.ndarray, offset: float) -> np.ndar
     height, width = camera.image_size
     pixels = torch.cartesian_prod(torch.linspace(0, width - 1, 9), torch.linspace(0, height - 1, 9)).double()
     rays = camera.rays(pixels)
-    points = (rays.origin + rays.background[:, None] * rays.direction).numpy()
+    points = rays.end_points.numpy()
     return points @ normal - offset
 
 

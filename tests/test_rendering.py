@@ -45,7 +45,7 @@ def test_a_ramp_is_seen_as_a_ramp(camera):
     width, height = pattern_size(camera)
     texture = background_texture(camera, ramp, max(width / 400, height / 300))
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2))
-    hit = rays.origin + rays.background[:, None] * rays.direction
+    hit = rays.end_points
     expected = ((hit - texture.corner) @ texture.right / texture.texel - 0.5) / 399
     picture = render(camera, texture)
     assert float((picture.flatten() - expected).abs().max()) < 1e-5

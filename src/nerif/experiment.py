@@ -183,7 +183,7 @@ def background_scale(cameras: Sequence[Camera]) -> float:
     middle = [
         torch.tensor([[(c.image_size[1] - 1) / 2, (c.image_size[0] - 1) / 2]], dtype=torch.float64) for c in cameras
     ]
-    ratios = [float(c.rays(m).background[0] / c.centre.norm()) for c, m in zip(cameras, middle, strict=True)]
+    ratios = [float(c.rays(m).ends.distance[0] / c.centre.norm()) for c, m in zip(cameras, middle, strict=True)]
     return round(min(ratios), 1)
 
 

@@ -104,11 +104,13 @@ class Measurement:
             v = torch.linspace(0, height - 1, min(height, 33), dtype=torch.float64)
             rays = camera.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False).clip(self.box)
             crossing |= bool(rays.crosses.any())
+            if camera.background is None:
+                continue
             normal = camera.background.normal.to(torch.float64)
             plane = corners @ normal - camera.background.offset
             behind = plane * float(camera.centre.to(torch.float64) @ normal - camera.background.offset)
             seen = rays[rays.crosses]
-            if len(seen) and (float(behind.min()) <= 0 or not bool((seen.background > seen.far).all())):
+            if len(seen) and (float(behind.min()) <= 0 or not bool(seen.unobstructed.all())):
                 raise InputError(
                     f"background of view '{camera.name}': expected a plane behind the box as the camera sees it, got "
                     "one that cuts or stands before the box; check background_normal, background_offset (mm) and box"
@@ -178,14 +180,14 @@ class Measurement:
 
         Rays are made in double precision: cameras stand far off, and positions lose digits in single precision.
         """
-        for camera, wanted in zip(self.cameras, mask, strict=True):
+        for view, (camera, wanted) in enumerate(zip(self.cameras, mask, strict=True)):
             rows = max(1, CHUNK // wanted.shape[1])
             for first in range(0, wanted.shape[0], rows):
                 block = wanted[first : first + rows]  # a view, through which the mask is changed
                 row, column = block.nonzero().unbind(-1)
                 pixels = torch.stack([column, row + first], dim=-1).to(camera.intrinsics.dtype)
-                rays = camera.rays(pixels, sensitivity).clip(self.box)
-                keep = rays.crosses & (rays.background > rays.far)
+                rays = camera.rays(pixels, sensitivity, view).clip(self.box)
+                keep = rays.unobstructed
                 block[row, column] = keep
                 yield rays, keep
 

@@ -72,8 +72,8 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         "distortion": stack([c.distortion for c in cameras]),
         "rotation": stack([c.rotation for c in cameras]),
         "translation": stack([c.translation for c in cameras]),
-        "background_normal": stack([c.background.normal for c in cameras]),
-        "background_offset": np.array([c.background.offset for c in cameras]),
+        "background_normal": stack([c.plane.normal for c in cameras]),
+        "background_offset": np.array([c.plane.offset for c in cameras]),
         "box": np.array([measurement.box.lower, measurement.box.upper]),
         "image_size": np.array([c.image_size for c in cameras], dtype=np.int32),
     }

@@ -7,7 +7,7 @@ is the mean of the texture at X. Without a field the same rays run straight: the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError, Points
 from nerif.fields.base import Field
-from nerif.geometry import Box, Camera, Plane, Rays
+from nerif.geometry import BackgroundPoints, Box, Camera, Plane, Rays
 from nerif.physics.ray_tracing import trace
 from nerif.simulation import STEPS
 
@@ -133,8 +133,8 @@ def background_texture(camera: Camera, values: Float[Tensor, "row column"], texe
     height, width = camera.image_size
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
     ray = camera.rays(middle)
-    centre = ray.origin[0] + ray.background[0] * ray.direction[0]
-    normal = camera.background.normal.to(torch.float64)
+    centre = ray.end_points[0]
+    normal = camera.plane.normal.to(torch.float64)
     normal = normal if float(normal @ ray.direction[0]) > 0 else -normal
     right = torch.linalg.cross(camera.rotation[1], normal)
     right = right / right.norm()
@@ -150,7 +150,7 @@ def pattern_size(camera: Camera) -> tuple[float, float]:
     edge = torch.tensor([-0.5, 0.5], dtype=torch.float64)
     corners = torch.cartesian_prod(edge * width + (width - 1) / 2, edge * height + (height - 1) / 2)
     rays = camera.rays(corners)
-    hits = rays.origin + rays.background[:, None] * rays.direction
+    hits = rays.end_points
     texture = background_texture(camera, torch.zeros(2, 2, dtype=torch.float64), 1.0)
     centre = texture.corner + texture.right + texture.down
     reach = ((hits - centre) @ torch.stack([texture.right, texture.down], dim=1)).abs().amax(dim=0)
@@ -202,7 +202,7 @@ def render(
             for du in shift:
                 pixels = camera.pixel_grid() + torch.stack([du, dv])
                 rays = _rays(camera, pixels.reshape(-1, 2), texture.plane, offset, focus)
-                points = rays.origin + rays.background[:, None] * rays.direction
+                points = rays.end_points
                 if movement is not None:
                     points = points + _between(movement, float(dv), float(du)).reshape(-1, 3)
                 light += texture.at(points).reshape(height, width)
@@ -219,7 +219,8 @@ def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], plane: Plane, offset: Fl
     direction = direction / direction.norm(dim=-1, keepdim=True)
     reach = (plane.offset - origin @ plane.normal) / (direction @ plane.normal)
     zero = torch.zeros_like(reach)
-    return Rays(origin, direction, straight.sensitivity, reach, zero, zero)
+    background = BackgroundPoints(straight.ends.sensitivity, reach)
+    return replace(straight, origin=origin, direction=direction, near=zero, far=zero, background=background)
 
 
 def _movement(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float, steps: int) -> Float[Tensor, "n 3"]:

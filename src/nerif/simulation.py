@@ -42,7 +42,7 @@ def view_displacement(
         # rays in single precision choose the precision of the field; positions stay double inside
         chosen = rays[part]
         moved = background_points(field, chosen.to(dtype=torch.float32), steps, n_ambient)
-        x0 = chosen.origin + chosen.background[:, None] * chosen.direction
+        x0 = chosen.end_points
         displacement[part] = camera.project(x0) - camera.project(x0 + moved)
     return displacement.reshape(*camera.image_size, 2).float()
 

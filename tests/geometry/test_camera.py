@@ -38,7 +38,7 @@ def pixels() -> torch.Tensor:
 
 def test_ray_ends_on_the_background_where_the_pixel_sees_it(camera, pixels):
     rays = camera.rays(pixels)
-    end = rays.origin + rays.background[:, None] * rays.direction
+    end = rays.end_points
     assert float((end @ camera.background.normal - camera.background.offset).abs().max()) < 1e-9
     assert float((camera.project(end) - pixels).abs().max()) < 1e-9
     assert torch.allclose(rays.direction.norm(dim=1), torch.ones(300, dtype=F64))
@@ -47,19 +47,19 @@ def test_ray_ends_on_the_background_where_the_pixel_sees_it(camera, pixels):
 
 def test_sensitivity_ignores_movement_along_the_ray(camera, pixels):
     rays = camera.rays(pixels)
-    along = torch.einsum("nij,nj->ni", rays.sensitivity, rays.direction)
-    assert float(along.abs().max()) < 1e-12 * float(rays.sensitivity.abs().max())
+    along = torch.einsum("nij,nj->ni", rays.ends.sensitivity, rays.direction)
+    assert float(along.abs().max()) < 1e-12 * float(rays.ends.sensitivity.abs().max())
 
 
 def test_sensitivity_against_finite_differences_of_project(camera, pixels):
     rays = camera.rays(pixels)
-    end = rays.origin + rays.background[:, None] * rays.direction
+    end = rays.end_points
     h = 1e-3  # mm
     for axis in range(3):
         shift = torch.zeros(3, dtype=F64)
         shift[axis] = h
         slope = -(camera.project(end + shift) - camera.project(end - shift)) / (2 * h)
-        assert float((slope - rays.sensitivity[..., axis]).abs().max()) < 1e-8
+        assert float((slope - rays.ends.sensitivity[..., axis]).abs().max()) < 1e-8
 
 
 def test_projection_against_opencv_s_formula_written_out(camera):
@@ -78,8 +78,9 @@ def test_crop_sees_the_same_rays(camera, pixels):
     part = camera.view(row=20, column=30, height=50, width=60)
     assert part.image_size == (50, 60)
     whole, cropped = camera.rays(pixels), part.rays(pixels - torch.tensor([30.0, 20.0], dtype=F64))
-    for name in ("origin", "direction", "sensitivity", "background"):
+    for name in ("origin", "direction", "end_points"):
         assert torch.allclose(getattr(whole, name), getattr(cropped, name), atol=1e-9)
+    assert torch.allclose(whole.ends.sensitivity, cropped.ends.sensitivity, atol=1e-9)
 
 
 def test_pixel_grid_is_column_then_row(camera):

@@ -17,7 +17,8 @@ BOX = Box((-1.0, -2.0, -3.0), (2.0, 4.0, 6.0))
 def ray(origin: list[float], direction: list[float]) -> Rays:
     d = torch.tensor([direction], dtype=F64)
     one = torch.ones(1, dtype=F64)
-    return Rays(torch.tensor([origin], dtype=F64), d / d.norm(), torch.zeros(1, 2, 3, dtype=F64), 100 * one, one, one)
+    nothing = torch.zeros(1, 2, dtype=F64), torch.zeros(1, dtype=torch.int16)
+    return Rays(torch.tensor([origin], dtype=F64), d / d.norm(), one, one, *nothing)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +88,7 @@ def test_paper_rig():
         assert origin.tolist() == pytest.approx([99.5, 99.5])
         assert float(above[1]) < float(origin[1])  # up in the world is up in the picture
         assert float(c.centre.norm()) == pytest.approx(700.0)
-        assert float(c.rays(torch.tensor([[99.5, 99.5]], dtype=F64)).background) == pytest.approx(1200.0)
+        assert float(c.rays(torch.tensor([[99.5, 99.5]], dtype=F64)).ends.distance) == pytest.approx(1200.0)
     first = cameras[0]
     corners = torch.tensor([[x, y, z] for x in (-25, 25) for y in (-25, 25) for z in (-25, 25)], dtype=F64)
     seen = first.project(corners)

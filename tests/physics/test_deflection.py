@@ -54,8 +54,8 @@ def test_lever_arm_meets_the_closed_form_of_a_gaussian_ball(cameras, cube):
     to_centre = torch.tensor([0.3, -0.4, 0.2], dtype=torch.float64) - rays.origin
     s_0 = (to_centre * rays.direction).sum(-1)
     b = s_0[:, None] * rays.direction - to_centre
-    size = a * math.sqrt(2 * math.pi) / w * (rays.background - s_0) * torch.exp(-b.square().sum(-1) / (2 * w * w))
-    expected = -torch.einsum("nij,nj->ni", rays.sensitivity, b) * size[:, None]
+    size = a * math.sqrt(2 * math.pi) / w * (rays.ends.distance - s_0) * torch.exp(-b.square().sum(-1) / (2 * w * w))
+    expected = -torch.einsum("nij,nj->ni", rays.ends.sensitivity, b) * size[:, None]
     chord = rays.far - rays.near
     clear = (chord > 20) & ((s_0 - rays.near).minimum(rays.far - s_0) > 9)  # tails inside the box
     assert int(clear.sum()) > 500

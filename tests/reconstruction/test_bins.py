@@ -41,7 +41,7 @@ def test_a_bin_is_the_weighted_mean_of_its_usable_pixels(noisy):
     (found,) = ((rays.direction - wanted.direction.float()).norm(dim=1) < 1e-6).nonzero()
     assert torch.allclose(displacement[found].double(), mean, atol=1e-6)
     assert torch.allclose(sigma[found].double(), weight.sum(0).rsqrt(), rtol=1e-5)
-    assert torch.allclose(rays.sensitivity[found], wanted.sensitivity.float(), rtol=1e-5)
+    assert torch.allclose(rays.ends.sensitivity[found], wanted.ends.sensitivity.float(), rtol=1e-5)
 
 
 def test_invalid_pixels_do_not_count(noisy):

@@ -95,7 +95,7 @@ def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(
     p = field.normalise(rays.at(s))
     weight = torch.ones_like(s)
     exact = torch.einsum(
-        "nij,nmj->ni", rays.sensitivity, field.network.value_and_gradient(p.reshape(-1, 3))[1].reshape(p.shape)
+        "nij,nmj->ni", rays.ends.sensitivity, field.network.value_and_gradient(p.reshape(-1, 3))[1].reshape(p.shape)
     )
     errors = []
     for reach in (1.6, 0.8, 0.4):

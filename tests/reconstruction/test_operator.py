@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
-from nerif.geometry import Box, Camera, Grid, Plane, Rays
+from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays
 from nerif.physics.deflection import Deflection
 from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.operator import DeflectionOperator
@@ -142,9 +143,8 @@ def test_turning_rig_and_flow_by_a_right_angle_changes_nothing(measurement, ball
     (ax, ay, az), (bx, by, bz) = measurement.box.lower, measurement.box.upper
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y, y to -x
     turned_box = Box((-by, ax, az), (-ay, bx, bz))
-    turned = Rays(
-        rays.origin @ turn.T, rays.direction @ turn.T, rays.sensitivity @ turn.T, rays.background, rays.near, rays.far
-    )
+    ends = BackgroundPoints(rays.ends.sensitivity @ turn.T, rays.ends.distance)
+    turned = replace(rays, origin=rays.origin @ turn.T, direction=rays.direction @ turn.T, background=ends)
     a = DeflectionOperator(rays, Grid(measurement.box, (6, 8, 10)), dtype=torch.float64)
     b = DeflectionOperator(turned, Grid(turned_box, (6, 10, 8)), dtype=torch.float64)
     c = random(6, 8, 10)
@@ -160,8 +160,8 @@ def test_a_constant_moves_nothing_and_a_slope_all_alike(rays, box):
     through = rays.clip(inner)
     a = DeflectionOperator(through, grid, boundary=Boundary(), dtype=torch.float64, step=0.05)
     x = grid.points(torch.float64)[..., 0]
-    lever = through.background - 0.5 * (through.near + through.far)
-    exact = through.sensitivity[:, :, 0] * (lever * (through.far - through.near))[:, None]
+    lever = through.ends.distance - 0.5 * (through.near + through.far)
+    exact = through.ends.sensitivity[:, :, 0] * (lever * (through.far - through.near))[:, None]
     assert torch.allclose(a(x), exact.double(), rtol=1e-4, atol=1e-4 * float(exact.abs().max()))
 
 
@@ -196,7 +196,7 @@ def test_what_cannot_be_right(rays, box):
 
 @pytest.mark.parametrize("basis", ["linear", "cubic"])
 def test_rays_that_miss_the_box_see_nothing(rays, box, basis):
-    away = Rays(rays.origin + 500, rays.direction, rays.sensitivity, rays.background, rays.near, rays.far).clip(box)
+    away = replace(rays, origin=rays.origin + 500).clip(box)
     both = Rays.concatenate([rays[:30], away[:10]])
     a = operator(both, box, basis=basis, dtype=torch.float64)
     c = random(*a.domain_shape)

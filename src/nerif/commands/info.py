@@ -71,12 +71,13 @@ def _measurement(path: Path, m: Measurement) -> None:
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
         away = float((c.centre - centre).norm())
-        plane = abs(float(centre @ c.background.normal.to(centre)) - c.background.offset)
+        plane = c.background
+        behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
         good = m.displacement[i][usable[i]]
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
         say(
-            f"  {c.name:<14} {size:>10} {float(c.intrinsics[0, 0]):11.1f} {away:23.1f} {plane:20.1f} "
+            f"  {c.name:<14} {size:>10} {float(c.intrinsics[0, 0]):11.1f} {away:23.1f} {behind:>20} "
             f"{share:8.1%} {float(good.square().mean().sqrt()):10.4f}"
         )
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points
-from nerif.geometry.rays import Rays
+from nerif.geometry.rays import BackgroundPoints, Rays
 
 __all__ = ["Camera", "Plane"]
 
@@ -36,7 +36,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera and the background it looks at.
+    """A calibrated camera, and the background it looks at if there is one.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Camera:
     rotation : (3, 3) world to camera
     translation : (3,) world to camera, mm
     image_size : (height, width), px
-    background : Plane of any orientation, world frame, mm
+    background : Plane of any orientation, world frame, mm; None for a technique that needs none
     distortion : (5,) OpenCV's k1, k2, p1, p2, k3
     name : what the view is called
 
@@ -58,24 +58,25 @@ class Camera:
     rotation: Matrix3
     translation: Float[Tensor, 3]
     image_size: tuple[int, int]
-    background: Plane
+    background: Plane | None
     distortion: Float[Tensor, 5]
     name: str = "camera"
 
     def __post_init__(self) -> None:
         plane = self.background
+        offset = 0.0 if plane is None else plane.offset
         for what, value, most, unit in (
             ("intrinsics", self.intrinsics, 1e7, "px"),
             ("translation", self.translation, LARGEST_LENGTH, "mm"),
             ("distortion", self.distortion, 1e6, ""),
-            ("background_offset", torch.tensor(plane.offset), LARGEST_LENGTH, "mm"),
+            ("background_offset", torch.tensor(offset), LARGEST_LENGTH, "mm"),
         ):
             if not bool((value.abs() <= most).all()):
                 got = value.tolist()
                 raise InputError(
                     f"{what} of view '{self.name}': expected numbers up to {most:g} {unit}".rstrip() + f", got {got}"
                 )
-        if not abs(float(plane.normal.norm()) - 1) < 1e-2:
+        if plane is not None and not abs(float(plane.normal.norm()) - 1) < 1e-2:
             raise InputError(
                 f"background_normal of view '{self.name}': expected a unit vector, got {plane.normal.tolist()}"
             )
@@ -109,6 +110,19 @@ class Camera:
         """Optical centre, mm, world frame."""
         return -self.rotation.T @ self.translation
 
+    @property
+    def plane(self) -> Plane:
+        """The background.
+
+        Raises
+        ------
+        InputError
+            If the camera has none.
+        """
+        if self.background is None:
+            raise InputError(f"background of view '{self.name}': expected a plane, normal . x = offset, got none")
+        return self.background
+
     def pixel_grid(self) -> Float[Tensor, "row column 2"]:
         """All pixel centres, px."""
         height, width = self.image_size
@@ -119,11 +133,13 @@ class Camera:
         """Project world points (mm) to pixels (px)."""
         return self._project_jacobian(points)[0]
 
-    def rays(self, pixels: Float[Tensor, "n 2"], sensitivity: bool = True) -> Rays:
-        """Back-trace the rays seen by `pixels` (px) to the background; not yet clipped to a box.
+    def rays(self, pixels: Float[Tensor, "n 2"], sensitivity: bool = True, view: int = 0) -> Rays:
+        """Back-trace the rays seen by `pixels` (px), to the background where there is one; not yet clipped to a box.
 
-        S = -d project / d X at the background point X0, so that S . direction = 0; left at 0 where only the paths are
-        asked for.
+        Parameters
+        ----------
+        sensitivity : whether S = -d project / d X at the background point X0 is wanted (S . direction = 0), else 0
+        view : number of the view, kept with the rays
         """
         k = self.intrinsics
         y = (pixels[..., 1] - k[1, 2]) / k[1, 1]
@@ -132,13 +148,19 @@ class Camera:
         direction = torch.cat([ideal, torch.ones_like(ideal[..., :1])], dim=-1) @ self.rotation
         direction = direction / direction.norm(dim=-1, keepdim=True)
         origin = self.centre.expand_as(direction)
+        zero = torch.zeros_like(pixels[..., 0])
+        number = torch.full(zero.shape, view, dtype=torch.int16)
+        return Rays(origin, direction, zero, zero, pixels, number, self._background_points(origin, direction, sensitivity))
+
+    def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
+        """Where rays meet the background, and S there."""
+        if self.background is None:
+            return None
         normal = self.background.normal.to(direction)
-        s_b = (self.background.offset - origin @ normal) / (direction @ normal)
-        zero = torch.zeros_like(s_b)
+        distance = (self.background.offset - origin @ normal) / (direction @ normal)
         if not sensitivity:
-            return Rays(origin, direction, zero[:, None, None].expand(-1, 2, 3), s_b, zero, zero)
-        _, jacobian = self._project_jacobian(origin + s_b[..., None] * direction)
-        return Rays(origin, direction, -jacobian, s_b, zero, zero)
+            return BackgroundPoints(torch.zeros_like(distance)[:, None, None].expand(-1, 2, 3), distance)
+        return BackgroundPoints(-self._project_jacobian(origin + distance[..., None] * direction)[1], distance)
 
     def view(self, row: int, column: int, height: int, width: int) -> Camera:
         """Return the camera of a crop of its image that starts at (row, column), px."""

@@ -66,7 +66,7 @@ class Deflection(ForwardModel):
             value, gradient = field.value_and_gradient(rays.at(s) + offset)
             gradient = gradient - angle * along[..., None]
         weights = integration_weights(rays, s, step, self.model) / (self.n_ambient + value)
-        return torch.einsum("nm,nij,nmj->ni", weights, rays.sensitivity, gradient)
+        return torch.einsum("nm,nij,nmj->ni", weights, rays.ends.sensitivity, gradient)
 
 
 def midpoints(rays: Rays, samples: int) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
@@ -81,9 +81,9 @@ def integration_weights(
 ) -> Float[Tensor, "n m"]:
     """Return lever arm times step, mm^2: what each sample of S grad(n) counts for."""
     if model == "paraxial":
-        lever = (rays.background - 0.5 * (rays.near + rays.far))[:, None].expand_as(s)
+        lever = (rays.ends.distance - 0.5 * (rays.near + rays.far))[:, None].expand_as(s)
     else:
-        lever = rays.background[:, None] - s
+        lever = rays.ends.distance[:, None] - s
     return lever * step
 
 

@@ -119,10 +119,10 @@ def expect(ring: Ring, flow: DesignSettings) -> Expectation:
     height, width = camera.image_size
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
     ray = camera.rays(middle)
-    to_flow, to_background = ring.distance, float(ray.background[0])
+    to_flow, to_background = ring.distance, float(ray.ends.distance[0])
     lever = to_background - to_flow
     # a deflection in the plane of the picture's columns
-    per_mrad = lever * float((ray.sensitivity[0, 0] @ camera.rotation[0]).abs()) / 1000
+    per_mrad = lever * float((ray.ends.sensitivity[0, 0] @ camera.rotation[0]).abs()) / 1000
     focal = float(camera.intrinsics[0, 0])
     at_flow, at_background = to_flow / focal, to_background / focal
     deflection = 1000 * flow.contrast * math.sqrt(2 * math.pi / math.e)

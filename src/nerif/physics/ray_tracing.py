@@ -66,8 +66,8 @@ def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: flo
     origin, direction = rays.origin.to(position), rays.direction.to(position)
     travelled = ((position - origin) * direction).sum(-1)
     cosine = (heading * direction).sum(-1)
-    reach = (rays.background.to(position) - travelled) / cosine
-    return position + reach[:, None] * heading - (origin + rays.background.to(position)[:, None] * direction)
+    reach = (rays.ends.distance.to(position) - travelled) / cosine
+    return position + reach[:, None] * heading - (origin + rays.ends.distance.to(position)[:, None] * direction)
 
 
 @dataclass(frozen=True)
@@ -89,4 +89,4 @@ class CurvedRays(ForwardModel):
 
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n 2"]:
         moved = background_points(field, rays, self.steps, self.n_ambient)
-        return torch.einsum("nij,nj->ni", rays.sensitivity.to(moved), moved).to(rays.origin.dtype)
+        return torch.einsum("nij,nj->ni", rays.ends.sensitivity.to(moved), moved).to(rays.origin.dtype)

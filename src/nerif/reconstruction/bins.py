@@ -53,7 +53,7 @@ def binned_rays(
         moment = _sums(weight.mean(-1, keepdim=True) * camera.pixel_grid(), edge)
         keep = (mean[..., 0] > 0) & _inside(camera, measurement.box, edge, open_faces)
         pixels = (moment / mean)[keep].to(camera.intrinsics.dtype)
-        rays = camera.rays(pixels).clip(measurement.box)
+        rays = camera.rays(pixels, view=i).clip(measurement.box)
         crosses = rays.crosses
         parts.append(rays[crosses].to(dtype=torch.float32))
         displacement.append((_sums(weight * d, edge)[keep] / total[keep])[crosses].float())
@@ -74,6 +74,6 @@ def _inside(camera: Camera, box: Box, edge: int, open_faces: tuple[str, ...]) ->
     rows, columns = (torch.arange(0, n + edge, edge)[: -(-n // edge) + 1].clamp(max=n) - 0.5 for n in (height, width))
     v, u = torch.meshgrid(rows.double(), columns.double(), indexing="ij")
     rays = camera.rays(torch.stack([u, v], dim=-1).reshape(-1, 2).to(camera.intrinsics.dtype)).clip(box)
-    good = rays.crosses & (rays.background > rays.far) & ~rays.exit_faces(box, open_faces)
+    good = rays.unobstructed & ~rays.exit_faces(box, open_faces)
     good = good.reshape(u.shape)
     return good[1:, 1:] & good[1:, :-1] & good[:-1, 1:] & good[:-1, :-1]

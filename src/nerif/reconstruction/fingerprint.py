@@ -62,7 +62,7 @@ def check_fingerprint(kept: dict[str, str] | None, asked: dict[str, str]) -> Non
 def _parts(camera: Camera) -> tuple[Any, ...]:
     plane = camera.background
     optics = (camera.intrinsics, camera.rotation, camera.translation, camera.distortion)
-    return (*optics, camera.image_size, plane.normal, plane.offset)
+    return (*optics, camera.image_size, *(() if plane is None else (plane.normal, plane.offset)))
 
 
 def digest(parts: Iterable[Any]) -> str:

@@ -99,7 +99,7 @@ def loss_terms(
         gradient = gradient.float().reshape(*shape, 3)
         if tilt is not None:
             gradient = gradient - tilt
-        d = torch.einsum("nm,nij,nmj->ni", weight, rays.sensitivity, gradient)
+        d = torch.einsum("nm,nij,nmj->ni", weight, rays.ends.sensitivity, gradient)
         return reduce((d - target.displacement) * target.inverse_scale, norm)
 
     terms = {}
@@ -137,8 +137,8 @@ def numerical_displacement(
     reach : of the differences to either side, in the same coordinates
     weight : lever arm times step in the units of the network
     """
-    length = rays.sensitivity.norm(dim=-1)  # px/mm
-    along = rays.sensitivity / length[..., None]
+    length = rays.ends.sensitivity.norm(dim=-1)  # px/mm
+    along = rays.ends.sensitivity / length[..., None]
     offset = reach[..., None, None] * along[:, None]  # n m 2 3
     centre = p[:, :, None, :]
     points = torch.stack([centre + offset, centre - offset])  # 2 n m 2 3

@@ -99,10 +99,10 @@ class DeflectionOperator:
         start, stride = start.masked_fill(missing, 1.0), stride.masked_fill(missing, 0.0)
         self._check_inside(start, start + (count - 1).clamp_min(0)[:, None] * stride)
         if model == "paraxial":
-            lever = torch.stack([rays.background - 0.5 * (rays.near + rays.far), torch.zeros_like(s)], dim=-1)
+            lever = torch.stack([rays.ends.distance - 0.5 * (rays.near + rays.far), torch.zeros_like(s)], dim=-1)
         else:
-            lever = torch.stack([rays.background - s, -interval], dim=-1)
-        matrix = rays.sensitivity * (interval / n_ambient)[:, None, None] / spacing
+            lever = torch.stack([rays.ends.distance - s, -interval], dim=-1)
+        matrix = rays.ends.sensitivity * (interval / n_ambient)[:, None, None] / spacing
         kept = (a.to(self.device, self.dtype).contiguous() for a in (start, stride, lever, matrix))
         return (*kept, count.to(self.device, torch.int32))
 

@@ -56,8 +56,8 @@ class Target:
         rms = float(displacement.square().mean().sqrt())
         if rms == 0:
             rms = 1.0  # no displacement at all: the answer is the ambient index, in whatever scale
-        lever = rays.background - 0.5 * (rays.near + rays.far)
-        pixels_per_radian = lever * rays.sensitivity.norm(dim=(1, 2)) / math.sqrt(2)
+        lever = rays.ends.distance - 0.5 * (rays.near + rays.far)
+        pixels_per_radian = lever * rays.ends.sensitivity.norm(dim=(1, 2)) / math.sqrt(2)
         index_scale = float((displacement / pixels_per_radian[:, None]).square().mean().sqrt()) or 1e-6
         if sigma is None:
             return cls(rays, displacement, torch.full_like(displacement, 1 / rms), index_scale)

@@ -106,7 +106,7 @@ def picture_corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         [[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=torch.float64
     )  # fmt: skip
     rays = camera.rays(pixels)
-    return rays.direction.numpy(), (rays.origin + rays.background[:, None] * rays.direction).numpy()
+    return rays.direction.numpy(), rays.end_points.numpy()
 
 
 def _close(axes: Axes3D, corners: np.ndarray, **style: object) -> None:
