@@ -42,7 +42,7 @@ def test_ray_ends_on_the_background_where_the_pixel_sees_it(camera, pixels):
     assert float((end @ camera.background.normal - camera.background.offset).abs().max()) < 1e-9
     assert float((camera.project(end) - pixels).abs().max()) < 1e-9
     assert torch.allclose(rays.direction.norm(dim=1), torch.ones(300, dtype=F64))
-    assert float(rays.background.min()) > 0
+    assert float(rays.ends.distance.min()) > 0
 
 
 def test_sensitivity_ignores_movement_along_the_ray(camera, pixels):

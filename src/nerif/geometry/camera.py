@@ -150,7 +150,8 @@ class Camera:
         origin = self.centre.expand_as(direction)
         zero = torch.zeros_like(pixels[..., 0])
         number = torch.full(zero.shape, view, dtype=torch.int16)
-        return Rays(origin, direction, zero, zero, pixels, number, self._background_points(origin, direction, sensitivity))
+        ends = self._background_points(origin, direction, sensitivity)
+        return Rays(origin, direction, zero, zero, pixels, number, ends)
 
     def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
         """Where rays meet the background, and S there."""
