@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
-from nerif.geometry import Box, Camera, Plane
+from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, projection_named
 from nerif.netcdf import values
 
 if TYPE_CHECKING:
@@ -88,6 +88,9 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         "n_ambient": measurement.n_ambient,
         "ambient_faces": " ".join(measurement.ambient_faces),
     }
+    kinds = [c.projection.name for c in cameras]
+    if set(kinds) != {PERSPECTIVE.name}:
+        dataset["projection"] = (("view",), kinds)
     if measurement.wavelength_nm is not None:
         dataset.attrs["wavelength_nm"] = measurement.wavelength_nm
     return dataset
@@ -182,6 +185,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     distortion = _array(dataset, "distortion") if "distortion" in dataset else torch.zeros(views, 5).double()
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
     normals, offsets = _array(dataset, "background_normal"), _array(dataset, "background_offset")
+    kinds = dataset["projection"].values if "projection" in dataset else [PERSPECTIVE.name] * views
     cameras = []
     for i, name in enumerate(names):
         length = float(normals[i].norm())
@@ -197,6 +201,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 background=Plane(normals[i] / length, float(offsets[i]) / length),
                 distortion=distortion[i],
                 name=name,
+                projection=projection_named(str(kinds[i]), f"projection of view '{name}'"),
             )
         )
     return tuple(cameras)
