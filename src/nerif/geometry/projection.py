@@ -50,7 +50,7 @@ class Projection(ABC):
         """Return d g / d (X, Y, Z) of what has d g / d (x, y) = (along_x, along_y), at points and their (x, y)."""
 
     @abstractmethod
-    def lines(self, image: Pixels) -> tuple[Points, Points]:
+    def lines(self, image: Pixels) -> tuple[Float[Tensor, "*#batch 3"], Points]:
         """Return where the lines seen at (x, y) start, mm (one place if it is the same), and their directions.
 
         The directions are of any length, and lead away from the camera.
@@ -87,7 +87,7 @@ class Perspective(Projection):
         along_z = -(along_x * image[..., 0] + along_y * image[..., 1])
         return along_x / depth, along_y / depth, along_z / depth
 
-    def lines(self, image: Pixels) -> tuple[Points, Points]:
+    def lines(self, image: Pixels) -> tuple[Float[Tensor, "*#batch 3"], Points]:
         direction = torch.cat([image, torch.ones_like(image[..., :1])], dim=-1)
         return direction.new_zeros(3), direction
 
@@ -117,7 +117,7 @@ class Telecentric(Projection):
     def slope(self, along_x: Array, along_y: Array, image: Array, local: Array) -> tuple[Array, Array, Array]:
         return along_x, along_y, 0 * along_x
 
-    def lines(self, image: Pixels) -> tuple[Points, Points]:
+    def lines(self, image: Pixels) -> tuple[Float[Tensor, "*#batch 3"], Points]:
         start = torch.cat([image, torch.zeros_like(image[..., :1])], dim=-1)
         return start, self.sight(start)
 
