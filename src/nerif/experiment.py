@@ -26,7 +26,7 @@ from nerif.toml import write_toml
 from nerif.volume import Volume
 from nerif.volume_file import write_netcdf
 
-__all__ = ["Experiment", "background_poses", "background_scale", "place", "target_poses", "world_axes"]
+__all__ = ["Experiment", "background_poses", "background_scale", "place", "side_of_one", "target_poses", "world_axes"]
 
 SIDES = {
     (1, 0): ("z-", "x+", "y-"),
@@ -117,6 +117,10 @@ class Experiment:
             "background_scale": background_scale(cameras),
             "target": asdict(self.target_for(cameras)),
         }
+        if not cameras[0].projection.shows_depth:
+            settings["projection"] = cameras[0].projection.name
+            settings["side"] = side_of_one(cameras)
+            settings["background_distance"] = -cameras[0].plane.offset
         write_toml(path, settings)
 
     def write_targets(
@@ -191,6 +195,14 @@ def background_scale(cameras: Sequence[Camera]) -> float:
 def world_axes(cameras: Sequence[Camera]) -> tuple[str, str, str]:
     """Return the axes (as nerif calibrate takes them) of the first target pose: the rig's own world."""
     return SIDES[_side(cameras)]
+
+
+def side_of_one(cameras: Sequence[Camera]) -> tuple[str, str]:
+    """Return a view that stands to one side of the first target pose, and on which side of the world that is."""
+    across = (_side(cameras)[0] == 0, _side(cameras)[1] == 0)  # x or y
+    places = [-c.sight(ORIGIN)[:2] @ torch.tensor(across, dtype=torch.float64) for c in cameras]
+    i = max(range(len(cameras)), key=lambda k: abs(float(places[k])))
+    return cameras[i].name, f"{'x' if across[0] else 'y'}{'+' if float(places[i]) > 0 else '-'}"
 
 
 def _side(cameras: Sequence[Camera]) -> tuple[int, int]:

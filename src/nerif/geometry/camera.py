@@ -94,8 +94,8 @@ class Camera:
         k = self.intrinsics
         if not min(float(k[0, 0]), float(k[1, 1])) >= self.projection.least_scale:
             raise InputError(
-                f"intrinsics of view '{self.name}': expected positive {self.projection.scale}, "
-                f"got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}"
+                f"intrinsics of view '{self.name}': expected positive {self.projection.scale}s in "
+                f"{self.projection.unit}, got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}"
             )
         if abs(float(k[2, 2]) - 1) > 1e-9 or float(k[2, :2].abs().max()) > 0 or float(k[1, 0]) != 0:
             raise InputError(

@@ -37,7 +37,9 @@ class Projection(ABC):
     shows_depth: ClassVar[bool]
     """Whether a picture changes with the depth of what it shows."""
     scale: ClassVar[str]
-    """What fx and fy of K are, with their unit."""
+    """What fx and fy of K are called."""
+    unit: ClassVar[str]
+    """Of fx and fy."""
     least_scale: ClassVar[float]
     """Of fx and fy."""
 
@@ -76,7 +78,8 @@ class Perspective(Projection):
     name = "perspective"
     begin = 0.0
     shows_depth = True
-    scale = "focal lengths in px"
+    scale = "focal length"
+    unit = "px"
     least_scale = 1.0
 
     def image(self, local: Array) -> Array:
@@ -108,7 +111,8 @@ class Telecentric(Projection):
     name = "telecentric"
     begin = -math.inf
     shows_depth = False
-    scale = "scales in px/mm"
+    scale = "scale"
+    unit = "px/mm"
     least_scale = 1 / LARGEST_LENGTH
 
     def image(self, local: Array) -> Array:

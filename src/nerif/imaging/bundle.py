@@ -242,20 +242,23 @@ class _Layout:
     def cost(self, x: np.ndarray) -> float:
         """The sum that is minimised, px^2."""
         bundle = self.unpack(x)
-        knee, total = HUBER * self.noise, float((self._prior(bundle) ** 2).sum())
-        for o in self.observations:
-            length = np.linalg.norm(bundle.residual(o), axis=1)
-            total += float(np.where(length < knee, length**2, 2 * knee * length - knee**2).sum())
-        return total
+        loss = sum(self._loss(np.linalg.norm(bundle.residual(o), axis=1)) for o in self.observations)
+        return loss + float((self._prior(bundle) ** 2).sum())
+
+    def _loss(self, length: np.ndarray) -> float:
+        """Huber's loss of residuals, px^2."""
+        knee = HUBER * self.noise
+        return float(np.where(length < knee, length**2, 2 * knee * length - knee**2).sum())
 
     def normal_equations(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """The cost, J^T W J and J^T W r, with Huber's weights W and J the derivatives of r = expected - found."""
         bundle = self.unpack(x)
-        curvature, slope = np.zeros((self.size, self.size)), np.zeros(self.size)
+        curvature, slope, cost = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
         for o in self.observations:
             by_intrinsics, by_camera, by_pose = bundle.derivatives(o)
             residual = -bundle.residual(o)
             length = np.linalg.norm(residual, axis=1)
+            cost += self._loss(length)
             weight = np.repeat(np.sqrt(np.minimum(1, HUBER * self.noise / np.maximum(length, 1e-12))), 2)
             blocks = [by_intrinsics[:, self.free], by_camera]
             at = np.arange(o.camera * self.block, (o.camera + 1) * self.block)
@@ -272,7 +275,7 @@ class _Layout:
             jacobian, at = whole[:, self.free], i * self.block + np.arange(len(self.free))
             curvature[np.ix_(at, at)] += jacobian.T @ jacobian
             slope[at] += jacobian.T @ prior[i]
-        return self.cost(x), curvature, slope
+        return cost + float((prior**2).sum()), curvature, slope
 
     def _prior(self, bundle: Bundle) -> np.ndarray:
         """Distance from the middle of the picture and from no distortion, in units that make `noise` one sigma."""

@@ -34,7 +34,8 @@ class ImportSettings:
     pose: int = 1
     """Number of the target picture that is the world frame, where a file of MATLAB's keeps a pose for each picture."""
     background_distance: float | None = None
-    """Where planes are not known: background across the optical axis, this far behind the origin, mm."""
+    """Where planes are not known: background across the optical axis, this far behind the origin, mm; from target
+    pictures too."""
     image_size: tuple[int, int] | None = None
     """Height and width of the pictures where the file does not say, px."""
 
