@@ -210,7 +210,7 @@ def _interpolated(
     camera: Camera, box: Box, step: int, see: Callable[[Rays], Float[Tensor, "n 2"]]
 ) -> Float[Tensor, "row column 2"]:
     """What `see` makes of rays, on every step-th row and column, and by bicubic splines between them."""
-    from scipy.interpolate import RectBivariateSpline
+    from scipy.interpolate import make_interp_spline
 
     rows, columns = (torch.arange(0, n + step - 1, step).clamp(max=n - 1) for n in camera.image_size)
     v, u = torch.meshgrid(rows, columns, indexing="ij")
@@ -221,6 +221,8 @@ def _interpolated(
     seen = see(rays).reshape(len(rows), len(columns), 2)
     if step == 1:
         return seen
-    at = [torch.arange(n).numpy() for n in camera.image_size]
-    maps = [RectBivariateSpline(rows.numpy(), columns.numpy(), seen[..., c].numpy())(*at) for c in range(2)]
-    return torch.stack([torch.from_numpy(m).float() for m in maps], dim=-1)
+    values = seen.double().numpy()
+    for axis, (places, n) in enumerate(zip((rows, columns), camera.image_size, strict=True)):
+        spline = make_interp_spline(places.numpy(), values, k=min(3, len(places) - 1), axis=axis)  # one row has one
+        values = spline(torch.arange(n).numpy())
+    return torch.from_numpy(values).float()

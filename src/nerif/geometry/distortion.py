@@ -16,7 +16,10 @@ from torch import Tensor
 from nerif.conventions import Pixels
 from nerif.geometry.projection import Array
 
-__all__ = ["distort", "undistort"]
+__all__ = ["POWERS", "distort", "undistort"]
+
+POWERS = (2, 4, 1, 1, 6)
+"""Of the unit of (x, y), by which k1, k2, p1, p2, k3 are divided."""
 
 
 def distort(x: Array, y: Array, coefficients: Iterable[Any]) -> tuple[Array, Array, tuple[Array, Array, Array]]:

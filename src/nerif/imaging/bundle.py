@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.geometry import PERSPECTIVE, Projection
-from nerif.geometry.distortion import distort
+from nerif.geometry.distortion import POWERS, distort
 from nerif.imaging.targets import Detection
 
 __all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust"]
@@ -32,7 +32,6 @@ HUBER = 5  # times the noise of a point: where the loss turns linear
 PRINCIPAL = 0.03  # of the picture's width: how far the principal point may well be from its middle
 DISTORTION = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS: how large they may well be, by (x, y) in units of
 UNIT = 5  # times half the width of a telecentric picture, mm: of a perspective one, that is 23 degrees wide
-POWERS = np.array([2, 4, 1, 1, 6])  # of a length, by which COEFFICIENTS are divided
 UNSEEN = 1e-13  # share of the largest eigenvalue of the curvature: directions below it change no picture
 INTRINSIC, POSE = 9, 6  # parameters: fx, fy, cx, cy and five of distortion; rotation vector, translation
 
@@ -288,7 +287,7 @@ class _Layout:
         unit = np.ones_like(widths)
         if not self.bundle.projection.shows_depth:
             unit = UNIT * widths / 2 / self.bundle.intrinsics[:, :1]
-        likely = np.concatenate([PRINCIPAL * widths.repeat(2, axis=1), DISTORTION / unit**POWERS], axis=1)
+        likely = np.concatenate([PRINCIPAL * widths.repeat(2, axis=1), DISTORTION / unit ** np.array(POWERS)], axis=1)
         return np.asarray(self.noise / likely)
 
     def per_camera(self, x: np.ndarray) -> np.ndarray:
