@@ -90,7 +90,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     }
     kinds = [c.projection.name for c in cameras]
     if set(kinds) != {PERSPECTIVE.name}:
-        dataset["projection"] = (("view",), kinds)
+        dataset["projection"] = (("view",), np.array(kinds, dtype=object))
     if measurement.wavelength_nm is not None:
         dataset.attrs["wavelength_nm"] = measurement.wavelength_nm
     return dataset

@@ -85,7 +85,7 @@ def test_own_file_keeps_every_bit(tmp_path):
         (("rotation", "rotatoin"), "camera 'one': unknown key 'rotatoin'; the nearest known one is 'rotation'"),
         (('name = "one"', ""), "camera 'camera 0': 'name' is missing"),
         (("offset = -900.0", 'offset = "far"'), "background: offset: expected a number"),
-        (('name = "one"', 'name = "one"\nprojection = "fisheye"'), "projection: expected one of perspective, telecentric"),
+        (('name = "one"', 'name = "one"\nprojection = "fisheye"'), "'one': projection: expected one of perspective"),
         (('format = "nerif-calibration-1"', 'format = "other"'), "expected format = 'nerif-calibration-1'"),
         (("[[camera]]", "[[camera"), "not a TOML file"),
     ],
@@ -197,7 +197,7 @@ def test_telecentric_cameras_of_tables(tmp_path):
         assert got.projection == TELECENTRIC
         assert same(got, PARALLEL)
         path.write_text(path.read_text().replace("telecentric", "fisheye"))
-        with pytest.raises(InputError, match="'?parallel'?: projection: expected one of perspective, telecentric, got"):
+        with pytest.raises(InputError, match=r"'?parallel'?: projection: expected one of perspective, telecentric, got"):
             import_cameras(path)
 
 

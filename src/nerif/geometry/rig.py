@@ -50,7 +50,8 @@ class Ring:
         for name in ("arc", "extra_angles", "elevation"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
                 raise InputError(f"{name}: expected degrees, got {getattr(self, name)}")
-        if self.magnification is not None and (self.kind.shows_depth or not 0 < self.magnification < math.inf):
+        perspective = self.kind.shows_depth
+        if self.magnification is not None and (perspective or not 0 < self.magnification < math.inf):
             raise InputError(
                 f"magnification: expected a positive number, with projection = telecentric, got {self.magnification} "
                 f"with {self.projection}"
