@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from nerif.consistency import binned
 from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
@@ -127,6 +128,16 @@ def test_one_row_is_a_picture(ball, box):
     result = Tikhonov(voxels=13, device="cpu")(row)
     again = reproject(result.field, row)
     assert float((again.predicted - row.displacement)[row.sees_box].norm() / row.displacement.norm()) < 0.2
+
+
+def test_lines_are_binned_along_themselves_only(ball, box):
+    row = simulate(ball, ring(rows=1), box, AMBIENT, noise=0.0, steps=40)
+    small = binned(row, 13)
+    assert small.displacement.shape == (5, 1, 13, 2)
+    k, whole = small.cameras[0].intrinsics, row.cameras[0].intrinsics
+    assert k.diagonal().tolist() == pytest.approx([float(whole[0, 0]) / 2, float(whole[1, 1]), 1.0])
+    mean = row.displacement.reshape(5, 1, 13, 2, 2).mean(dim=3)
+    assert torch.allclose(small.displacement, mean / torch.tensor([2.0, 1.0]), atol=1e-7)
 
 
 @pytest.mark.parametrize("size", [(1, 26), (9, 26), (20, 1)])
