@@ -49,7 +49,8 @@ def measure(
     assert measurement.sigma is not None
     ensemble, spread = Ensemble(members, leave_one_out), Spread()
     for number in range(1, members + 1):
-        method, noisy = ensemble.member(number, reconstructor, measurement, measurement.sigma)
+        noise = {"deflection": measurement.sigma}
+        method, noisy = ensemble.member(number, reconstructor, measurement, noise)
         spread.add([method(noisy).volume(GRID)])
     mean, std = (v.values for v in spread.volumes())
     flow = truth.abs() > 0.02 * truth.abs().max()

@@ -65,7 +65,7 @@ def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> list[s
     edges = [bins.coarsest_edge(measurement)] + [int(r["bin_edge"]) for r in result.history if "bin_edge" in r]
     last, steps = result.history[-1], " then ".join(map(str, edges))
     return [
-        f"{measurement.displacement.shape[1]}²",
+        f"{measurement.shape[1]}²",
         steps,
         f"{last['step']:.0f}",
         f"{last['epoch']:.2f}",

@@ -52,7 +52,7 @@ def prepare(out: ResultDirectory, measured: Path, views: int, pixels: int, steps
     out.write_field(result)
     out.write_metrics({"outcome": "time_limit", "message": "fitted", "seconds": 0.0})
     cameras = Ring(views=views, image_size=(pixels, pixels), pixel_pitch=0.02 * 200 / pixels).cameras()
-    empty = Measurement(cameras, torch.zeros(views, pixels, pixels, 2), BOX, N_AMBIENT)
+    empty = Measurement(cameras, torch.zeros(views, pixels, pixels, 2), box=BOX, n_ambient=N_AMBIENT)
     predicted = reproject(field, empty).predicted
     sigma = NOISE * float(predicted.square().mean().sqrt())
     noisy = predicted + sigma * torch.randn(predicted.shape, generator=torch.Generator().manual_seed(1))
@@ -66,7 +66,7 @@ def stage(name: str, folder: Path, views: int, pixels: int, steps: int) -> list[
     if name in ("reproject", "score", "write"):
         data = Measurement.read(measured)
     if name in ("score", "write"):
-        views_seen = Reprojection(data, torch.load(kept)) if data else None
+        views_seen = Reprojection(data, {"deflection": torch.load(kept)}) if data else None
     began, before = time.perf_counter(), _cpu()
     if name == "prepare":
         prepare(out, measured, views, pixels, steps)

@@ -19,7 +19,7 @@ from bench import N_AMBIENT, Table, add_write
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
-from nerif.physics.deflection import Deflection, project
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import preset
@@ -31,8 +31,9 @@ COLUMNS = ("octaves", "width", "depth", "loss / that of the empty field", "taken
 
 def unexplained(result: Reconstruction, target: Target) -> float:
     """Mean square of the residuals over that of what was measured."""
-    seen = project(Deflection(samples=60, n_ambient=N_AMBIENT), result.field, target.rays, result.device)
-    return float(((seen - target.displacement) * target.inverse_scale).square().mean())
+    (part,) = target.parts
+    seen = project(PathIntegral(part.model, 60), result.field, part.rays, result.device)
+    return float(part.residual(seen).square().mean())
 
 
 def main() -> None:

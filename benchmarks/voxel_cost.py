@@ -21,9 +21,10 @@ from nerif.geometry import Grid, paper_rig
 from nerif.measurement import Measurement
 from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.device import keep_freed_memory, peak_memory, resolve_device
-from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.simulation import simulate
+from nerif.techniques.deflection import LeverArm
 
 COLUMNS = (
     "grid", "basis", "samples [million]", "iterations", "seconds", "ns a sample and iteration", "of it operator",
@@ -57,7 +58,7 @@ def run(
     result = settings(measurement)
     memory = peak_memory(where)
     grid = Grid.of_resolution(measurement.box, voxels)
-    operator = DeflectionOperator(rays, grid, N_AMBIENT, basis=basis, device=where)
+    operator = VoxelOperator(rays, grid, LeverArm(N_AMBIENT), basis, device=where)
     x, y = torch.rand(grid.shape, device=where), displacement.to(where)
     times = []
     for _ in range(3):
@@ -65,7 +66,7 @@ def run(
         operator(x)
         float(operator.T(y).sum())
         times.append(time.perf_counter() - start)
-    samples = int(operator._rays[-1].sum())
+    samples = int(operator.path[-1].sum())
     estimate = settings.memory_bytes(measurement, grid) / 2**30
     cells = [f"{samples / 1e6:.1f}", str(iterations), f"{result.seconds:.1f}"]
     cells += [f"{result.seconds / iterations / samples * 1e9:.1f}", f"{min(times) * iterations / result.seconds:.0%}"]
@@ -78,16 +79,16 @@ def plain(measurement: Measurement, voxels: int, basis: Basis, threads: int) -> 
     keep_freed_memory()
     rays, displacement, _ = measurement.rays()
     grid = Grid.of_resolution(measurement.box, voxels)
-    operator = DeflectionOperator(rays, grid, N_AMBIENT, basis=basis)
+    operator = VoxelOperator(rays, grid, LeverArm(N_AMBIENT), basis)
     x = torch.rand(grid.shape)
-    padded, out = operator.boundary.extend(x, operator.layers), torch.empty_like(displacement)
+    padded, out = operator.boundary.extend(x, operator.layers), torch.zeros_like(displacement)
     operator.T(operator(x))
     start = time.perf_counter()
     operator.T(operator(x))
     fast = time.perf_counter() - start
     start = time.perf_counter()
-    kernels_torch.forward(operator.degree, padded, operator._rays, out)
-    kernels_torch.adjoint(operator.degree, out, operator._rays, torch.zeros_like(padded))
+    kernels_torch.forward(operator.degree, padded, operator.path, operator.matrices[0], out)
+    kernels_torch.adjoint(operator.degree, out, operator.path, operator.matrices[0], torch.zeros_like(padded))
     return fast, time.perf_counter() - start
 
 

@@ -14,9 +14,10 @@ from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.geometry import Grid
-from nerif.physics.deflection import MODELS, Deflection, project
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.prediction import predict_view, reproject
 from nerif.result import METRICS, ResultDirectory
+from nerif.techniques.deflection import MODELS
 from nerif.volume import Volume
 
 
@@ -74,7 +75,8 @@ def test_views_are_predicted_by_the_model_asked_for(measurement, ball, model):
         predicted = reproject(field, measurement, model=model).predicted
         camera, (height, width) = measurement.cameras[1], measurement.cameras[1].image_size
         rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).to(dtype=torch.float32)
-        expected = project(Deflection(model, 200, measurement.n_ambient), field, rays).reshape(height, width, 2)
+        forward = PathIntegral(MODELS[model](measurement.n_ambient), 200)
+        expected = project(forward, field, rays).reshape(height, width, 2)
         assert float((predicted[1, :height, :width] - expected).norm() / expected.norm()) < 3e-3
 
 
@@ -84,7 +86,7 @@ def test_voxels_are_projected_as_any_field(measurement, ball, degree, model):
     """The compiled way through a voxel field and the way through the Field give the same view."""
     grid = Grid(measurement.box, (14, 17, 20))
     field = VoxelField(Boundary(measurement.ambient_faces).extend(ball.sample(grid), (degree + 1) // 2), grid, degree)
-    camera, forward = measurement.cameras[1], Deflection(model, 200, measurement.n_ambient)
+    camera, forward = measurement.cameras[1], PathIntegral(MODELS[model](measurement.n_ambient), 200)
     fast = predict_view(field, camera, forward, measurement.box)
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).to(dtype=torch.float32)
     slow = project(forward, field, rays).reshape(fast.shape)

@@ -14,9 +14,10 @@ SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 LAYERS = (
     ("atomic", "conventions", "netcdf", "toml"),
     ("geometry",),
+    ("techniques",),
     ("drawing",),
     ("notebook",),
-    ("measurement_file", "measurement", "measurement_sequence"),
+    ("observation", "measurement_file", "measurement_summary", "measurement", "measurement_sequence"),
     ("volume", "volume_file", "volume_sequence", "vti", "exports", "reprojection"),
     ("imaging",),
     ("fields",),

@@ -12,8 +12,10 @@ import xarray as xr
 from nerif.conventions import InputError
 from nerif.geometry import Ring
 from nerif.measurement import Measurement
-from nerif.measurement_file import VARIABLES
+from nerif.measurement_file import ABOUT_VIEWS, variables
 from nerif.simulation import simulate
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.registry import TECHNIQUES
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +55,11 @@ def test_file_opens_with_plain_xarray_and_states_its_units(full, tmp_path):
     with xr.open_dataset(tmp_path / "m.nc") as dataset:
         assert dataset.attrs["Conventions"] == "BOST-1.0"
         assert dataset.attrs["ambient_faces"] == "x- z+"
-        assert set(dataset.data_vars) == set(VARIABLES)
-        for name, (dimensions, unit) in VARIABLES.items():
+        known = variables()
+        others = {name for k in TECHNIQUES.values() if k is not Deflection for name in (k.measured, k.sigma)}
+        assert set(dataset.data_vars) == set(known) - set(ABOUT_VIEWS) - others
+        for name in dataset.data_vars:
+            dimensions, unit = known[name]
             assert dataset[name].dims == dimensions
             assert dataset[name].attrs["units"] == unit
         assert list(dataset["component"].values) == ["u", "v"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from nerif.metrics import correlation, displacement_metrics, psnr, slice_metrics, ssim, volume_metrics
+from nerif.metrics import correlation, psnr, slice_metrics, ssim, view_metrics, volume_metrics
 
 RNG = np.random.default_rng(0)
 TRUTH = -2e-4 * RNG.random((20, 11, 13))
@@ -52,15 +52,15 @@ def test_ten_slices_across_z():
     assert slices[3]["cc"] == pytest.approx(correlation(TRUTH[7], TEST[7]))
 
 
-def test_displacement_metrics_ignore_what_is_not_valid():
+def test_view_metrics_ignore_what_is_not_valid():
     measured = RNG.standard_normal((15, 17, 2)).astype(np.float32)
     predicted = measured + 0.1
     valid = np.ones((15, 17), dtype=bool)
     valid[4:6, 2:9] = False
-    clean = displacement_metrics(measured, predicted, valid)
+    clean = view_metrics(measured, predicted, valid)
     spoilt = measured.copy()
     spoilt[~valid] = 1e6
-    assert displacement_metrics(spoilt, predicted, valid) == pytest.approx(clean)
-    assert clean["rms_px"] == pytest.approx(0.1, rel=1e-4)
+    assert view_metrics(spoilt, predicted, valid) == pytest.approx(clean)
+    assert clean["rms"] == pytest.approx(0.1, rel=1e-4)
     assert clean["cc"] == pytest.approx(1, abs=1e-6)
-    assert all(math.isnan(v) for v in displacement_metrics(measured, predicted, ~(valid | True)).values())
+    assert all(math.isnan(v) for v in view_metrics(measured, predicted, ~(valid | True)).values())

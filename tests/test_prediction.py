@@ -12,9 +12,10 @@ from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
 from nerif.measurement import Measurement
-from nerif.physics.deflection import MODELS, Deflection
+from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import SampledViews, reproject
 from nerif.reprojection import Reprojection
+from nerif.techniques.deflection import MODELS
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 
@@ -39,7 +40,7 @@ def test_views_by_way_of_voxels_are_near_the_integral_and_say_how_near(empty, mo
     monkeypatch.setattr(prediction, "VOXELS", 10)  # a lattice of every second pixel
     centre, width, depth = torch.tensor([[1.0, -0.5, 0.0]]), torch.tensor([3.0]), torch.tensor([-2e-4])
     ball = GaussianBalls(centre.double(), width.double(), depth.double())
-    forward, seen = Deflection(model, prediction.SAMPLES, empty.n_ambient), empty.sees_box
+    forward, seen = PathIntegral(MODELS[model](empty.n_ambient), prediction.SAMPLES), empty.sees_box
     exact = reproject(ball, empty, model=model).predicted
     views = SampledViews.of(ball, BOX, forward)
     near = torch.stack([views(camera) for camera in empty.cameras])

@@ -8,9 +8,10 @@ import torch
 from nerif.conventions import InputError
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Ring, paper_rig
-from nerif.physics.deflection import Deflection
+from nerif.physics.path_integral import PathIntegral
 from nerif.physics.ray_tracing import CurvedRays
 from nerif.simulation import STEPS, add_noise, simulate, view_displacement
+from nerif.techniques.deflection import MODELS
 
 
 def test_noise_is_a_share_of_the_rms_over_crossing_rays(ball, cameras, box):
@@ -42,7 +43,7 @@ def test_simulation_meets_the_first_order_model(ball, cameras, box):
     camera = cameras[1]
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box)
     d = view_displacement(ball, camera, box, 1.00027, steps=100).reshape(-1, 2)[rays.crosses].double()
-    straight = Deflection("lever_arm", 200, 1.00027)(ball, rays[rays.crosses])
+    straight = PathIntegral(MODELS["lever_arm"](1.00027), 200)(ball, rays[rays.crosses])
     assert float((d - straight).norm() / d.norm()) < 2e-3
 
 

@@ -13,15 +13,17 @@ from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
 from nerif.measurement import Measurement
-from nerif.physics.deflection import Deflection
+from nerif.physics.path_integral import PathIntegral
 from nerif.physics.ray_tracing import background_points
 from nerif.prediction import _interpolated, reproject
 from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.gauge import visual_hull
-from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.report.rig_figure import draw_rig, picture_corners
 from nerif.simulation import simulate, view_displacement
+from nerif.techniques.deflection import LeverArm
+from nerif.techniques.registry import TECHNIQUES, forward_model
 
 AMBIENT = 1.00027
 
@@ -61,17 +63,19 @@ def test_straight_and_traced_rays_agree(ball, box):
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box)
     assert float(rays.near[rays.crosses].median()) < 0 < float(rays.far[rays.crosses].median())
     straight = torch.zeros(len(rays), 2, dtype=torch.float64)
-    straight[rays.crosses] = Deflection("lever_arm", 200, AMBIENT)(ball, rays[rays.crosses])
+    straight[rays.crosses] = PathIntegral(LeverArm(AMBIENT))(ball, rays[rays.crosses])
     traced = view_displacement(ball, camera, box, AMBIENT).reshape(-1, 2)
     assert float((straight - traced).norm() / traced.norm()) < 2e-3
 
 
 @pytest.mark.parametrize("rows", [1, 20])
+@pytest.mark.parametrize("technique", sorted(TECHNIQUES))
 @pytest.mark.parametrize("kind", sorted(PROJECTIONS))
-def test_the_adjoint_of_the_voxel_operator_is_exact(box, kind, rows):
+def test_the_adjoint_of_the_voxel_operator_is_exact(seen, box, kind, technique, rows):
+    model = forward_model(TECHNIQUES[technique], seen)
     rays = Rays.concatenate([c.rays(c.pixel_grid().reshape(-1, 2)).clip(box) for c in ring(kind, rows)])
-    a = DeflectionOperator(
-        rays[rays.crosses], Grid(box, (9, 11, 13)), AMBIENT, boundary=Boundary(("x-", "y+")), dtype=torch.float64
+    a = VoxelOperator(
+        rays[rays.crosses], Grid(box, (9, 11, 13)), model, boundary=Boundary(("x-", "y+")), dtype=torch.float64
     )  # fmt: skip
     generator = torch.Generator().manual_seed(0)
     c = torch.randn(a.domain_shape, dtype=torch.float64, generator=generator)
@@ -93,6 +97,10 @@ def test_the_file_keeps_the_projection_of_each_view(seen, tmp_path):
     dataset["projection"] = (("view",), ["fisheye"] * 5)
     with pytest.raises(InputError, match="projection of view '0deg': expected one of perspective, telecentric"):
         Measurement.from_dataset(dataset)
+    dataset["projection"] = (("row",), ["telecentric"] * 20)
+    with pytest.raises(InputError, match="variable 'projection': expected one name a view, got dimensions"):
+        Measurement.from_dataset(dataset)
+    assert dataset.attrs["Conventions"] == "BOST-1.1"  # a reader of BOST-1.0 would take them for pinholes
 
 
 def test_a_field_comes_back_and_is_seen_again(seen, ball, box):

@@ -20,6 +20,7 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
+from nerif.techniques.deflection import MODELS
 
 __all__ = [
     "BOX",
@@ -213,9 +214,9 @@ def _all(scale: Scale) -> Iterator[Case]:
         key = as_is if sampling == base.sampling else f"sampling-{sampling}"
         yield case(key, {"sampling": sampling}, replace(base, sampling=sampling))
 
-    for model in ("lever_arm", "paraxial", "curved"):
-        key = "2-0-nerif" if model == base.model else f"model-{model}"
-        yield case(key, {"model": model}, replace(base, model=model), noise=0.0)
+    for i, model in enumerate(MODELS):  # the first is what auto stands for
+        key, changed = (f"model-{model}", replace(base, model=model)) if i else ("2-0-nerif", base)
+        yield case(key, {"model": model}, changed, noise=0.0)
 
     tikhonov = Tikhonov(voxels=scale.voxels, basis="linear", device=scale.device)
     for name, method in {"NeRIF": base, "Tikhonov": tikhonov}.items():

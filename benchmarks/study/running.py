@@ -23,11 +23,12 @@ from nerif.fields.phantoms import Octahedron, make_phantom
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.metrics import volume_errors
-from nerif.physics.deflection import Deflection, project
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import add_noise, simulate
+from nerif.techniques.deflection import MODELS
 from nerif.volume import Volume
 from study.cases import BOX, N_AMBIENT, NOISE_SEED, Case
 from study.octahedron import pixels_per_unit, to_plain
@@ -140,8 +141,8 @@ def _forward_models(phantom: Field, measurement: Measurement) -> dict[str, dict[
     some = slice(None, None, max(1, len(rays) // FORWARD_RAYS))
     rays, curved = rays[some], curved[some]
     found = {}
-    for model in ("lever_arm", "paraxial", "curved"):
-        straight = project(Deflection(model, FORWARD_SAMPLES, N_AMBIENT), phantom, rays)
+    for model in MODELS:
+        straight = project(PathIntegral(MODELS[model](N_AMBIENT), FORWARD_SAMPLES), phantom, rays)
         rms = float((straight - curved).square().mean().sqrt())
         found[model] = {"rms_px": rms, "relative": rms / float(curved.square().mean().sqrt())}
     return found

@@ -20,9 +20,10 @@ from nerif.fields.base import Field
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.mistakes import Correction, everywhere, exchanges, of_one_view
-from nerif.physics.deflection import Deflection
+from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import predict_view
 from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.techniques.deflection import LeverArm
 
 __all__ = ["Consistency", "ViewAgreement", "binned", "check_consistency"]
 
@@ -142,10 +143,10 @@ def binned(measurement: Measurement, longest: int) -> Measurement:
         k[:2, 2] = (k[:2, 2] + 0.5) / scale - 0.5
         height, width = camera.image_size
         cameras.append(replace(camera, intrinsics=k, image_size=(height // down, width // across)))
-    rows, columns = (n // bins for n, bins in zip(measurement.displacement.shape[1:3], (down, across), strict=True))
+    rows, columns = (n // bins for n, bins in zip(measurement.displacements.shape[1:3], (down, across), strict=True))
     inside = (slice(0, rows * down), slice(0, columns * across))
     maps = []
-    for d, usable in zip(measurement.displacement, measurement.usable, strict=True):
+    for d, usable in zip(measurement.displacements, measurement.usable, strict=True):
         good = usable[inside].reshape(rows, down, columns, across)
         parts = torch.where(good[..., None], d[inside].reshape(rows, down, columns, across, 2), 0.0)
         count = good.sum(dim=(1, 3))[..., None]
@@ -162,9 +163,9 @@ def binned(measurement: Measurement, longest: int) -> Measurement:
 
 
 def _without_spikes(small: Measurement) -> Measurement:
-    length = small.displacement.norm(dim=-1)
+    length = small.displacements.norm(dim=-1)
     limit = SPIKE * torch.nanquantile(length.flatten()[:: max(1, length.numel() // 1_000_000)], 0.95)
-    return replace(small, displacement=torch.where((length <= limit)[..., None], small.displacement, torch.nan))
+    return replace(small, displacement=torch.where((length <= limit)[..., None], small.displacements, torch.nan))
 
 
 def _fit(measurement: Measurement, voxels: int, weight: float) -> tuple[Field, float]:
@@ -181,7 +182,7 @@ def _predict(small: Measurement, left_out: Sequence[int], voxels: int) -> dict[i
     """What the other views predict of those left out."""
     others = [name for i, name in enumerate(small.names) if i not in left_out]
     field, _ = _fit(small.select(others), voxels, 3e-3)
-    model = Deflection(n_ambient=small.n_ambient)
+    model = PathIntegral(LeverArm(small.n_ambient))
     return {i: predict_view(field, small.cameras[i], model, small.box) for i in left_out}
 
 
@@ -190,7 +191,7 @@ def _compare(
 ) -> tuple[float, float]:
     """Correlation (about 0) of measured and predicted displacements, and the factor between them."""
     height, width = small.cameras[view].image_size
-    measured = (small.displacement[view] if measured is None else measured)[:height, :width]
+    measured = (small.displacements[view] if measured is None else measured)[:height, :width]
     good = torch.isfinite(measured).all(dim=-1)
     a, b = predicted[good].flatten(), measured[good].flatten()
     product = float((a * b).sum())
@@ -206,7 +207,7 @@ def _disagreement(predicted: Tensor, small: Measurement, view: int, measured: Te
 def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int, int], None]) -> Correction | None:
     """The one mistake whose undoing helps the joint fit most, if it helps clearly."""
     views = range(len(small.names))
-    d = small.displacement
+    d = small.displacements
     alike, done = everywhere(len(views)), 0
 
     def step(total: int) -> None:
@@ -220,7 +221,7 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
         now = _disagreement(predicted, small, i, d[i])
         agreements.append(_compare(predicted, small, i)[0])
         ways = of_one_view(i)
-        left = [_disagreement(predicted, small, i, _without(c, small).displacement[i]) for c in ways]
+        left = [_disagreement(predicted, small, i, _without(c, small).displacements[i]) for c in ways]
         likely += [c for c, x in zip(ways, left, strict=True) if x < SHORTLIST * now]
         predictions.append(predicted)
         step(2 * len(views))
@@ -252,13 +253,13 @@ def _fits(mended: Measurement, views: Sequence[int], enough: float, voxels: int)
 
 
 def _without(correction: Correction, small: Measurement) -> Measurement:
-    return replace(small, displacement=correction.undo(small.displacement, small.cameras))
+    return replace(small, displacement=correction.undo(small.displacements, small.cameras))
 
 
 def _crossed(predicted: dict[int, Tensor], small: Measurement, pair: Correction) -> float:
     """Disagreement of two views with predictions of each other, as a share of that with their own."""
     i, j = pair.views
-    d = small.displacement
+    d = small.displacements
     straight = sum(_disagreement(predicted[k], small, k, d[k]) for k in (i, j))
     crossed = _disagreement(predicted[i], small, i, d[j]) + _disagreement(predicted[j], small, j, d[i])
     return crossed / max(straight, 1e-30)
@@ -272,13 +273,13 @@ def _who(correction: Correction, names: Sequence[str]) -> str:
 
 def _open_faces(field: Field, small: Measurement) -> list[str]:
     """Faces beyond which the flow seems to go on: rays through them fit worse than rays through none of them."""
-    model = Deflection(n_ambient=small.n_ambient)
+    model = PathIntegral(LeverArm(small.n_ambient))
     groups: dict[str, list[Tensor]] = {face: [] for face in (*FACES, "none")}
     suspects = [face for face in FACES if face not in small.ambient_faces]
     for i, camera in enumerate(small.cameras):
         height, width = camera.image_size
         predicted = predict_view(field, camera, model, small.box).reshape(-1, 2)
-        measured = small.displacement[i, :height, :width].reshape(-1, 2)
+        measured = small.displacements[i, :height, :width].reshape(-1, 2)
         rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(small.box)
         good = torch.isfinite(measured).all(dim=-1) & rays.crosses
         both = torch.stack([(predicted - measured).square().sum(dim=-1), measured.square().sum(dim=-1)], dim=-1)
@@ -310,7 +311,7 @@ def _looks(measurement: Measurement, small: Measurement, valid: Sequence[float])
         if valid[i] < 0.5:
             remarks.append(f"view {name}: only {valid[i]:.0%} of its pixels can be used")
         rows, columns = small.cameras[i].image_size
-        d = small.displacement[i, :rows, :columns]
+        d = small.displacements[i, :rows, :columns]
         rim = torch.ones(rows, columns, dtype=torch.bool)
         edge = max(1, min(rows, columns) // 12)
         down = slice(edge, -edge) if rows > 2 * edge else slice(None)  # a line has two ends and no rim

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.conventions import InputError
@@ -17,17 +17,19 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Box
 from nerif.measurement import Measurement
-from nerif.metrics import displacement_metrics, slice_metrics, volume_metrics
+from nerif.metrics import slice_metrics, view_metrics, volume_metrics
+from nerif.observation import Observation
 from nerif.prediction import reproject
 from nerif.reprojection import Reprojection
 from nerif.result import VOLUME, ResultDirectory
-from nerif.volume import Volume
+from nerif.techniques.registry import AUTO
+from nerif.volume import INDEX, Volume
 from nerif.volume_file import read_volume
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 AT_A_TIME = 8e6  # pixels of the views that are scored side by side: a megapixel takes some 0.1 GiB
 
-__all__ = ["FLOW", "evaluate", "evaluate_views", "evaluate_volume", "score_lines"]
+__all__ = ["FLOW", "evaluate", "evaluate_views", "evaluate_volume", "rms_text", "score_lines"]
 
 
 def evaluate(
@@ -57,15 +59,16 @@ def evaluate(
         raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")
     directory = ResultDirectory(result)
     field, box, n_ambient = directory.field()
+    quantity = directory.quantity()
     metrics: dict[str, Any] = {}
     if truth is not None:
-        compared = _truth(Path(truth), box, n_ambient)
+        compared = _truth(Path(truth), box, n_ambient, quantity)
         metrics |= evaluate_volume(field, compared, n_ambient) | _coverage(directory, compared)
         metrics["truth"] = str(Path(truth).resolve())
     if measurement is not None:
         data, asked = Measurement.read(measurement), directory.settings()
         held_out = _held_out(hold_out, asked, data)
-        views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", "lever_arm")))
+        views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": asdict(views.accuracy)}
         metrics["measurement"] = str(Path(measurement).resolve())
         directory.write_reprojection(views)
@@ -74,31 +77,46 @@ def evaluate(
 
 
 def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
-    """Compare every view with its prediction: cc, ssim, psnr and rms_px over the usable pixels that see the box.
+    """Compare every view with its prediction: cc, ssim, psnr and rms over the usable pixels that see the box.
 
-    Where sigma is known, rms_over_sigma tells whether the residual is the noise (1) or more.
+    The rms is in the unit of what was measured, and also called rms_px where that is px. Where sigma is known,
+    rms_over_sigma tells whether the residual is the noise (1) or more.
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    measurement = reprojection.measurement
-    compared = measurement.usable & measurement.sees_box
+    measurement, sees_box = reprojection.measurement, reprojection.measurement.sees_box
 
-    def scores(i: int) -> dict[str, Any]:
-        camera = measurement.cameras[i]
+    def scores(view: int, observation: Observation, compared: Bool[Tensor, "view row column"]) -> dict[str, Any]:
+        camera, kind = measurement.cameras[view], observation.technique
         height, width = camera.image_size
-        mask = compared[i, :height, :width]
-        predicted = reprojection.predicted[i, :height, :width]
-        measured = measurement.displacement[i, :height, :width].nan_to_num(0.0, 0.0, 0.0)
-        view: dict[str, Any] = {"name": camera.name, "held_out": camera.name in reprojection.held_out}
-        view |= displacement_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
-        if measurement.sigma is not None and bool(mask.any()):
-            residual = (predicted - measured)[mask] / measurement.sigma[i, :height, :width][mask]
-            view["rms_over_sigma"] = float(residual.square().mean().sqrt())
-        return view
+        inside = view, slice(0, height), slice(0, width)
+        mask, predicted = compared[inside], reprojection.maps[kind.name][inside]
+        measured = observation.values[inside].nan_to_num(0.0, 0.0, 0.0)
+        found: dict[str, Any] = {"name": camera.name, "held_out": camera.name in reprojection.held_out}
+        found |= {"measured": kind.measured, "unit": kind.unit}
+        found |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
+        if kind.unit != "1":
+            found[f"rms_{kind.unit}"] = found["rms"]
+        if observation.sigma is not None and bool(mask.any()):
+            residual = (predicted - measured)[mask] / observation.sigma[inside][mask]
+            found["rms_over_sigma"] = float(residual.square().mean().sqrt())
+        return found
 
-    side_by_side = int(min(torch.get_num_threads(), AT_A_TIME // compared[0].numel()))
-    with ThreadPoolExecutor(max(side_by_side, 1)) as threads:
-        return list(threads.map(scores, range(len(measurement.cameras))))
+    views: list[dict[str, Any]] = []
+    side_by_side = int(min(torch.get_num_threads(), AT_A_TIME // sees_box[0].numel()))
+    for o in measurement.observations:
+        compared = measurement.usable_for(o) & sees_box
+        # of several techniques a view has what it measured only
+        chosen = [i for i in range(len(compared)) if len(measurement.observations) == 1 or bool(compared[i].any())]
+        with ThreadPoolExecutor(max(side_by_side, 1)) as threads:
+            views += threads.map(lambda i, o=o, compared=compared: scores(i, o, compared), chosen)
+    return views
+
+
+def rms_text(view: dict[str, Any]) -> str:
+    """Return the rms error of a view with its unit."""
+    unit = view.get("unit", "px")
+    return f"{view['rms']:.4g}" + (f" {unit}" if unit != "1" else "")
 
 
 def score_lines(views: list[dict[str, Any]]) -> list[str]:
@@ -108,11 +126,11 @@ def score_lines(views: list[dict[str, Any]]) -> list[str]:
         chosen = [v for v in views if v["held_out"] is held]
         if chosen:
             cc = min(v["cc"] for v in chosen)
-            rms = max(v["rms_px"] for v in chosen)
+            rms = rms_text(max(chosen, key=lambda v: v["rms"]))
             noise = max(v.get("rms_over_sigma", float("nan")) for v in chosen)
             beside = "" if noise != noise else f", at most {noise:.2f} sigma"
             plural = "s" if len(chosen) > 1 else ""
-            lines.append(f"{len(chosen)} {group}{plural}: CC at least {cc:.4f}, rms error at most {rms:.4f} px{beside}")
+            lines.append(f"{len(chosen)} {group}{plural}: CC at least {cc:.4f}, rms error at most {rms}{beside}")
     return lines
 
 
@@ -123,19 +141,20 @@ def evaluate_volume(
 
     Parameters
     ----------
-    field : of index excess over n_ambient
-    truth : index excess over the same ambient
+    field : of the truth's quantity; of an index the excess over n_ambient
+    truth : of an index the excess over the same ambient
     n_ambient : 1
     """
     rec = field.sample(truth.grid, device).numpy()
     gt = truth.values.numpy()
     heights = truth.grid.axis("z").numpy()
-    return {**volume_metrics(gt, rec, n_ambient), "slices": slice_metrics(gt, rec, heights)}
+    beyond = n_ambient if truth.quantity == INDEX else 1.0  # the paper's L2 counts the ambient in
+    return {**volume_metrics(gt, rec, beyond), "slices": slice_metrics(gt, rec, heights)}
 
 
-def _truth(path: Path, box: Box, n_ambient: float) -> Volume:
-    """The truth as index excess over the ambient of the reconstruction; refused where it sticks out of the box."""
-    truth = read_volume(path)
+def _truth(path: Path, box: Box, n_ambient: float, quantity: str) -> Volume:
+    """The truth, as index excess over the ambient of the reconstruction; refused where it sticks out of the box."""
+    truth = read_volume(path, None if quantity == INDEX else quantity)
     sides = zip("xyz", truth.grid.box.lower, truth.grid.box.upper, box.lower, box.upper, strict=True)
     outside = [a for a, low, high, lower, upper in sides if low < lower - 1e-6 or high > upper + 1e-6]
     if outside:
@@ -143,6 +162,8 @@ def _truth(path: Path, box: Box, n_ambient: float) -> Volume:
             f"{path}: expected a volume inside the reconstructed box ({box.lower} to {box.upper} mm), "
             f"got one that sticks out along {', '.join(outside)}"
         )
+    if quantity != INDEX:
+        return truth
     try:
         return truth.relative_to(n_ambient)
     except InputError as error:
@@ -162,7 +183,8 @@ def _held_out(asked: Sequence[str] | None, settings: dict[str, Any], measurement
 def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
     """Share of the truth's voxels within two standard deviations of the mean, if there is an ensemble."""
     found = directory.volumes() if directory.has(VOLUME) else {}
-    if "index_excess_std" not in found:
+    quantity = directory.quantity()
+    if f"{quantity}_std" not in found:
         return {}
 
     def on_its_grid(volume: Volume) -> Float[Tensor, "z y x"]:
@@ -170,7 +192,7 @@ def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
             return volume.values
         return VoxelField.through(volume.values, volume.grid).sample(truth.grid)
 
-    mean, std = (on_its_grid(found[f"index_excess_{s}"]) for s in ("mean", "std"))
+    mean, std = (on_its_grid(found[f"{quantity}_{s}"]) for s in ("mean", "std"))
     within = (truth.values - mean).abs() <= 2 * std
     flow = truth.values.abs() > FLOW * truth.values.abs().max()
     share = {"share": float(within.float().mean()), "share_in_flow": float(within[flow].float().mean())}

@@ -1,10 +1,10 @@
-"""A Measurement: cameras and the displacement each of them saw."""
+"""A Measurement: cameras, and what each of them saw by one technique or by several."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,15 +16,16 @@ from nerif import measurement_file
 from nerif.atomic import atomic
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces
 from nerif.geometry import Box, Camera, Rays
+from nerif.measurement_summary import as_html, summary
 from nerif.netcdf import opened
+from nerif.observation import Observation, check_observations
+from nerif.techniques.base import ForwardModel
+from nerif.techniques.registry import TECHNIQUES
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["LIMITS_PX", "Measurement"]
-
-LIMITS_PX = (1e-6, 1e5)
-"""Least sigma, and largest displacement and sigma, that a camera can have measured, px."""
+__all__ = ["Measurement"]
 
 LIMITS_NM = (100.0, 30000.0)
 """Wavelengths from ultraviolet to thermal infrared, nm."""
@@ -35,28 +36,33 @@ CHUNK = 1 << 17
 
 @dataclass(frozen=True)
 class Measurement:
-    """What was measured: cameras, displacements and the volume of interest.
+    """What was measured: cameras, what they saw, and the volume of interest.
 
     Parameters
     ----------
     cameras : one a view; their names are the names of the views
-    displacement : (view, row, column, 2) d = p - p0 on the grid of the flow image, px; NaN where not measured
+    displacement : (view, row, column, 2) d = p - p0 on the grid of the flow image, px; NaN where not measured; None for
+        a measurement by other techniques alone
     box : Box, mm
     n_ambient : refractive index around the flow
-    sigma : (view, row, column, 2) standard deviation of the noise, px, or None
+    sigma : (view, row, column, 2) standard deviation of the displacement's noise, px, or None
     valid : (view, row, column) False where a pixel is not to be used, or None
     flow_mask : (view, row, column) True where there is flow, or None
     wavelength_nm : of the light, or None
     ambient_faces : faces of the box on which the index is ambient (the gauge)
+    maps : (view, row, column) of other techniques, by their names in the file: absorbance, absorbance_sigma, radiance,
+        radiance_sigma, fringes, fringes_sigma; NaN where not measured
+    about_views : (view, ...) what else is known of the views, by its name in the file, such as aperture_diameter
 
     Raises
     ------
     InputError
-        If shapes disagree, a view has no valid pixel, a background is not behind the box, or no ray crosses the box.
+        If nothing was measured, shapes disagree, a view has no valid pixel, values cannot be what their technique
+        measures, a background is missing, needless or not behind the box, or no ray crosses the box.
     """
 
     cameras: tuple[Camera, ...]
-    displacement: Float[Tensor, "view row column 2"]
+    displacement: Float[Tensor, "view row column 2"] | None
     box: Box
     n_ambient: float
     sigma: Float[Tensor, "view row column 2"] | None = None
@@ -64,32 +70,42 @@ class Measurement:
     flow_mask: Bool[Tensor, "view row column"] | None = None
     wavelength_nm: float | None = None
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
+    maps: Mapping[str, Float[Tensor, "view row column"]] = field(default_factory=dict)
+    about_views: Mapping[str, Float[Tensor, "view ..."]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        shape = tuple(self.displacement.shape)
+        self._check_shapes()
+        ambient_index(self.n_ambient)
+        if self.wavelength_nm is not None and not LIMITS_NM[0] <= self.wavelength_nm <= LIMITS_NM[1]:
+            raise InputError(f"wavelength_nm: expected nanometres such as 532, got {self.wavelength_nm}")
+        parse_faces(self.ambient_faces)
+        check_observations(self)
+        good = self.usable.flatten(1).sum(dim=1)
+        for name, count in zip(self.names, good.tolist(), strict=True):
+            if count == 0:
+                what = " and ".join(o.technique.measured for o in self.observations)
+                raise InputError(f"{what} of view '{name}': no valid pixel; leave the view out or mend its mask")
+        self._check_geometry()
+
+    def _check_shapes(self) -> None:
+        if not self.observations:
+            names = ", ".join(kind.measured for kind in TECHNIQUES.values())
+            raise InputError(f"measurement: expected one of {names}, got none of them")
+        shape, name = self.shape, self.observations[0].technique.measured
         if len(self.cameras) != shape[0] or not self.cameras:
-            raise InputError(f"displacement: expected one map a camera ({len(self.cameras)}), got {shape[0]}")
+            raise InputError(f"{name}: expected one map a camera ({len(self.cameras)}), got {shape[0]}")
         if len(set(self.names)) < len(self.names):
             raise InputError(f"view: expected different names, got {', '.join(self.names)}")
-        for name in ("sigma", "valid", "flow_mask"):
-            value = getattr(self, name)
-            if value is not None and tuple(value.shape)[:3] != shape[:3]:
-                raise InputError(f"{name}: expected (view, row, column) = {shape[:3]}, got {tuple(value.shape)[:3]}")
+        others = {"sigma": self.sigma, "valid": self.valid, "flow_mask": self.flow_mask, **self.maps}
+        for name, value in others.items():
+            if value is not None and tuple(value.shape)[:3] != shape:
+                raise InputError(f"{name}: expected (view, row, column) = {shape}, got {tuple(value.shape)[:3]}")
         for camera in self.cameras:
             if camera.image_size[0] > shape[1] or camera.image_size[1] > shape[2]:
                 raise InputError(
                     f"image_size of view '{camera.name}': expected at most {shape[1:3]} (height, width) px, "
                     f"got {camera.image_size}"
                 )
-        ambient_index(self.n_ambient)
-        if self.wavelength_nm is not None and not LIMITS_NM[0] <= self.wavelength_nm <= LIMITS_NM[1]:
-            raise InputError(f"wavelength_nm: expected nanometres such as 532, got {self.wavelength_nm}")
-        parse_faces(self.ambient_faces)
-        good = self.usable.flatten(1).sum(dim=1)
-        for name, count in zip(self.names, good.tolist(), strict=True):
-            if count == 0:
-                raise InputError(f"displacement of view '{name}': no valid pixel; leave the view out or mend its mask")
-        self._check_geometry()
 
     def _check_geometry(self) -> None:
         """Refuse a background in front of or inside the box, and a box that no ray crosses."""
@@ -127,12 +143,76 @@ class Measurement:
         """Names of the views."""
         return tuple(c.name for c in self.cameras)
 
+    @cached_property
+    def observations(self) -> tuple[Observation, ...]:
+        """What was seen, technique by technique."""
+        maps: dict[str, Tensor | None] = {"displacement": self.displacement, "sigma": self.sigma}
+        maps |= {name: value[..., None] for name, value in self.maps.items()}
+        found = []
+        for kind in TECHNIQUES.values():
+            values = maps.get(kind.measured)
+            if values is not None:
+                found.append(Observation(kind, values, maps.get(kind.sigma)))
+        return tuple(found)
+
+    @property
+    def displacements(self) -> Float[Tensor, "view row column 2"]:
+        """The displacement.
+
+        Raises
+        ------
+        InputError
+            If none was measured.
+        """
+        if self.displacement is None:
+            names = " and ".join(o.technique.measured for o in self.observations)
+            raise InputError(f"displacement: expected a measurement of displacements, got {names}")
+        return self.displacement
+
+    @property
+    def techniques(self) -> tuple[type[ForwardModel], ...]:
+        """The techniques that something was measured by."""
+        return tuple(o.technique for o in self.observations)
+
+    @property
+    def quantity(self) -> str:
+        """The field that can be reconstructed."""
+        return self.observations[0].technique.quantity
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Views, rows and columns of the maps."""
+        views, rows, columns = self.observations[0].values.shape[:3]
+        return views, rows, columns
+
+    def observed(self, values: Mapping[str, Tensor], sigmas: Mapping[str, Tensor | None] | None = None) -> Measurement:
+        """Return the measurement with other values (view, row, column, c), and other sigmas, by technique name.
+
+        A technique that is not named keeps its values; where sigmas are given, it loses its sigma.
+        """
+        new: dict[str, Tensor] = {}
+        for o in self.observations:
+            new[o.technique.measured] = values.get(o.technique.name, o.values)
+            sigma = o.sigma if sigmas is None else sigmas.get(o.technique.name)
+            if sigma is not None:
+                new[o.technique.sigma] = sigma
+        displacement, sigma = new.pop("displacement", None), new.pop("sigma", None)
+        maps = {name: value[..., 0] for name, value in new.items()}
+        return replace(self, displacement=displacement, sigma=sigma, maps=maps)
+
     @property
     def usable(self) -> Bool[Tensor, "view row column"]:
-        """Pixels inside their image, valid, of a displacement and, where it is known, a sigma within LIMITS_PX."""
+        """Pixels inside their image, valid, by which one of the techniques measured something."""
         mask = self._called_valid
         for i in range(len(mask)):
             mask[i] &= self._measured(i)
+        return mask
+
+    def usable_for(self, observation: Observation) -> Bool[Tensor, "view row column"]:
+        """Pixels inside their image, valid, by which one technique measured something."""
+        mask = self._called_valid
+        for i in range(len(mask)):
+            mask[i] &= observation.measured(i)
         return mask
 
     @property
@@ -147,15 +227,14 @@ class Measurement:
         return mask if self.valid is None else mask.logical_and_(self.valid)
 
     def _measured(self, view: int) -> Bool[Tensor, "row column"]:
-        least, most = LIMITS_PX
-        mask = (self.displacement[view].abs() <= most).all(dim=-1)  # NaN compares false
-        if self.sigma is not None:
-            mask &= ((self.sigma[view] >= least) & (self.sigma[view] <= most)).all(dim=-1)
-        return mask
+        first, *others = (o.measured(view) for o in self.observations)
+        for other in others:
+            first |= other
+        return first
 
     @property
     def _inside(self) -> Bool[Tensor, "view row column"]:
-        mask = torch.zeros(self.displacement.shape[:3], dtype=torch.bool)
+        mask = torch.zeros(self.shape, dtype=torch.bool)
         for i, camera in enumerate(self.cameras):
             mask[i, : camera.image_size[0], : camera.image_size[1]] = True
         return mask
@@ -164,24 +243,37 @@ class Measurement:
     def sees_box(self) -> Bool[Tensor, "view row column"]:
         """Pixels whose rays cross the box on the way to the background."""
         mask = self._inside
-        for _ in self._traced(mask, sensitivity=False):
+        for _ in self._traced(mask, self.observations[0].technique, sensitivity=False):
             pass
         return mask
 
-    def rays(self) -> tuple[Rays, Float[Tensor, "n 2"], Float[Tensor, "n 2"] | None]:
-        """Return the usable rays that cross the box, their displacement and sigma (None if unknown), px."""
-        mask = self.usable
-        rays = Rays.collect((traced[keep] for traced, keep in self._traced(mask)), int(mask.sum()))
-        return rays, self.displacement[mask].float(), None if self.sigma is None else self.sigma[mask].float()
+    def rays(
+        self, observation: Observation | None = None
+    ) -> tuple[Rays, Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
+        """Return the usable rays that cross the box, what they measured by one technique, and its sigma or None.
+
+        Parameters
+        ----------
+        observation : the first of the measurement where None
+        """
+        observation = observation or self.observations[0]
+        mask = self.usable_for(observation)
+        traced = self._traced(mask, observation.technique)
+        rays = Rays.collect((part[keep] for part, keep in traced), int(mask.sum()))
+        sigma = observation.sigma
+        return rays, observation.values[mask].float(), None if sigma is None else sigma[mask].float()
 
     def _traced(
-        self, mask: Bool[Tensor, "view row column"], sensitivity: bool = True
+        self, mask: Bool[Tensor, "view row column"], kind: type[ForwardModel], sensitivity: bool = True
     ) -> Iterator[tuple[Rays, Bool[Tensor, " n"]]]:
         """Trace the pixels of a mask, some at a time, tell whose ray crosses the box, and clear the others in the mask.
 
         Rays are made in double precision: cameras stand far off, and positions lose digits in single precision.
         """
         for view, (camera, wanted) in enumerate(zip(self.cameras, mask, strict=True)):
+            if not bool(wanted.any()):
+                continue
+            camera = kind.seen_by(camera)
             rows = max(1, CHUNK // wanted.shape[1])
             for first in range(0, wanted.shape[0], rows):
                 block = wanted[first : first + rows]  # a view, through which the mask is changed
@@ -215,8 +307,10 @@ class Measurement:
         return replace(
             self,
             cameras=tuple(self.cameras[i] for i in index),
-            displacement=self.displacement[index],
+            displacement=pick(self.displacement),
             sigma=pick(self.sigma),
+            maps={name: value[index] for name, value in self.maps.items()},
+            about_views={name: value[index] for name, value in self.about_views.items()},
             valid=pick(self.valid),
             flow_mask=pick(self.flow_mask),
         )
@@ -239,41 +333,11 @@ class Measurement:
 
     def summary(self, held_out: int = 0) -> list[tuple[str, str]]:
         """Return what was measured as names and values with units; `held_out` of the views were not used."""
-        from nerif.notebook import number
-
-        usable = self.usable
-        count = max(int(usable.sum()), 1)
-        squares, noise, largest = 0.0, 0.0, 0.0
-        for i, mask in enumerate(usable):  # view by view: pictures may be large
-            d = self.displacement[i][mask].double()
-            squares, largest = squares + float(d.square().sum()), max(largest, float(d.abs().max()))
-            if self.sigma is not None:
-                noise += float(self.sigma[i][mask].double().square().sum())
-        rms, sigma = (number((total / (2 * count)) ** 0.5, 3) for total in (squares, noise))
-        sizes = sorted({c.image_size for c in self.cameras})
-        inside = sum(height * width for height, width in (c.image_size for c in self.cameras))
-        held = f", of which {held_out} held out" if held_out else ""
-        light = f" at {self.wavelength_nm:g} nm" if self.wavelength_nm else ""
-        return [
-            ("Views", f"{len(self.cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
-            ("Displacement", f"rms {rms} px, up to {number(largest, 3)} px"),
-            ("Noise σ", "not known" if self.sigma is None else f"rms {sigma} px"),
-            ("Usable pixels", f"{count / inside:.1%}"),
-            ("Volume", " × ".join(f"{e:g}" for e in self.box.edges) + " mm (x, y, z)"),
-            ("Ambient index", f"{self.n_ambient:.7g}{light}"),
-        ]
+        return summary(self, held_out)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: u and v of the views, and the summary."""
-        from nerif.notebook import PIXELS, panel, show_views
-
-        maps, usable = [], self.usable
-        for i, (height, width) in enumerate(c.image_size for c in self.cameras):
-            step = -(-max(height, width) // PIXELS)
-            part = i, slice(0, height, step), slice(0, width, step)
-            maps.append(torch.where(usable[part][..., None], self.displacement[part], torch.nan).numpy())
-        picture = show_views(self.names, maps)
-        return panel("Measurement", self.summary(), picture, "Displacement u and v of each view, in px")
+        """Return what a notebook shows: the maps of the views, and the summary."""
+        return as_html(self)
 
     # -- files ---------------------------------------------------------------------------------------------------
 
@@ -309,3 +373,22 @@ class Measurement:
             If they break the contract; the message names the variable.
         """
         return cls(**measurement_file.from_dataset(dataset))
+
+
+def measurement_of(
+    values: Mapping[type[ForwardModel], Float[Tensor, "view row column c"]],
+    cameras: Sequence[Camera],
+    box: Box,
+    n_ambient: float,
+    wavelength_nm: float | None = None,
+    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
+) -> Measurement:
+    """Return a measurement by one technique or more, with sigma 1 where there are more, from its values."""
+    maps = {kind.measured: value for kind, value in values.items()}
+    if len(values) > 1:
+        maps |= {kind.sigma: torch.ones_like(value) for kind, value in values.items()}
+    displacement, sigma = maps.pop("displacement", None), maps.pop("sigma", None)
+    return Measurement(
+        tuple(cameras), displacement, box=box, n_ambient=n_ambient, sigma=sigma, wavelength_nm=wavelength_nm,
+        ambient_faces=ambient_faces, maps={name: value[..., 0] for name, value in maps.items()},
+    )  # fmt: skip

@@ -1,4 +1,8 @@
-"""The file of a measurement (NetCDF-4, Conventions BOST-1.0): its variables, what is written and what is refused."""
+"""The file of a measurement (NetCDF-4, Conventions BOST-1.1 or 1.0): its variables, what is written and what refused.
+
+What a technique measures is a variable on view, row, column (and component, where it has several); its name is the
+technique's. The rest is known of the rig.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +15,28 @@ from torch import Tensor
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
 from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, projection_named
 from nerif.netcdf import values
+from nerif.techniques.base import ForwardModel
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.registry import TECHNIQUES, technique
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from nerif.measurement import Measurement
 
-__all__ = ["CONVENTIONS", "MAPS", "VARIABLES", "encoding", "from_dataset", "to_dataset"]
+__all__ = [
+    "ABOUT_VIEWS", "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "known_conventions", "map_names", "to_dataset",
+    "variables",
+]  # fmt: skip
 
-CONVENTIONS = "BOST-1.0"
+PLAIN, CONVENTIONS = "BOST-1.0", "BOST-1.1"
+"""Of files that hold what version 1.0 had, and of those that hold more."""
 
-VARIABLES = {
-    "displacement": (("view", "row", "column", "component"), "px"),
-    "sigma": (("view", "row", "column", "component"), "px"),
-    "valid": (("view", "row", "column"), "1"),
-    "flow_mask": (("view", "row", "column"), "1"),
+PIXELS = ("view", "row", "column")
+
+RIG = {
+    "valid": (PIXELS, "1"),
+    "flow_mask": (PIXELS, "1"),
     "intrinsics": (("view", "i", "j"), "px"),
     "distortion": (("view", "coefficient"), "1"),
     "rotation": (("view", "i", "j"), "1"),
@@ -35,15 +46,42 @@ VARIABLES = {
     "box": (("corner", "i"), "mm"),
     "image_size": (("view", "side"), "px"),
 }
-"""Dimensions and unit of every variable of the file."""
+"""Dimensions and unit of what is known of the rig."""
 
-MAPS = ("displacement", "sigma", "valid", "flow_mask")
-"""What is measured; the rest is known of the rig."""
+MASKS = ("valid", "flow_mask")
 
-OPTIONAL = ("sigma", "valid", "flow_mask", "distortion", "image_size")
-SIZES = {"component": 2, "i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2}
+ABOUT_VIEWS = {
+    "aperture_diameter": (("view",), "mm"),
+    "focus_distance": (("view",), "mm"),
+    "window": (("view",), "px"),
+    "pose_sigma": (("view", "parameter"), "rad, rad, rad, mm, mm, mm"),
+}
+"""Dimensions and unit of what else may be known of the views."""
+
+NEEDED = ("intrinsics", "rotation", "translation", "box")
+BACKGROUND = ("background_normal", "background_offset")
+SIZES = {"component": 2, "i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2, "parameter": 6}
 MOST_PIXELS = 1 << 32
 """Of all views together; a damaged file may claim any number."""
+
+
+def variables() -> dict[str, tuple[tuple[str, ...], str]]:
+    """Return dimensions and unit of every variable that a file may have."""
+    measured: dict[str, tuple[tuple[str, ...], str]] = {}
+    for kind in TECHNIQUES.values():
+        dimensions = (*PIXELS, "component") if len(kind.channels) > 1 else PIXELS
+        measured |= {kind.measured: (dimensions, kind.unit), kind.sigma: (dimensions, kind.unit)}
+    return {**measured, **RIG, **ABOUT_VIEWS}
+
+
+def map_names() -> tuple[str, ...]:
+    """Return the names of what has a value a pixel."""
+    return tuple(name for name, (dimensions, _) in variables().items() if dimensions[:3] == PIXELS)
+
+
+def known_conventions(found: object) -> bool:
+    """Return whether an attribute Conventions is that of a measurement."""
+    return isinstance(found, str) and found in (PLAIN, CONVENTIONS)
 
 
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
@@ -66,31 +104,39 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     def stack(values: list[Tensor]) -> np.ndarray:
         return torch.stack(values).numpy()
 
-    cameras = measurement.cameras
+    cameras, known = measurement.cameras, variables()
     data: dict[str, np.ndarray] = {
         "intrinsics": stack([c.intrinsics for c in cameras]),
         "distortion": stack([c.distortion for c in cameras]),
         "rotation": stack([c.rotation for c in cameras]),
         "translation": stack([c.translation for c in cameras]),
-        "background_normal": stack([c.plane.normal for c in cameras]),
-        "background_offset": np.array([c.plane.offset for c in cameras]),
         "box": np.array([measurement.box.lower, measurement.box.upper]),
         "image_size": np.array([c.image_size for c in cameras], dtype=np.int32),
     }
-    for name in MAPS:
-        value = getattr(measurement, name)
+    if any(c.background is not None for c in cameras):
+        nowhere = torch.full((3,), torch.nan, dtype=torch.float64)
+        data["background_normal"] = stack([nowhere if c.background is None else c.background.normal for c in cameras])
+        data["background_offset"] = np.array([np.nan if c.background is None else c.background.offset for c in cameras])
+    maps = {"displacement": measurement.displacement, "sigma": measurement.sigma, **measurement.maps}
+    for name, value in {**maps, "valid": measurement.valid, "flow_mask": measurement.flow_mask}.items():
         if value is not None:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
-    dataset = xr.Dataset({k: (VARIABLES[k][0], v, {"units": VARIABLES[k][1]}) for k, v in data.items()})
-    dataset = dataset.assign_coords(view=list(measurement.names), component=list(COMPONENTS))
+    data |= {name: value.numpy() for name, value in measurement.about_views.items()}
+    dataset = xr.Dataset({k: (known[k][0], v, {"units": known[k][1]}) for k, v in data.items()})
+    dataset = dataset.assign_coords(view=list(measurement.names))
+    if measurement.displacement is not None:
+        dataset = dataset.assign_coords(component=list(COMPONENTS))
+    names = [kind.name for kind in measurement.techniques]
+    pinholes = all(c.projection == PERSPECTIVE for c in cameras)
+    plain = names == [Deflection.name] and not measurement.about_views and pinholes
     dataset.attrs = {
-        "Conventions": CONVENTIONS,
+        "Conventions": PLAIN if plain else CONVENTIONS,
+        **({} if plain else {"technique": " ".join(names)}),
         "n_ambient": measurement.n_ambient,
         "ambient_faces": " ".join(measurement.ambient_faces),
     }
-    kinds = [c.projection.name for c in cameras]
-    if set(kinds) != {PERSPECTIVE.name}:
-        dataset["projection"] = (("view",), np.array(kinds, dtype=object))
+    if not pinholes:
+        dataset["projection"] = (("view",), np.array([c.projection.name for c in cameras], dtype=object))
     if measurement.wavelength_nm is not None:
         dataset.attrs["wavelength_nm"] = measurement.wavelength_nm
     return dataset
@@ -105,27 +151,44 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
         If variables or attributes break the contract; the message names the variable.
     """
     found = dataset.attrs.get("Conventions")
-    if not (isinstance(found, str) and found == CONVENTIONS):
-        raise InputError(f"attribute Conventions: expected '{CONVENTIONS}', got '{found}'; is it a measurement?")
+    if not known_conventions(found):
+        raise InputError(
+            f"attribute Conventions: expected '{PLAIN}' or '{CONVENTIONS}', got '{found}'; is it a measurement?"
+        )
     _check_variables(dataset)
     faces = dataset.attrs.get("ambient_faces", " ".join(DEFAULT_AMBIENT_FACES))
     if not isinstance(faces, str):
         raise InputError(f"attribute ambient_faces: expected a text such as 'x- x+ y- y+', got {faces!r}")
+    own = ("displacement", "sigma", *MASKS)
+    index = any(kind.quantity == Deflection.quantity for kind in _techniques(dataset))
     return {
         "cameras": _cameras(dataset),
         "box": _box(dataset),
-        **{name: _map(dataset, name) for name in MAPS if name in dataset},
-        "n_ambient": _number(dataset, "n_ambient", "the index around the flow, e.g. 1.00027"),
+        **{name: _map(dataset, name) for name in own if name in dataset},
+        "maps": {name: _map(dataset, name) for name in map_names() if name in dataset and name not in own},
+        "about_views": {name: _array(dataset, name) for name in ABOUT_VIEWS if name in dataset},
+        "n_ambient": _number(dataset, "n_ambient", "the index around the flow, e.g. 1.00027", None if index else 1.0),
         "wavelength_nm": _number(dataset, "wavelength_nm", "nm") if "wavelength_nm" in dataset.attrs else None,
         "ambient_faces": parse_faces(faces, "attribute ambient_faces"),
     }
 
 
+def _techniques(dataset: xr.Dataset) -> tuple[type[ForwardModel], ...]:
+    """The techniques of a file: those its attribute names, each of which needs its variable, else those it holds."""
+    named = dataset.attrs.get("technique", "")
+    if not isinstance(named, str):
+        raise InputError(f"attribute technique: expected one of {', '.join(TECHNIQUES)}, got {named!r}")
+    kinds = tuple(technique(name) for name in named.replace(",", " ").split())
+    return kinds or tuple(k for k in TECHNIQUES.values() if k.measured in dataset) or (Deflection,)
+
+
 def _check_variables(dataset: xr.Dataset) -> None:
     """Refuse missing variables and wrong dimensions, sizes, types and units, by name."""
-    for name, (dimensions, unit) in VARIABLES.items():
+    kinds = _techniques(dataset)
+    needed = [*(kind.measured for kind in kinds), *NEEDED, *(BACKGROUND if any(k.background for k in kinds) else ())]
+    for name, (dimensions, unit) in variables().items():
         if name not in dataset:
-            if name in OPTIONAL:
+            if name not in needed:
                 continue
             raise InputError(f"variable '{name}': expected on ({', '.join(dimensions)}) in {unit}, got none")
         variable = dataset[name]
@@ -142,22 +205,23 @@ def _check_variables(dataset: xr.Dataset) -> None:
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
         shape = f"{views} x {rows} x {columns}"
-        raise InputError(f"variable 'displacement': expected views of some megapixels, got {shape}")
+        raise InputError(f"variable '{kinds[0].measured}': expected views of some megapixels, got {shape}")
 
 
-def _array(dataset: xr.Dataset, name: str) -> Tensor:
-    """A small variable in double precision, in the order of its dimensions, every number finite."""
-    numbers = values(dataset[name].transpose(*VARIABLES[name][0])).astype(np.float64)
-    if not np.isfinite(numbers).all():
+def _array(dataset: xr.Dataset, name: str, gaps: bool = False) -> Tensor:
+    """A small variable in double precision, in the order of its dimensions, every number finite unless gaps may be."""
+    numbers = values(dataset[name].transpose(*variables()[name][0])).astype(np.float64)
+    if not gaps and not np.isfinite(numbers).all():
         raise InputError(f"variable '{name}': expected finite numbers, got {numbers[~np.isfinite(numbers)][0]}")
     return torch.from_numpy(np.ascontiguousarray(numbers))
 
 
 def _map(dataset: xr.Dataset, name: str) -> Tensor:
     """A map: measured numbers in single precision, masks as booleans."""
-    variable, (_, *dimensions) = dataset[name], VARIABLES[name][0]
-    shape = [variable.sizes[d] for d in VARIABLES[name][0]]
-    measured = dimensions[-1] == "component"
+    variable, whole = dataset[name], variables()[name][0]
+    _, *dimensions = whole
+    shape = [variable.sizes[d] for d in whole]
+    measured = name not in MASKS
     result = torch.empty(shape, dtype=torch.float32 if measured else torch.bool)
     for i in range(shape[0]):
         numbers = values(variable.isel(view=i).transpose(*dimensions))
@@ -184,13 +248,14 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     sizes = _array(dataset, "image_size") if "image_size" in dataset else whole
     distortion = _array(dataset, "distortion") if "distortion" in dataset else torch.zeros(views, 5).double()
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
-    normals, offsets = _array(dataset, "background_normal"), _array(dataset, "background_offset")
-    kinds = dataset["projection"].values if "projection" in dataset else [PERSPECTIVE.name] * views
+    nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64)
+    normals, offsets = (_array(dataset, n, True) if n in dataset else nowhere for n in BACKGROUND)
+    kinds = dataset["projection"].values if "projection" in dataset else np.array([PERSPECTIVE.name] * views)
+    if kinds.shape != (views,):
+        got = dataset["projection"].dims
+        raise InputError(f"variable 'projection': expected one name a view, got dimensions {got}")
     cameras = []
     for i, name in enumerate(names):
-        length = float(normals[i].norm())
-        if not 0.99 < length < 1.01:
-            raise InputError(f"background_normal of view '{name}': expected a unit vector, got length {length:g}")
         height, width = sizes[i].tolist()
         cameras.append(
             Camera(
@@ -198,7 +263,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 rotation=rotation[i],
                 translation=translation[i],
                 image_size=(int(height), int(width)),
-                background=Plane(normals[i] / length, float(offsets[i]) / length),
+                background=_plane(normals[i], offsets[i], name),
                 distortion=distortion[i],
                 name=name,
                 projection=projection_named(str(kinds[i]), f"projection of view '{name}'"),
@@ -207,8 +272,20 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def _number(dataset: xr.Dataset, name: str, what: str) -> float:
-    value = dataset.attrs.get(name)
+def _plane(normal: Tensor, offset: Tensor, view: str) -> Plane | None:
+    """The background of a view; none where neither of its numbers is given."""
+    if bool(normal.isnan().all()):
+        return None
+    length = float(normal.norm())
+    if not 0.99 < length < 1.01:
+        raise InputError(f"background_normal of view '{view}': expected a unit vector, got length {length:g}")
+    if not bool(offset.isfinite()):
+        raise InputError(f"background_offset of view '{view}': expected a finite number in mm, got {float(offset)}")
+    return Plane(normal / length, float(offset) / length)
+
+
+def _number(dataset: xr.Dataset, name: str, what: str, otherwise: float | None = None) -> float:
+    value = dataset.attrs.get(name, otherwise)
     if not isinstance(value, int | float | np.number):
         got = "none" if value is None else repr(value)
         raise InputError(f"attribute {name}: expected a number ({what}), got {got}")

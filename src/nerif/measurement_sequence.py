@@ -1,4 +1,4 @@
-"""Measurements over time: a Zarr store of the measurement's variables, with a leading dimension `time` (BOST-1.0).
+"""Measurements over time: a Zarr store of the measurement's variables, with a leading dimension `time`.
 
 Each frame has chunks of its own, so frames are written and read one by one, by as many processes as there are.
 """
@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.measurement import Measurement
-from nerif.measurement_file import CONVENTIONS, MAPS, VARIABLES
+from nerif.measurement_file import CONVENTIONS, PLAIN, known_conventions, map_names, variables
 from nerif.netcdf import reading, values
+from nerif.techniques.registry import TECHNIQUES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,12 +86,16 @@ class MeasurementSequence:
         path = Path(path)
         _check_arrays(path)
         with _opened(path) as dataset:
-            if dataset.attrs.get("Conventions") != CONVENTIONS:
-                found = dataset.attrs.get("Conventions")
-                raise InputError(f"{path}: attribute Conventions: expected '{CONVENTIONS}', got '{found}'")
-            if "displacement" not in dataset or dataset["displacement"].dims[:1] != ("time",):
-                got = dataset["displacement"].dims if "displacement" in dataset else "none"
-                raise InputError(f"{path}: variable 'displacement': expected a leading dimension time, got {got}")
+            found = dataset.attrs.get("Conventions")
+            if not known_conventions(found):
+                raise InputError(
+                    f"{path}: attribute Conventions: expected '{PLAIN}' or '{CONVENTIONS}', got '{found}'"
+                )
+            names = _measured(dataset) or ("displacement",)
+            for name in names:
+                got = dataset[name].dims if name in dataset else "none"
+                if got[:1] != ("time",):
+                    raise InputError(f"{path}: variable '{name}': expected a leading dimension time, got {got}")
             count = dataset.sizes["time"]
             given = values(dataset["time"]).tolist() if "time" in dataset.coords else range(count)
         times = tuple(float(t) for t in given)
@@ -106,13 +111,17 @@ class MeasurementSequence:
         InputError
             If the frame breaks the contract of a measurement, such as a view with no valid pixel.
         """
+        import numpy as np
+
         with _opened(self.path) as dataset, reading(f"{self.path}, frame {index}: cannot be read; is it damaged?"):
             if WRITTEN in dataset and not bool(dataset[WRITTEN][index]):
                 raise InputError(f"{self.path}, frame {index}: nothing was measured then, or not to its end")
             one = dataset.isel(time=index).load() if "time" in dataset.dims else dataset.load()
         try:
-            if tuple(one["displacement"].dims) == VARIABLES["displacement"][0]:
-                seeing = one["displacement"].notnull().all("component").any(("row", "column")).values
+            known = variables()
+            maps = [one[name] for name in _measured(one) if one[name].dims == known[name][0]]
+            if maps:
+                seeing = np.any([m.notnull().all(m.dims[3:]).any(("row", "column")).values for m in maps], axis=0)
                 one = one.isel(view=seeing) if seeing.any() else one
             return Measurement.from_dataset(one.drop_vars(["time", WRITTEN], errors="ignore"))
         except InputError as error:
@@ -157,19 +166,19 @@ class MeasurementSequence:
             raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
         dataset = like.to_dataset()
         # the static variables by xarray, those of each frame as empty arrays of one chunk a frame
-        fixed = dataset.drop_vars([name for name in MAPS if name in dataset])
+        maps = [name for name in map_names() if name in dataset]
+        fixed = dataset.drop_vars(maps)
         # names as text of any length: the fixed one has no place in Zarr's third format
-        names = {k: (k, fixed[k].values.astype(object)) for k in ("view", "component")}
+        names = {k: (k, fixed[k].values.astype(object)) for k in ("view", "component") if k in fixed.coords}
         time = ("time", np.asarray(times, dtype=np.float64), {"units": "s", "axis": "T"})
         fixed = fixed.assign_coords(names).assign_coords(time=time)
         with atomic(path) as part:
             fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=3)
             group = zarr.open_group(part, mode="r+")
-            for name in MAPS:
-                if name in dataset:
-                    v = dataset[name]
-                    fill = np.nan if v.dtype.kind == "f" else 0
-                    add_frames(group, name, len(times), v.shape, tuple(map(str, v.dims)), v.dtype, fill, **v.attrs)
+            for name in maps:
+                v = dataset[name]
+                fill = np.nan if v.dtype.kind == "f" else 0
+                add_frames(group, name, len(times), v.shape, tuple(map(str, v.dims)), v.dtype, fill, **v.attrs)
             meaning = "written last: the frame is complete"
             add_frames(group, WRITTEN, len(times), (), (), "int8", 0, long_name=meaning)
         return cls(path, tuple(float(t) for t in times))
@@ -189,13 +198,13 @@ class MeasurementSequence:
             if name not in names:
                 raise InputError(f"{self.path}, frame {index}: expected views out of {', '.join(names)}, got '{name}'")
         places = [names.index(name) for name in measurement.names]
-        for name in MAPS:
+        for name in map_names():
             if (name in dataset) != (name in group):
                 has = "with" if name in group else "without"
                 raise InputError(f"{self.path}, frame {index}: expected a measurement {has} '{name}' as the others")
         if WRITTEN in group:
             group[WRITTEN][index] = 0
-        for name in (name for name in reversed(MAPS) if name in dataset):
+        for name in (name for name in reversed(map_names()) if name in dataset):
             values = dataset[name].values
             whole = np.full(group[name].shape[1:], group[name].fill_value, dtype=values.dtype)
             whole[places, : values.shape[1], : values.shape[2]] = values
@@ -210,7 +219,13 @@ class MeasurementSequence:
         group: Any = zarr.open_group(self.path, mode="r")
         if WRITTEN in group:
             return bool(group[WRITTEN][index])
-        return any(p.is_file() for p in (self.path / "displacement" / "c" / str(index)).rglob("*"))
+        first = next(kind.measured for kind in TECHNIQUES.values() if kind.measured in group)
+        return any(p.is_file() for p in (self.path / first / "c" / str(index)).rglob("*"))
+
+
+def _measured(dataset: xr.Dataset) -> tuple[str, ...]:
+    """Names of what the techniques measured."""
+    return tuple(kind.measured for kind in TECHNIQUES.values() if kind.measured in dataset)
 
 
 def _check_arrays(path: Path) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
-from nerif.evaluation import evaluate_views
+from nerif.evaluation import evaluate_views, rms_text
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
@@ -35,7 +35,7 @@ ASKED = "asked.json"
 
 
 def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
-    """Sample a reconstruction as index excess, n, density and temperature, `voxels` along the longest edge."""
+    """Sample a reconstruction as all that follows from it, such as density, `voxels` along the longest edge."""
     return derive_all(result.volume(Grid.of_resolution(result.box, voxels)), gas)
 
 
@@ -97,26 +97,28 @@ class Members:
         self.out.add_metrics({"ensemble": about})
         for line in masked_lines(volumes):
             say(line)
-        excess = next(v for v in volumes if v.quantity == "index_excess_std")
+        excess = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
         largest = float(volumes[0].values.abs().max())
         rms = float(excess.values.square().mean().sqrt())
-        share = f"{rms / largest:.2%} of the largest excess"
-        say(f"ensemble of {spread.count}: rms standard deviation of n {rms:.3g}, {share}")
+        share = f"{rms / largest:.2%} of the largest"
+        say(f"ensemble of {spread.count}: rms standard deviation of {volumes[0].quantity} {rms:.3g}, {share}")
         for v in left_out:
-            say(f"left out {v['name']}: CC {v['cc']:.4f}, rms error {v['rms_px']:.4f} px")
+            say(f"left out {v['name']}: CC {v['cc']:.4f}, rms error {rms_text(v)}")
 
-    def _noise(self, main: Reconstruction) -> tuple[Float[Tensor, "view row column 2"], str]:
-        """Standard deviation of the noise of every pixel, px: that of the file, else the rms residual of each view."""
-        training = self.training
-        if training.sigma is not None:
-            return training.sigma.nan_to_num(0.0, 0.0, 0.0), "sigma of the measurement"
-        rms = torch.tensor([v["rms_px"] for v in _compared(main, training)])
+    def _noise(self, main: Reconstruction) -> tuple[dict[str, Float[Tensor, "view row column c"]], str]:
+        """Standard deviation of every pixel's noise by technique: the file's, else the rms residual of each view."""
+        seen, training = self.training.observations[0], self.training
+        if seen.sigma is not None:  # of several techniques each has one
+            known = {o.technique.name: o.sigma for o in training.observations if o.sigma is not None}
+            return {name: sigma.nan_to_num(0.0, 0.0, 0.0) for name, sigma in known.items()}, "sigma of the measurement"
+        rms = torch.tensor([v["rms"] for v in _compared(main, training)])
         instead = "noise of the size of each view's rms residual is added"
         self.monitor.say(f"ensemble: the measurement has no sigma; {instead}")
         # NaN for a view of which no ray crosses the box
-        return rms.nan_to_num(0.0)[:, None, None, None].expand(training.displacement.shape).clone(), "rms residual"
+        whole = rms.nan_to_num(0.0)[:, None, None, None].expand(seen.values.shape).clone()
+        return {seen.technique.name: whole}, "rms residual"
 
-    def _member(self, number: int, noise: Float[Tensor, "view row column 2"]) -> Reconstruction:
+    def _member(self, number: int, noise: Mapping[str, Float[Tensor, "view row column c"]]) -> Reconstruction:
         """One member: read if it is there already, made by the same settings from the same data; else reconstructed."""
         directory = self.out.member(number)
         reconstructor, noisy = self.ensemble.member(number, self.reconstructor, self.training, noise)

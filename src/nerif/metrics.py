@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["correlation", "displacement_metrics", "psnr", "slice_metrics", "ssim", "volume_errors", "volume_metrics"]
+__all__ = ["correlation", "psnr", "slice_metrics", "ssim", "view_metrics", "volume_errors", "volume_metrics"]
 
 Array = np.ndarray
 
@@ -80,10 +80,10 @@ def slice_metrics(
     ]
 
 
-def displacement_metrics(
-    measured: Float[Array, "row column 2"], predicted: Float[Array, "row column 2"], valid: Array
+def view_metrics(
+    measured: Float[Array, "row column c"], predicted: Float[Array, "row column c"], valid: Array
 ) -> dict[str, float]:
-    """Compare two displacement maps over the valid pixels: cc, ssim, psnr over both components, rms_px in px.
+    """Compare what a view measured with what is predicted over the valid pixels: cc, ssim, psnr, rms of all components.
 
     SSIM needs whole windows: pixels that are not valid are set to the same value in both maps and windows centred on
     them are left out.
@@ -92,15 +92,15 @@ def displacement_metrics(
 
     if not valid.any():
         nan = float("nan")
-        return {"cc": nan, "ssim": nan, "psnr": nan, "rms_px": nan}
+        return {"cc": nan, "ssim": nan, "psnr": nan, "rms": nan}
     a, b = measured[valid], predicted[valid]
     rms = float(np.sqrt(np.mean((a - b).astype(np.float64) ** 2)))
     span = float(a.max() - a.min())
     similarity = float("nan")
     if span > 0 and min(valid.shape) >= 7:
         maps = []
-        for c in range(2):
+        for c in range(measured.shape[-1]):
             x, y = (np.where(valid, m[..., c], 0).astype(np.float64) for m in (measured, predicted))
             maps.append(structural_similarity(x, y, data_range=span, full=True)[1][valid])
         similarity = float(np.mean(maps))
-    return {"cc": correlation(a, b), "ssim": similarity, "psnr": psnr(a, b), "rms_px": rms}
+    return {"cc": correlation(a, b), "ssim": similarity, "psnr": psnr(a, b), "rms": rms}

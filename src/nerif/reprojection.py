@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,8 +13,10 @@ from torch import Tensor
 from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.measurement import Measurement
-from nerif.measurement_file import VARIABLES, encoding, from_dataset, to_dataset
+from nerif.measurement_file import encoding, from_dataset, to_dataset
 from nerif.netcdf import opened
+from nerif.techniques.base import ForwardModel
+from nerif.techniques.deflection import Deflection
 
 __all__ = ["Accuracy", "Reprojection"]
 
@@ -49,24 +52,33 @@ class Reprojection:
     Parameters
     ----------
     measurement : Measurement
-    predicted : (view, row, column, 2) displacement, px; 0 where a ray misses the box
+    maps : (view, row, column, c) predicted, by the name of the technique; 0 where a ray misses the box
     held_out : names of the views that the reconstruction has not seen
     accuracy : of the prediction
     """
 
     measurement: Measurement
-    predicted: Float[Tensor, "view row column 2"]
+    maps: Mapping[str, Float[Tensor, "view row column c"]]
     held_out: tuple[str, ...] = ()
     accuracy: Accuracy = Accuracy()
 
+    @property
+    def predicted(self) -> Float[Tensor, "view row column c"]:
+        """What is predicted of the first technique."""
+        return self.maps[self.measurement.observations[0].technique.name]
+
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a measurement file of the predicted displacement, with `measured` and `held_out` in it, atomically."""
+        """Write a measurement file of what is predicted, with `measured` and `held_out` in it, atomically."""
         import numpy as np
 
-        predicted = replace(self.measurement, displacement=self.predicted, valid=self.measurement.usable)
+        measurement = self.measurement
+        sigmas = {o.technique.name: o.sigma for o in measurement.observations}
+        predicted = replace(measurement.observed(self.maps, sigmas), valid=measurement.usable)
         dataset = to_dataset(predicted)
-        about = {"units": "px", "long_name": "measured displacement"}
-        dataset["measured"] = (VARIABLES["displacement"][0], self.measurement.displacement.float().numpy(), about)
+        for o in measurement.observations:
+            like = dataset[o.technique.measured]
+            about = {"units": o.technique.unit, "long_name": f"measured {o.technique.measured}"}
+            dataset[_measured(o.technique)] = (like.dims, o.values.float().numpy().reshape(like.shape), about)
         held = np.array([name in self.held_out for name in self.measurement.names], dtype=np.int8)
         about = {"units": "1", "long_name": "1 where the reconstruction has not seen it"}
         dataset["held_out"] = (("view",), held, about)
@@ -86,9 +98,21 @@ class Reprojection:
         import numpy as np
 
         with opened(path, "a re-projection") as data:
-            if "measured" not in data or "held_out" not in data:
-                raise InputError("expected variables 'measured' and 'held_out', got a plain measurement")
             predicted = Measurement(**from_dataset(data))
-            measured = torch.from_numpy(np.asarray(data["measured"].values, dtype=np.float32))
+            names = {o.technique.name: _measured(o.technique) for o in predicted.observations}
+            for name in (*names.values(), "held_out"):
+                if name not in data:
+                    raise InputError(f"expected variables '{name}' and 'held_out', got a plain measurement")
+            maps = {o.technique.name: o.values for o in predicted.observations}
+            sigmas = {o.technique.name: o.sigma for o in predicted.observations}
+            measured = {
+                kind: torch.from_numpy(np.asarray(data[name].values, dtype=np.float32)).reshape(maps[kind].shape)
+                for kind, name in names.items()
+            }
             held_out = tuple(n for n, held in zip(predicted.names, data["held_out"].values, strict=True) if held)
-        return cls(replace(predicted, displacement=measured), predicted.displacement, held_out)
+        return cls(predicted.observed(measured, sigmas), maps, held_out)
+
+
+def _measured(kind: type[ForwardModel]) -> str:
+    """Name of the variable that holds what was measured."""
+    return "measured" if kind is Deflection else f"measured_{kind.measured}"

@@ -21,7 +21,15 @@ from nerif.fields.base import Field
 from nerif.geometry import Box
 from nerif.measurement import Measurement
 from nerif.reconstruction.base import Reconstruction, State
-from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_state, write_field, write_state
+from nerif.reconstruction.files import (
+    CHECKPOINT,
+    FIELD,
+    read_field,
+    read_quantity,
+    read_state,
+    write_field,
+    write_state,
+)
 from nerif.reprojection import Reprojection
 from nerif.toml import read_toml, write_toml
 from nerif.volume import Volume
@@ -190,6 +198,10 @@ class ResultDirectory:
     def field(self) -> tuple[Field, Box, float]:
         """Return the field of index excess, its box (mm) and n_ambient."""
         return read_field(self.path)
+
+    def quantity(self) -> str:
+        """Return what the field is (volume.QUANTITIES)."""
+        return read_quantity(self.path)
 
     def state(self) -> State:
         """Return the checkpoint."""

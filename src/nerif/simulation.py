@@ -1,11 +1,17 @@
-"""Simulated measurements: curved rays from every pixel through a field, to the background, plus noise."""
+"""Simulated measurements: what cameras see of a field by any technique, plus noise.
+
+Displacements are those of curved rays, followed from every pixel through the field to the background; the other
+techniques see straight rays.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,18 +19,25 @@ from torch import Tensor
 from nerif.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
-from nerif.fields.phantoms import make_phantom
+from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Box, Camera, Grid
-from nerif.measurement import Measurement
+from nerif.measurement import Measurement, measurement_of
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.ray_tracing import background_points
-from nerif.volume import Volume
+from nerif.techniques.absorption import Absorption, absorbance
+from nerif.techniques.base import ForwardModel
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.registry import forward_model, technique
+from nerif.volume import INDEX, Volume, describe
 from nerif.volume_file import read_volume
 from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["Simulation", "add_noise", "simulate", "view_displacement"]
+__all__ = ["Simulation", "add_noise", "add_photon_noise", "simulate", "view_displacement"]
 
 MOVING = ("flame", "2", "3", "4", "5", "6", "7")
+PEAK_VOXELS = 64  # along the longest edge, on which the largest value of a phantom is looked for
+VIEW_CHUNK = 2048  # rays that are integrated at a time
 STEPS = 120  # Runge-Kutta steps through the box: 2e-4 of the rms displacement on the flame (tests/test_simulation.py)
 
 
@@ -47,8 +60,19 @@ def view_displacement(
     return displacement.reshape(*camera.image_size, 2).float()
 
 
+def view_of(
+    kind: type[ForwardModel], field: Field, camera: Camera, measurement: Measurement, steps: int = STEPS
+) -> Float[Tensor, "row column c"]:
+    """Return what every pixel of a camera sees of a field by a technique; 0 where its ray misses the box."""
+    if issubclass(kind, Deflection):
+        return view_displacement(field, camera, measurement.box, measurement.n_ambient, steps)
+    projector = PathIntegral(forward_model(kind, measurement), steps)
+    rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).to(dtype=torch.float32)
+    return project(projector, field, rays, chunk=VIEW_CHUNK).reshape(*camera.image_size, -1)
+
+
 def add_noise(measurement: Measurement, level: float, seed: int = 0) -> Measurement:
-    """Add Gaussian noise of sigma = level x the rms displacement over the rays that cross the box, and record sigma.
+    """Add Gaussian noise of sigma = level x the rms over the rays that cross the box, and record sigma.
 
     Parameters
     ----------
@@ -56,17 +80,39 @@ def add_noise(measurement: Measurement, level: float, seed: int = 0) -> Measurem
     seed : of the noise
     """
     if not level >= 0:
-        raise InputError(f"noise: expected a level of 0 or more (0.1 is 10 % of the rms displacement), got {level}")
+        raise InputError(f"noise: expected a level of 0 or more (0.1 is 10 % of the rms), got {level}")
     if level == 0:
         return measurement
-    _, d, _ = measurement.rays()
-    sigma = level * float(d.square().mean().sqrt())
-    noise = torch.randn(measurement.displacement.shape, generator=torch.Generator().manual_seed(seed))
-    return replace(
-        measurement,
-        displacement=measurement.displacement + sigma * noise,
-        sigma=torch.full_like(measurement.displacement, sigma),
-    )
+    generator, noisy, sigmas = torch.Generator().manual_seed(seed), {}, {}
+    for o in measurement.observations:
+        _, values, _ = measurement.rays(o)
+        sigma = level * float(values.square().mean().sqrt())
+        noisy[o.technique.name] = o.values + sigma * torch.randn(o.values.shape, generator=generator)
+        sigmas[o.technique.name] = torch.full_like(o.values, sigma)
+    return measurement.observed(noisy, sigmas)
+
+
+def add_photon_noise(measurement: Measurement, counts: float, seed: int = 0) -> Measurement:
+    """Replace absorbances by those of so many detected quanta a pixel without the medium, and record their sigma.
+
+    Parameters
+    ----------
+    counts : quanta; the reference picture is the mean of many, so without noise of its own
+    seed : of the noise
+
+    Raises
+    ------
+    InputError
+        If something else was measured.
+    """
+    if measurement.techniques != (Absorption,):
+        raise InputError(f"counts: expected absorption, got {' and '.join(k.name for k in measurement.techniques)}")
+    values = measurement.observations[0].values
+    generator = torch.Generator().manual_seed(seed)
+    passed = torch.poisson(counts * torch.exp(-values.nan_to_num()), generator)
+    found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_pictures=math.inf)
+    maps = {Absorption.name: torch.from_numpy(found).float()}
+    return measurement.observed(maps, {Absorption.name: torch.from_numpy(sigma).float()})
 
 
 def simulate(
@@ -80,39 +126,39 @@ def simulate(
     wavelength_nm: float | None = None,
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
     on_view: Callable[[int], None] | None = None,
+    techniques: Sequence[type[ForwardModel]] = (Deflection,),
 ) -> Measurement:
     """Return what the cameras would measure of a field.
 
     Parameters
     ----------
-    field : Field of index excess
-    cameras : with their backgrounds
-    box : outside of which the index is ambient, mm
+    field : of what the techniques see; of an index the excess
+    cameras : with their backgrounds, where a technique needs them
+    box : outside of which the field is ambient, mm
     noise : level, see add_noise
     seed : of the noise
-    steps : Runge-Kutta steps through the box
+    steps : Runge-Kutta steps, or samples, through the box
     on_view : called with the number of views done
+    techniques : what each pixel measures
     """
-    height = max(c.image_size[0] for c in cameras)
-    width = max(c.image_size[1] for c in cameras)
-    displacement = torch.zeros(len(cameras), height, width, 2)
+    if len(techniques) > 1 and not noise:
+        raise InputError("noise: expected a level above 0, by which several techniques are weighed")
+    height, width = (max(c.image_size[i] for c in cameras) for i in (0, 1))
+    if not any(kind.background for kind in techniques):
+        cameras = [kind.seen_by(c) for kind in techniques[:1] for c in cameras]
+    empty = {kind: torch.zeros(len(cameras), height, width, len(kind.channels)) for kind in techniques}
     # made first with nothing in it: a rig that cannot be right is refused before the long work
-    measurement = Measurement(
-        cameras=tuple(cameras),
-        displacement=displacement,
-        box=box,
-        n_ambient=n_ambient,
-        wavelength_nm=wavelength_nm,
-        ambient_faces=ambient_faces,
-    )
-    displacement = torch.full_like(displacement, float("nan"))
+    measurement = measurement_of(empty, tuple(cameras), box, n_ambient, wavelength_nm, ambient_faces)
+    seen = {kind.name: torch.full_like(values, float("nan")) for kind, values in empty.items()}
     with torch.no_grad():
         for i, camera in enumerate(cameras):
             h, w = camera.image_size
-            displacement[i, :h, :w] = view_displacement(field, camera, box, n_ambient, steps)
+            for kind in techniques:
+                seen[kind.name][i, :h, :w] = view_of(kind, field, kind.seen_by(camera), measurement, steps)
             if on_view is not None:
                 on_view(i + 1)
-    return add_noise(replace(measurement, displacement=displacement), noise, seed)
+    measurement = measurement.observed(seen) if len(techniques) > 1 else measurement.observed(seen, {})
+    return add_noise(measurement, noise, seed)
 
 
 @dataclass(frozen=True)
@@ -121,8 +167,14 @@ class Simulation:
 
     phantom: str = "flame"
     """One of gaussians, flame, octahedron, 1-7 (the paper's numbers), or a volume file (.nc, .vti) of your own."""
+    technique: tuple[str, ...] = (Deflection.name,)
+    """What a pixel measures: deflection, absorption, emission or interferometry; of one field also several."""
+    peak: float = 0.0
+    """Largest extinction or emission, 1/mm, that a phantom is scaled to; 0 for one that gives about 1 along a ray."""
     noise: float = 0.0
-    """Standard deviation of the noise as a share of the rms displacement over rays that cross the box."""
+    """Standard deviation of the noise as a share of the rms over rays that cross the box."""
+    counts: float = 0.0
+    """Of absorption: detected quanta a pixel without the medium, whose noise there is then instead; 0 for none."""
     seed: int = 0
     """Of phantom and noise."""
     time: float = 0.0
@@ -141,6 +193,13 @@ class Simulation:
     """Runge-Kutta steps of a ray through the box."""
 
     def __post_init__(self) -> None:
+        for name in self.technique:
+            technique(name)
+        for name in ("peak", "counts"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if self.counts and self.noise:
+            raise InputError("counts: expected without --noise, which it replaces")
         if self.truth_voxels < 1:
             raise InputError(f"truth_voxels: expected at least 1, got {self.truth_voxels}")
 
@@ -155,12 +214,15 @@ class Simulation:
             If there is no such phantom, or a volume file is none.
         """
         field, box, n_ambient = self._field()
+        kinds = [technique(name) for name in self.technique]
         measurement = simulate(
             field, cameras, box, n_ambient, self.noise, self.seed + frame, self.steps, self.wavelength_nm,
-            self.ambient_faces, on_view,
+            self.ambient_faces, on_view, kinds,
         )  # fmt: skip
-        grid = Grid.of_resolution(box, self.truth_voxels)
-        return measurement, Volume(field.sample(grid), grid, attributes={"n_ambient": n_ambient})
+        if self.counts:
+            measurement = add_photon_noise(measurement, self.counts, self.seed + frame)
+        grid, quantity = Grid.of_resolution(box, self.truth_voxels), measurement.quantity
+        return measurement, Volume(field.sample(grid), grid, quantity, describe(quantity)[0], {"n_ambient": n_ambient})
 
     def over_time(
         self,
@@ -184,23 +246,32 @@ class Simulation:
             measurement, volume = replace(self, time=time)(cameras, frame=i)
             if i == 0:
                 sequence = MeasurementSequence.create(out, times, measurement, force)
-                store = VolumeSequence.create(truth, times, volume.grid, ("index_excess",), measurement.n_ambient)
+                store = VolumeSequence.create(truth, times, volume.grid, (volume.quantity,), measurement.n_ambient)
             sequence.write_frame(i, measurement)
             store.write(i, [volume])
             on_frame(i + 1, len(times))
         return sequence, store
 
     def _field(self) -> tuple[Field, Box, float]:
-        """The field of index excess, its box, and the ambient it is counted from."""
-        path = Path(self.phantom)
+        """The field that is seen, its box, and the ambient that an index is counted from."""
+        path, quantity = Path(self.phantom), technique(self.technique[0]).quantity
         if path.suffix not in (".nc", ".vti"):
             box = Box.around_origin(self.box)
             n_ambient = AMBIENT_INDEX if self.n_ambient is None else self.n_ambient
-            return make_phantom(self.phantom, box, self.seed, self.time), box, n_ambient
-        volume = read_volume(path)
+            phantom = make_phantom(self.phantom, box, self.seed, self.time)
+            return phantom if quantity == INDEX else self._scaled(phantom, box), box, n_ambient
+        volume = read_volume(path, None if quantity == INDEX else quantity)
+        if quantity != INDEX:
+            return VoxelField.through(volume.values, volume.grid), volume.grid.box, AMBIENT_INDEX
         try:
             n_ambient = next(n for n in (self.n_ambient, volume.n_ambient, AMBIENT_INDEX) if n is not None)
             excess = volume.relative_to(n_ambient)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         return VoxelField.through(excess.values, excess.grid), excess.grid.box, n_ambient
+
+    def _scaled(self, phantom: Field, box: Box) -> Field:
+        """The phantom times what makes its largest value, ambient 0, the peak."""
+        values = phantom.sample(Grid.of_resolution(box, PEAK_VOXELS))
+        peak = self.peak or 2 / min(box.edges[:2])
+        return Scaled(phantom, peak / float(values.flatten()[values.abs().argmax()]))

@@ -10,15 +10,26 @@ from torch import Tensor
 from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Grid
 
-__all__ = ["QUANTITIES", "STATISTICS", "Volume", "describe"]
+__all__ = ["INDEX", "QUANTITIES", "STATISTICS", "Volume", "describe", "quantities_of"]
 
 QUANTITIES = {
     "index_excess": ("1", "refractive index minus that of the ambient"),
     "n": ("1", "refractive index"),
     "density": ("kg m-3", "density"),
     "temperature": ("K", "temperature"),
+    "extinction": ("mm-1", "extinction coefficient"),
+    "emission": ("mm-1", "radiance per length"),
 }
 """Unit and long name of what a volume may hold."""
+
+INDEX = "index_excess"
+OF_AN_INDEX = (INDEX, "n", "density", "temperature")
+
+
+def quantities_of(quantity: str) -> tuple[str, ...]:
+    """Return what can be given of a reconstructed field: of an index excess all that follows from it, else itself."""
+    return OF_AN_INDEX if quantity == INDEX else (quantity,)
+
 
 STATISTICS = {"mean": "mean", "std": "standard_deviation"}
 """Endings of what an ensemble adds to a quantity (density_std), and CF's names for them."""

@@ -88,7 +88,7 @@ def test_paper_s_network():
 def test_units_of_the_field():
     box = Box((-3.0, 1.0, -8.0), (5.0, 7.0, 4.0))
     net = network(BASE)
-    field = NeuralField(net, box, index_scale=2e-4, offset=0.3)
+    field = NeuralField(net, box, scale=2e-4, offset=0.3)
     points = torch.rand(4, 5, 3, dtype=torch.float64) * 3
     expected = 2e-4 * (net((points.reshape(-1, 3) - torch.tensor(box.centre)) / 6.0) - 0.3).reshape(4, 5)
     assert torch.allclose(field(points), expected, atol=1e-16)

@@ -9,7 +9,8 @@ from nerif.conventions import InputError
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import FLAME_INTERVAL, Flame, GaussianBalls, Octahedron, make_phantom
 from nerif.geometry import Box, Grid, Rays, paper_rig
-from nerif.physics.deflection import Deflection
+from nerif.physics.path_integral import PathIntegral
+from nerif.techniques.deflection import MODELS
 
 CUBE = Box.cube(50.0)
 SLAB = Box((-20.0, -25.0, -15.0), (24.0, 21.0, 33.0))
@@ -124,7 +125,7 @@ def test_flame_moves_the_pixels_by_about_a_fifth():
     flame = Flame(box)
     pixels = [c.pixel_grid()[::8, ::8].reshape(-1, 2) for c in cameras]
     rays = Rays.concatenate([c.rays(p) for c, p in zip(cameras, pixels, strict=True)]).clip(box)
-    d = Deflection("lever_arm", 100, 1.00027)(flame, rays[rays.crosses].to(dtype=torch.float32))
+    d = PathIntegral(MODELS["lever_arm"](1.00027), 100)(flame, rays[rays.crosses].to(dtype=torch.float32))
     assert 0.15 < float(d.square().mean().sqrt()) < 0.3
 
 

@@ -13,8 +13,9 @@ from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Plane, Rays, Ring
-from nerif.physics.deflection import Deflection, project
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.ray_tracing import CurvedRays, trace
+from nerif.techniques.deflection import MODELS
 
 N_AMBIENT = 1.0
 
@@ -60,14 +61,14 @@ def test_lever_arm_meets_the_closed_form_of_a_gaussian_ball(cameras, cube):
     clear = (chord > 20) & ((s_0 - rays.near).minimum(rays.far - s_0) > 9)  # tails inside the box
     assert int(clear.sum()) > 500
     # n in the denominator of the integrand is 1 to 2e-4
-    got = Deflection("lever_arm", 400, N_AMBIENT)(field, rays)
+    got = PathIntegral(MODELS["lever_arm"](N_AMBIENT), 400)(field, rays)
     assert float((got - expected)[clear].abs().max()) < 4e-4 * float(expected.abs().max())
 
 
 def test_zero_field_moves_nothing(cameras, box):
     rays = rays_of(cameras, box)
     field = one_ball(0.0)
-    for model in (Deflection("lever_arm", 20), Deflection("paraxial", 20), CurvedRays(20)):
+    for model in (PathIntegral(MODELS["lever_arm"](), 20), PathIntegral(MODELS["paraxial"](), 20), CurvedRays(20)):
         assert float(model(field, rays).abs().max()) < 1e-9  # px; the rounding of a position
 
 
@@ -76,7 +77,8 @@ def test_curved_rays_converge_to_lever_arm_at_second_order(cameras, cube):
     differences = []
     for amplitude in (-4e-3, -2e-3, -1e-3):
         field = one_ball(amplitude, width=2.5)
-        straight, curved = Deflection("lever_arm", 200, N_AMBIENT)(field, rays), CurvedRays(200, N_AMBIENT)(field, rays)
+        straight = PathIntegral(MODELS["lever_arm"](N_AMBIENT), 200)(field, rays)
+        curved = CurvedRays(200, N_AMBIENT)(field, rays)
         differences.append(float((straight - curved).square().mean().sqrt()))
     orders = [math.log2(a / b) for a, b in pairwise(differences)]
     assert all(1.9 < order < 2.1 for order in orders), (differences, orders)
@@ -88,8 +90,9 @@ def test_curved_deflection_is_right_to_second_order(cameras, cube):
     differences = []
     for amplitude in (-1.6e-2, -8e-3, -4e-3):
         field = one_ball(amplitude, width=2.5)
-        bent, curved = Deflection("curved", 400, N_AMBIENT)(field, rays), CurvedRays(400, N_AMBIENT)(field, rays)
-        straight = Deflection("lever_arm", 400, N_AMBIENT)(field, rays)
+        bent = PathIntegral(MODELS["curved"](N_AMBIENT), 400)(field, rays)
+        curved = CurvedRays(400, N_AMBIENT)(field, rays)
+        straight = PathIntegral(MODELS["lever_arm"](N_AMBIENT), 400)(field, rays)
         differences.append(float((bent - curved).square().mean().sqrt()))
         assert differences[-1] < 0.1 * float((straight - curved).square().mean().sqrt())
     orders = [math.log2(a / b) for a, b in pairwise(differences)]
@@ -100,9 +103,9 @@ def test_paraxial_differs_by_the_lever_arm_alone(cameras, cube):
     """On a field thin along the rays and at their middle, one lever arm for the whole ray is exact."""
     rays = rays_of(cameras, cube)
     middle = one_ball(-2e-4, (0.0, 0.0, 0.0), 0.7)
-    lever, paraxial = (Deflection(m, 300)(middle, rays) for m in ("lever_arm", "paraxial"))
+    lever, paraxial = (PathIntegral(MODELS[m](), 300)(middle, rays) for m in ("lever_arm", "paraxial"))
     away = one_ball(-2e-4, (9.0, 0.0, 0.0), 0.7)
-    lever_away, paraxial_away = (Deflection(m, 300)(away, rays) for m in ("lever_arm", "paraxial"))
+    lever_away, paraxial_away = (PathIntegral(MODELS[m](), 300)(away, rays) for m in ("lever_arm", "paraxial"))
     near, far = (float((a - b).norm() / a.norm()) for a, b in ((lever, paraxial), (lever_away, paraxial_away)))
     assert near < 2e-3
     assert 5e-3 < far < 5e-2  # 9 mm of a lever arm of 450 mm
@@ -119,7 +122,7 @@ def test_turning_rig_and_phantom_together_changes_nothing(cameras, ball, rotatio
     moved = GaussianBalls(ball.centres @ turn.T, ball.widths, ball.amplitudes)
     # the box does not turn: take one so wide that the balls are deep inside it both ways
     wide = Box((-20.0, -20.0, -20.0), (20.0, 20.0, 20.0))
-    for model in (Deflection("lever_arm", 300), CurvedRays(200)):
+    for model in (PathIntegral(MODELS["lever_arm"](), 300), CurvedRays(200)):
         before = model(ball, all_rays(cameras, wide)[::4])
         after = model(moved, all_rays(tuple(turned(c, turn) for c in cameras), wide)[::4])
         assert float((before - after).abs().max()) < 1e-5 * float(before.abs().max())
@@ -133,9 +136,9 @@ def test_oblique_background_sees_the_same_to_first_order(ball, cube, rotation_ab
     centre = camera.background.normal * camera.background.offset
     oblique = replace(camera, background=Plane(normal, float(normal @ centre)))
     rays = rays_of((oblique,), cube)
-    straight, curved = Deflection("lever_arm", 300)(ball, rays), CurvedRays(200)(ball, rays)
+    straight, curved = PathIntegral(MODELS["lever_arm"](), 300)(ball, rays), CurvedRays(200)(ball, rays)
     assert float((straight - curved).norm() / curved.norm()) < 4e-4
-    upright = Deflection("lever_arm", 300)(ball, rays_of((camera,), cube))
+    upright = PathIntegral(MODELS["lever_arm"](), 300)(ball, rays_of((camera,), cube))
     assert float((straight - upright).norm() / upright.norm()) > 2e-3  # the tilt does matter
 
 
@@ -158,7 +161,7 @@ def test_rays_bend_towards_the_denser_gas():
 
 def test_project_in_chunks_equals_at_once_and_misses_are_zero(cameras, ball, box):
     rays = Rays.concatenate([c.rays(c.pixel_grid().reshape(-1, 2)) for c in cameras]).clip(box)
-    model = Deflection(samples=50)
+    model = PathIntegral(MODELS["lever_arm"](), 50)
     got = project(model, ball, rays, chunk=37)
     hit = rays.crosses
     assert 0 < int(hit.sum()) < len(rays)
@@ -166,7 +169,7 @@ def test_project_in_chunks_equals_at_once_and_misses_are_zero(cameras, ball, box
     assert torch.equal(got[~hit], torch.zeros_like(got[~hit]))
 
 
-@pytest.mark.parametrize("make", [lambda: Deflection("straight"), lambda: Deflection(samples=0), lambda: CurvedRays(0)])
+@pytest.mark.parametrize("make", [lambda: PathIntegral(MODELS["lever_arm"](), 0), lambda: CurvedRays(0)])
 def test_refusals(make):
     with pytest.raises(InputError, match="expected"):
         make()

@@ -8,12 +8,17 @@ import pytest
 import torch
 
 from nerif.geometry import Ring
-from nerif.physics.deflection import Deflection, project
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.bins import binned_rays, coarsest_edge
 from nerif.reconstruction.target import Target
 from nerif.simulation import simulate
+from nerif.techniques.deflection import MODELS
 
 EDGE = 3
+
+
+def binned(m, open_faces=()):
+    return binned_rays(m, m.observations[0], EDGE, open_faces)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +34,7 @@ def noisy(measurement):
 
 def test_a_bin_is_the_weighted_mean_of_its_usable_pixels(noisy):
     """One bin by hand, of the first view, in the middle of the picture."""
-    rays, displacement, sigma = binned_rays(noisy.select([noisy.names[0]]), EDGE)
+    rays, displacement, sigma = binned(noisy.select([noisy.names[0]]))
     camera, row, column = noisy.cameras[0], 9, 12
     block = (0, slice(row, row + EDGE), slice(column, column + EDGE))
     good = noisy.valid[block]
@@ -48,15 +53,15 @@ def test_invalid_pixels_do_not_count(noisy):
     """Whatever stands in them."""
     absurd = noisy.displacement.clone()
     absurd[~noisy.valid] = 99.0
-    assert torch.equal(binned_rays(replace(noisy, displacement=absurd), EDGE)[1], binned_rays(noisy, EDGE)[1])
+    assert torch.equal(binned(replace(noisy, displacement=absurd))[1], binned(noisy)[1])
 
 
 def test_bins_stay_inside_the_box_and_off_open_faces(measurement):
     """Their pixels are all among those that cross it."""
-    rays, _, _ = binned_rays(measurement, EDGE)
+    rays, _, _ = binned(measurement)
     assert bool(rays.crosses.all())
     assert 0.4 < len(rays) * EDGE**2 / len(Target.of(measurement)) <= 1
-    fewer, _, _ = binned_rays(measurement, EDGE, ("z+",))
+    fewer, _, _ = binned(measurement, ("z+",))
     assert 0 < len(fewer) < len(rays)
 
 
@@ -66,18 +71,19 @@ def test_bins_predict_what_they_measured(ball, box):
     fine = simulate(ball, ring.cameras(), box, n_ambient=1.00027, steps=60)
     errors = []
     for edge in (2, 4):
-        target = Target.of(fine, edge=edge)
-        predicted = project(Deflection(n_ambient=1.00027), ball, target.rays)
-        errors.append(float((predicted - target.displacement).norm() / target.displacement.norm()))
+        (part,) = Target.of(fine, edge=edge).parts
+        predicted = project(PathIntegral(MODELS["lever_arm"](1.00027)), ball, part.rays)
+        errors.append(float((predicted - part.measured).norm() / part.measured.norm()))
     assert errors[0] < 0.03
     assert 4 < errors[1] / errors[0] < 6  # (edge^2 - 1) / 12, the variance of the pixels of a bin: 5 times
 
 
 def test_without_sigma_a_bin_of_more_pixels_weighs_more(noisy):
     target = Target.of(replace(noisy, sigma=None), edge=EDGE)
-    assert target.chi_square_scale is None
-    assert float((target.displacement * target.inverse_scale).square().mean()) == pytest.approx(1, rel=1e-5)
-    ratio = target.inverse_scale.max() / target.inverse_scale.min()
+    assert target.noise is None
+    (part,) = target.parts
+    assert float(part.of_nothing.square().mean()) == pytest.approx(1, rel=1e-5)
+    ratio = part.inverse_scale.max() / part.inverse_scale.min()
     assert 1.1 < float(ratio) <= EDGE
 
 

@@ -21,8 +21,9 @@ GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
 
 def test_members_have_other_noise_and_other_seeds(measurement):
     sigma = measurement.sigma
+    noise = {"deflection": sigma}
     method = NeRIF(seed=7)
-    (first, a), (second, b) = (Ensemble(2).member(k, method, measurement, sigma) for k in (1, 2))
+    (first, a), (second, b) = (Ensemble(2).member(k, method, measurement, noise) for k in (1, 2))
     assert (first.seed, second.seed) == (8, 9)
     assert replace(first, seed=7) == method
     added = (a.displacement - measurement.displacement) / sigma
@@ -31,12 +32,12 @@ def test_members_have_other_noise_and_other_seeds(measurement):
     other = (b.displacement - measurement.displacement) / sigma
     assert abs(float((added * other).mean())) < 0.05
     torch.testing.assert_close(a.sigma, sigma * math.sqrt(2))
-    again = Ensemble(5).member(1, method, measurement, sigma)[1]
+    again = Ensemble(5).member(1, method, measurement, noise)[1]
     assert torch.equal(again.displacement, a.displacement)
 
 
 def test_methods_without_a_seed_and_measurements_without_sigma(measurement):
-    noise = torch.full(measurement.displacement.shape, 0.1)
+    noise = {"deflection": torch.full(measurement.displacement.shape, 0.1)}
     method, member = Ensemble(2).member(1, Tikhonov(), replace(measurement, sigma=None), noise)
     assert method == Tikhonov()
     assert member.sigma is None
@@ -47,7 +48,7 @@ def test_one_view_is_left_out_in_turn(measurement):
     ensemble = Ensemble(7, leave_one_out=True)
     out = [ensemble.left_out(k, measurement) for k in range(1, 8)]
     assert out == [(n,) for n in (*measurement.names, *measurement.names[:2])]
-    member = ensemble.member(2, NeRIF(), measurement, measurement.sigma)[1]
+    member = ensemble.member(2, NeRIF(), measurement, {"deflection": measurement.sigma})[1]
     assert member.names == tuple(n for n in measurement.names if n != measurement.names[1])
     assert Ensemble(3).left_out(1, measurement) == ()
 

@@ -18,11 +18,12 @@ from nerif.reconstruction import bins, training
 from nerif.reconstruction.base import Reconstruction, Step
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.gauge import AmbientRegion
-from nerif.reconstruction.losses import LossWeights, numerical_displacement
+from nerif.reconstruction.losses import LossWeights, by_differences
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
+from nerif.techniques.base import Weights
 from nerif.volume import Volume
 
 SMALL = NeRIF(
@@ -93,13 +94,13 @@ def test_numerical_differentiation_meets_the_exact_gradient_as_the_step_shrinks(
     rays = rays[:50]
     s = rays.near[:, None] + torch.linspace(0.05, 0.95, 9) * (rays.far - rays.near)[:, None]
     p = field.normalise(rays.at(s))
-    weight = torch.ones_like(s)
+    integral = Weights(torch.ones_like(s), slope=rays.ends.sensitivity)
     exact = torch.einsum(
         "nij,nmj->ni", rays.ends.sensitivity, field.network.value_and_gradient(p.reshape(-1, 3))[1].reshape(p.shape)
     )
     errors = []
     for reach in (1.6, 0.8, 0.4):
-        d = numerical_displacement(field.network, rays, p, torch.full(s.shape, reach / field.half_edge), weight)
+        d = by_differences(field.network, integral, p, torch.full(s.shape, reach / field.half_edge))
         errors.append(float((d - exact).norm()))
     assert 3.5 < errors[0] / errors[1] < 4.5
     assert 3.5 < errors[1] / errors[2] < 4.5
@@ -287,8 +288,7 @@ def test_masks_widen_the_ambient_region(measurement, ball):
 
 
 def test_open_faces_drop_their_rays(measurement):
-    everything = Target.of(measurement)
-    fewer = Target.of(measurement, ("z+",))
+    (everything,), (fewer,) = Target.of(measurement).parts, Target.of(measurement, ("z+",)).parts
     through = everything.rays.exit_faces(measurement.box, ("z+",))
     assert 0 < int(through.sum()) < len(everything.rays)
     assert len(fewer.rays) == int((~through).sum())

@@ -12,9 +12,10 @@ import torch
 from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays
-from nerif.physics.deflection import Deflection
+from nerif.physics.path_integral import PathIntegral
 from nerif.reconstruction import kernels_torch
-from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reconstruction.operator import VoxelOperator
+from nerif.techniques.deflection import MODELS
 
 GRID = (9, 11, 13)
 FACES = Boundary(("x-", "y+", "z-"))
@@ -42,11 +43,15 @@ def rays(rotation_about, box) -> Rays:
     return every[every.crosses]
 
 
-def operator(rays: Rays, box: Box, **settings) -> DeflectionOperator:
+LEVER = MODELS["lever_arm"]()
+
+
+def operator(rays: Rays, box: Box, **settings) -> VoxelOperator:
     # a little larger than the box, lest rays from face to face have samples just where a linear gradient jumps
     x, y, z = box.upper
     larger = Box((-x - 0.31, -y - 0.73, -z - 0.22), (x + 0.47, y + 0.11, z + 0.93))
-    return DeflectionOperator(rays, Grid(larger, GRID), **{"boundary": FACES, **settings})
+    model = MODELS[settings.pop("model", "lever_arm")]()
+    return VoxelOperator(rays, Grid(larger, GRID), model, **{"boundary": FACES, **settings})
 
 
 def random(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> torch.Tensor:
@@ -78,7 +83,8 @@ def test_agrees_with_the_readable_twin(rays, box, basis, model):
     field, length = a.field(c), some.far - some.near
     counts = (length.double() / (0.7 * min(a.grid.spacing))).ceil().int().tolist()
     d = torch.cat([
-        Deflection(model, count)(field, some[i : i + 1].to(dtype=torch.float64)) for i, count in enumerate(counts)
+        PathIntegral(MODELS[model](), count)(field, some[i : i + 1].to(dtype=torch.float64))
+        for i, count in enumerate(counts)
     ])  # fmt: skip
     d_fast, d_twin = a(c.detach()), d.detach()
     assert torch.allclose(d_fast, d_twin, rtol=1e-6, atol=1e-8 * float(d_twin.abs().max()))
@@ -92,11 +98,11 @@ def test_compiled_and_plain_kernels_agree(rays, box, basis):
     a = operator(rays, box, dtype=torch.float64, basis=basis)
     c, d = random(*a.domain_shape), random(*a.range_shape, seed=1)
     padded = a.boundary.extend(c, a.layers)
-    plain = torch.empty_like(d)
-    kernels_torch.forward(a.degree, padded, a._rays, plain)
+    plain = torch.zeros_like(d)
+    kernels_torch.forward(a.degree, padded, a.path, a.matrices[0], plain)
     assert torch.allclose(plain, a(c), rtol=1e-12, atol=1e-12 * float(plain.abs().max()))
     spread = torch.zeros_like(padded)
-    kernels_torch.adjoint(a.degree, d, a._rays, spread)
+    kernels_torch.adjoint(a.degree, d, a.path, a.matrices[0], spread)
     adjoint = a.T(d)
     assert torch.allclose(
         a.boundary.fold(spread, a.layers), adjoint, rtol=1e-12, atol=1e-12 * float(adjoint.abs().max())
@@ -115,7 +121,7 @@ def test_sum_does_not_depend_on_the_number_of_threads(rays, box):
 
 
 def test_norm_is_the_largest_singular_value(rays, box):
-    a = DeflectionOperator(rays[::7], Grid(box, (3, 4, 5)), dtype=torch.float64, boundary=FACES)
+    a = VoxelOperator(rays[::7], Grid(box, (3, 4, 5)), LEVER, dtype=torch.float64, boundary=FACES)
     columns = []
     for i in range(60):
         unit = torch.zeros(60, dtype=torch.float64)
@@ -132,7 +138,7 @@ def test_quadrature_converges(measurement, ball, basis):
     errors = []
     for n in (12, 24, 48):
         grid = Grid.of_resolution(measurement.box, n)
-        a = DeflectionOperator(rays, grid, measurement.n_ambient, basis=basis)
+        a = VoxelOperator(rays, grid, MODELS["lever_arm"](measurement.n_ambient), basis)
         errors.append(float((a(ball.sample(grid)) - d).norm() / d.norm()))
     assert all(fine < coarse for coarse, fine in pairwise(errors))
     assert errors[-1] < 0.08
@@ -145,8 +151,8 @@ def test_turning_rig_and_flow_by_a_right_angle_changes_nothing(measurement, ball
     turned_box = Box((-by, ax, az), (-ay, bx, bz))
     ends = BackgroundPoints(rays.ends.sensitivity @ turn.T, rays.ends.distance)
     turned = replace(rays, origin=rays.origin @ turn.T, direction=rays.direction @ turn.T, background=ends)
-    a = DeflectionOperator(rays, Grid(measurement.box, (6, 8, 10)), dtype=torch.float64)
-    b = DeflectionOperator(turned, Grid(turned_box, (6, 10, 8)), dtype=torch.float64)
+    a = VoxelOperator(rays, Grid(measurement.box, (6, 8, 10)), LEVER, dtype=torch.float64)
+    b = VoxelOperator(turned, Grid(turned_box, (6, 10, 8)), LEVER, dtype=torch.float64)
     c = random(6, 8, 10)
     assert torch.allclose(b(c.permute(0, 2, 1).flip(2)), a(c), rtol=1e-5, atol=1e-6 * float(a(c).abs().max()))
 
@@ -158,7 +164,7 @@ def test_a_constant_moves_nothing_and_a_slope_all_alike(rays, box):
     grid = Grid(box, (4, 4, 4))
     inner = Box((-8.9, -7.4, -5.9), (8.9, 7.4, 5.9))  # within the outermost centres, where mirroring begins
     through = rays.clip(inner)
-    a = DeflectionOperator(through, grid, boundary=Boundary(), dtype=torch.float64, step=0.05)
+    a = VoxelOperator(through, grid, LEVER, boundary=Boundary(), dtype=torch.float64, step=0.05)
     x = grid.points(torch.float64)[..., 0]
     lever = through.ends.distance - 0.5 * (through.near + through.far)
     exact = through.ends.sensitivity[:, :, 0] * (lever * (through.far - through.near))[:, None]
@@ -167,9 +173,9 @@ def test_a_constant_moves_nothing_and_a_slope_all_alike(rays, box):
 
 def test_memory_is_estimated_from_below_by_what_is_held(rays, box):
     a = operator(rays, box, basis="cubic")
-    held = sum(t.numel() * t.element_size() for t in a._rays)
+    held = sum(t.numel() * t.element_size() for t in (*a.path, *a.matrices))
     padded = math.prod(n + 4 for n in GRID) * 4
-    assert DeflectionOperator.memory_bytes(len(rays), a.grid, "cubic") == held + 2 * padded
+    assert VoxelOperator.memory_bytes(len(rays), a.grid, "cubic") == held + 2 * padded
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -177,20 +183,20 @@ def test_what_cannot_be_right(rays, box):
     missing = rays.clip(Box((900.0, 900.0, 900.0), (901.0, 901.0, 901.0)))
     with pytest.raises(InputError, match="rays: expected rays that cross the box, got none"):
         operator(missing, box)
-    with pytest.raises(InputError, match="model: expected lever_arm or paraxial, got 'curved'"):
+    with pytest.raises(InputError, match="model: expected a linear one, got Curved"):
         operator(rays, box, model="curved")
     with pytest.raises(InputError, match="basis: expected linear or cubic, got 'quintic'"):
         operator(rays, box, basis="quintic")
     with pytest.raises(InputError, match="step: expected a length above 0"):
         operator(rays, box, step=0.0)
     with pytest.raises(InputError, match="at least 2 along each edge"):
-        DeflectionOperator(rays, Grid(box, (1, 4, 5)), basis="cubic")
+        VoxelOperator(rays, Grid(box, (1, 4, 5)), LEVER, "cubic")
     with pytest.raises(InputError, match="rays: expected rays clipped to the box of the grid"):
-        DeflectionOperator(rays, Grid(Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), GRID))
+        VoxelOperator(rays, Grid(Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), GRID), LEVER)
     a = operator(rays, box)
     with pytest.raises(InputError, match=r"coefficients: expected \(9, 11, 13\)"):
         a(torch.zeros(9, 11, 12))
-    with pytest.raises(InputError, match="displacement: expected"):
+    with pytest.raises(InputError, match="seen: expected"):
         a.T(torch.zeros(3, 2))
 
 
@@ -201,8 +207,8 @@ def test_rays_that_miss_the_box_see_nothing(rays, box, basis):
     a = operator(both, box, basis=basis, dtype=torch.float64)
     c = random(*a.domain_shape)
     assert torch.equal(a(c)[30:], torch.zeros(10, 2, dtype=torch.float64))
-    plain = torch.ones(40, 2, dtype=torch.float64)
-    kernels_torch.forward(a.degree, a.boundary.extend(c, a.layers), a._rays, plain)
+    plain = torch.zeros(40, 2, dtype=torch.float64)
+    kernels_torch.forward(a.degree, a.boundary.extend(c, a.layers), a.path, a.matrices[0], plain)
     assert torch.allclose(plain, a(c), atol=1e-12 * float(plain.abs().max()))
 
 

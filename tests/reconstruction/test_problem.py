@@ -13,7 +13,7 @@ import torch
 from nerif.fields.grid import Boundary
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Differences, Penalty, Problem, conjugate_gradients
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.tikhonov import Tikhonov
@@ -42,11 +42,9 @@ def columns(linear, shape) -> np.ndarray:
 
 def make(measurement, free=None, bounds=None) -> Problem:
     target = Target.of(measurement)
-    operator = DeflectionOperator(
-        target.rays, Grid(measurement.box, SHAPE), measurement.n_ambient, boundary=Boundary(measurement.ambient_faces),
-        dtype=torch.float64,
-    )  # fmt: skip
-    return Problem(operator, target, free, bounds)
+    (part,), faces = target.parts, Boundary(measurement.ambient_faces)
+    operator = VoxelOperator(part.rays, Grid(measurement.box, SHAPE), part.model, boundary=faces, dtype=torch.float64)
+    return Problem([operator], target, free, bounds)
 
 
 @pytest.fixture(scope="module")

@@ -229,10 +229,10 @@ def test_settings_are_recorded(fixed):
         (Tikhonov, {"voxels": 0}, "voxels: expected at least 1, got 0"),
         (Tikhonov, {"iterations": 0}, "iterations: expected at least 1, got 0"),
         (Tikhonov, {"basis": "quadratic"}, "basis: expected one of linear, cubic, got 'quadratic'"),
-        (Tikhonov, {"model": "curved"}, "model: expected one of lever_arm, paraxial"),
+        (Tikhonov, {"model": "bent"}, "model: expected one of auto, lever_arm, paraxial, curved"),
         (Tikhonov, {"step": 0.0}, "step: expected above 0 voxels, got 0.0"),
         (Tikhonov, {"tolerance": -1.0}, "tolerance: expected 0 or more, got -1.0"),
-        (Tikhonov, {"lower": 1e-5}, "lower, upper: expected bounds of the index excess around 0"),
+        (Tikhonov, {"lower": 1e-5}, "lower, upper: expected bounds of the field around 0"),
         (Landweber, {"relaxation": 2.0}, "relaxation: expected above 0 and below 2"),
         (Landweber, {"relaxation": 1.5}, "with momentum at most 1"),
         (TotalVariation, {"softness": 0.0}, "softness: expected above 0, got 0.0"),
@@ -278,16 +278,14 @@ class PlainKernels:
     """What CUDA runs, in the place of what the CPU runs."""
 
     @staticmethod
-    def forward(degree, padded, rays, displacement):
-        kernels_torch.forward(
-            degree, torch.from_numpy(padded), tuple(map(torch.from_numpy, rays)), torch.from_numpy(displacement)
-        )
+    def forward(degree, padded, path, matrix, seen):
+        arrays = [torch.from_numpy(a) for a in (matrix, seen)]
+        kernels_torch.forward(degree, torch.from_numpy(padded), [torch.from_numpy(a) for a in path], *arrays)
 
     @staticmethod
-    def adjoint(degree, displacement, rays, padded):
-        kernels_torch.adjoint(
-            degree, torch.from_numpy(displacement), tuple(map(torch.from_numpy, rays)), torch.from_numpy(padded)
-        )
+    def adjoint(degree, seen, path, matrix, padded):
+        arrays = [torch.from_numpy(a) for a in (matrix, padded)]
+        kernels_torch.adjoint(degree, torch.from_numpy(seen), [torch.from_numpy(a) for a in path], *arrays)
 
 
 @pytest.mark.parametrize("basis", ["linear", "cubic"])

@@ -15,11 +15,12 @@ from nerif.fields.base import Field
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Box, Grid
-from nerif.physics.deflection import Deflection, project
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.warm_start import fit_network
+from nerif.techniques.deflection import MODELS
 
 BOX = Box((-3.0, -2.0, -1.0), (3.0, 2.0, 1.0))
 SHAPE = NetworkShape(depth=2, width=8, octaves=1)
@@ -73,7 +74,7 @@ def test_sampling_and_projecting_ask_the_field_to_the_device(measurement):
     field = Elsewhere()
     field.sample(Grid(BOX, (3, 4, 5)))
     rays, _, _ = measurement.rays()
-    project(Deflection("lever_arm", 8, 1.0003), field, rays[:3])
+    project(PathIntegral(MODELS["lever_arm"](1.0003), 8), field, rays[:3])
     assert [m.device for m in field.moved] == ["cpu", "cpu"]
 
 

@@ -298,7 +298,7 @@ def test_the_gas_is_doubted_in_a_liquid(tmp_path):
 
 def test_residuals_are_those_of_every_ray_through_the_box(measurement):
     """Also where the field is exactly 0, as outside a visual hull."""
-    nothing = Reprojection(measurement, torch.zeros_like(measurement.displacement))
+    nothing = Reprojection(measurement, {"deflection": torch.zeros_like(measurement.displacement)})
     found = residuals_over_sigma(nothing)
     seen = measurement.usable & measurement.sees_box
     assert found.size == 2 * int(seen.sum())
@@ -309,7 +309,7 @@ def test_residuals_are_those_of_every_ray_through_the_box(measurement):
 
 
 def test_of_many_pixels_a_regular_lattice_is_taken(measurement):
-    nothing = Reprojection(measurement, torch.zeros_like(measurement.displacement))
+    nothing = Reprojection(measurement, {"deflection": torch.zeros_like(measurement.displacement)})
     assert lattice_step(measurement, 10**6) == 1
     assert lattice_step(measurement, measurement.displacement[..., 0].numel() // 9 + 1) == 3
     seen = (measurement.usable & measurement.sees_box)[:, ::3, ::3]
@@ -320,7 +320,7 @@ def test_of_many_pixels_a_regular_lattice_is_taken(measurement):
 
 
 def test_the_pictures_of_many_views_stay_small(measurement, monkeypatch):
-    nothing = Reprojection(measurement, torch.zeros_like(measurement.displacement))
+    nothing = Reprojection(measurement, {"deflection": torch.zeros_like(measurement.displacement)})
     assert {v.shrunk for v in view_images(nothing, [])[0]} == {(1, 1)}
     monkeypatch.setattr("nerif.report.view_images.ALL_PICTURES", 6 * 5 * 13**2)
     assert {v.shrunk for v in view_images(nothing, [])[0]} == {(2, 2)}

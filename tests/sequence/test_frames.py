@@ -75,7 +75,7 @@ def test_a_warm_frame_begins_where_the_one_before_ended(undisturbed, five):
     after = one(MeasurementSequence.read(five).frame(1), start=before).field
     grid = SequenceStore(plan.out).grid
     x, y = before.sample(grid), after.sample(grid)
-    assert after.index_scale != before.index_scale
+    assert after.scale != before.scale
     # the same field but for the constant that the ambient pins
     assert float((x - y - (x - y).mean()).abs().max()) < 1e-4 * float(x.abs().max())
 

@@ -93,20 +93,21 @@ def test_a_chunk_holds_every_ray_of_every_frame(short):
     chunk = ChunkData(SETTINGS, [FrameData(SETTINGS, frame) for frame in frames], tau, 2)
     targets = [Target.of(frame) for frame in frames]
     assert len(chunk) == sum(len(t) for t in targets)
-    assert len(chunk.rays) == len(targets[0])
-    of_second = (chunk.measured // len(chunk.rays) == 1).nonzero()[:, 0]
-    target, at = chunk.batch(of_second)
-    assert torch.equal(at, torch.zeros(len(targets[1])))
-    assert torch.equal(target.displacement, targets[1].displacement)
-    assert torch.equal(target.rays.origin, targets[1].rays.origin)
-    assert torch.equal(target.rays.direction, targets[1].rays.direction)
+    (film,) = chunk.films
+    assert len(film.rays) == len(targets[0])
+    of_second = (film.known // len(film.rays) == 1).nonzero()[:, 0]
+    ((target, at),) = chunk.batch(of_second)
+    (wanted,) = targets[1].parts
+    assert torch.equal(at, torch.zeros(len(wanted)))
+    assert torch.equal(target.measured, wanted.measured)
+    assert torch.equal(target.rays.origin, wanted.rays.origin)
+    assert torch.equal(target.rays.direction, wanted.rays.direction)
     # weighed by sigma alone, the same for all, with a mean square of 1
-    everything, _ = chunk.batch(torch.arange(len(chunk)))
-    scaled = everything.displacement * everything.inverse_scale
-    assert float(scaled.square().mean()) == pytest.approx(1, rel=1e-4)
+    ((everything, _),) = chunk.batch(torch.arange(len(chunk)))
+    assert float(everything.of_nothing.square().mean()) == pytest.approx(1, rel=1e-4)
     sigma = frames[1].sigma[frames[1].usable][0, 0]
     other = frames[2].sigma[frames[2].usable][0, 0]
-    third, _ = chunk.batch(torch.arange(len(chunk))[-5:])
+    ((third, _),) = chunk.batch(torch.arange(len(chunk))[-5:])
     assert float(target.inverse_scale[0, 0] / third.inverse_scale[0, 0]) == pytest.approx(
         float(other / sigma), rel=1e-4
     )

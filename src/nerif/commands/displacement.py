@@ -115,7 +115,7 @@ def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
     assert measurement.sigma is not None
     usable = measurement.usable
     for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
-        d, sigma = measurement.displacement[i][usable[i]], measurement.sigma[i][usable[i]]
+        d, sigma = measurement.displacements[i][usable[i]], measurement.sigma[i][usable[i]]
         share = len(d) / (camera.image_size[0] * camera.image_size[1])
         say(
             f"{name:<12}{share:>8.1%}{float(d.square().mean().sqrt()):>12.3f}"

@@ -11,7 +11,7 @@ import tyro
 from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
-from nerif.evaluation import FLOW, evaluate
+from nerif.evaluation import FLOW, evaluate, rms_text
 
 __all__ = ["Evaluate", "main", "run"]
 
@@ -50,10 +50,10 @@ def run(settings: Evaluate) -> dict[str, Any]:
         for s in metrics["slices"]:
             say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
     if settings.measurement is not None:
-        say("view                CC    SSIM  PSNR [dB]  rms [px]")
+        say("view                CC    SSIM  PSNR [dB]  rms")
         for v in metrics["views"]:
             held = "  held out" if v["held_out"] else ""
-            say(f"{v['name']:<14} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {v['rms_px']:9.4f}{held}")
+            say(f"{v['name']:<14} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {rms_text(v)}{held}")
     return metrics
 
 

@@ -11,8 +11,9 @@ import tyro
 from nerif.commands.output import say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
+from nerif.evaluation import rms_text
 from nerif.measurement import Measurement
-from nerif.measurement_file import CONVENTIONS
+from nerif.measurement_file import known_conventions
 from nerif.netcdf import opened
 from nerif.result import METRICS, ResultDirectory
 from nerif.volume import Volume
@@ -44,7 +45,7 @@ def _is_measurement(path: Path) -> bool:
     """A volume says CF, a measurement BOST; what says nothing is left to the stricter reader."""
     try:
         with opened(path, "a measurement or a volume") as dataset:
-            said = dataset.attrs.get("Conventions") == CONVENTIONS or "displacement" in dataset
+            said = known_conventions(dataset.attrs.get("Conventions")) or "displacement" in dataset
             return said or not {"x", "y", "z"} <= set(dataset.coords)
     except InputError:
         return True
@@ -55,25 +56,29 @@ def _corners(lower: tuple[float, ...], upper: tuple[float, ...]) -> str:
 
 
 def _measurement(path: Path, m: Measurement) -> None:
-    rays, d, sigma = m.rays()
-    say(f"{path}: measurement, {len(m.cameras)} views of {m.displacement.shape[1]} x {m.displacement.shape[2]} px")
+    say(f"{path}: measurement, {len(m.cameras)} views of {m.shape[1]} x {m.shape[2]} px")
     say(f"  box            {_corners(m.box.lower, m.box.upper)}")
     light = f", wavelength {m.wavelength_nm:g} nm" if m.wavelength_nm else ""
     say(f"  n_ambient      {m.n_ambient:.8g}{light}")
     say(f"  ambient faces  {' '.join(m.ambient_faces) or 'none'}")
-    noise = "unknown" if sigma is None else f"rms {float(sigma.square().mean().sqrt()):.4g} px"
-    rms = float(d.square().mean().sqrt())
-    say(f"  rays           {len(rays)} cross the box; rms displacement {rms:.4g} px; sigma {noise}")
-    say(f"  masked         {m.bad_pixels} pixels whose displacement or sigma is NaN, infinite or impossible")
+    for o in m.observations:
+        (rays, values, sigma), kind = m.rays(o), o.technique
+        unit = "" if kind.unit == "1" else f" {kind.unit}"
+        noise = "unknown" if sigma is None else f"rms {float(sigma.square().mean().sqrt()):.4g}{unit}"
+        rms = float(values.square().mean().sqrt())
+        say(f"  {kind.name:<14} {len(rays)} rays cross the box; rms {kind.measured} {rms:.4g}{unit}; sigma {noise}")
+    say(f"  masked         {m.bad_pixels} pixels whose value or sigma is NaN, infinite or impossible")
+    for name in m.about_views:
+        say(f"  {name:<14} known of the views")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
-    say("  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable   rms [px]")
+    say("  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable        rms")
     usable = m.usable
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
         away, pixel = float(c.distance(centre)), float(c.pixel_size(centre))
         plane = c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
-        good = m.displacement[i][usable[i]]
+        good = m.observations[0].values[i][m.usable_for(m.observations[0])[i]]
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
         say(
@@ -109,7 +114,7 @@ def _result(path: Path) -> None:
             say(f"  {name:<18} {value}")
     for v in metrics.get("views", []):
         held = "held out" if v["held_out"] else "training"
-        say(f"  view {v['name']:<14} {held}  CC {v['cc']}  rms {v['rms_px']} px")
+        say(f"  view {v['name']:<14} {held}  CC {v['cc']}  rms {rms_text(v)}")
 
 
 def main(arguments: list[str]) -> None:

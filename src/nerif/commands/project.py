@@ -15,13 +15,14 @@ from nerif.geometry import Ring
 from nerif.measurement import Measurement
 from nerif.prediction import predict
 from nerif.result import ResultDirectory
+from nerif.techniques.registry import AUTO, technique, technique_of
 
 __all__ = ["Project", "main", "run"]
 
 
 @dataclass(frozen=True)
 class Project(Settings):
-    """Predict the displacement that cameras would see of a reconstruction, and write it as a measurement."""
+    """Predict what cameras would see of a reconstruction, and write it as a measurement."""
 
     result: Annotated[Path, tyro.conf.Positional]
     """Result directory of nerif reconstruct."""
@@ -33,6 +34,10 @@ class Project(Settings):
     """Names of the cameras of that file to use; none for all."""
     model: str | None = None
     """Forward model: lever_arm, paraxial, curved, or traced (Runge-Kutta); default: that of the reconstruction."""
+    technique: str | None = None
+    """What a pixel measures: deflection, absorption, emission, interferometry; default: the first of such a field."""
+    wavelength_nm: float | None = None
+    """Wavelength of the light, nm, for interferometry."""
     samples: int = 200
     """Samples (or Runge-Kutta steps) along a ray."""
     force: bool = False
@@ -54,13 +59,16 @@ def run(settings: Project) -> Measurement:
         raise InputError("names: expected together with --cameras FILE, got no file")
     else:
         cameras = settings.ring.cameras()
-    model = settings.model or str(result.settings().get("model", "lever_arm"))
+    model = settings.model or str(result.settings().get("model", AUTO))
+    kind = technique(settings.technique) if settings.technique else technique_of(result.quantity())
     with counting_bar("projecting") as bar:
-        predicted = predict(index, cameras, box, n_ambient, model, settings.samples, bar)
+        predicted = predict(
+            index, cameras, box, n_ambient, model, settings.samples, bar, kind, settings.wavelength_nm
+        )  # fmt: skip
     predicted.write(settings.out)
-    for camera, d in zip(cameras, predicted.displacement, strict=True):
-        rms = float(d.nan_to_num().square().mean().sqrt())
-        say(f"{camera.name}: rms displacement {rms:.4f} px a component")
+    for camera, values in zip(cameras, predicted.observations[0].values, strict=True):
+        rms = float(values.nan_to_num().square().mean().sqrt())
+        say(f"{camera.name}: rms {kind.measured} {rms:.4g}{'' if kind.unit == '1' else f' {kind.unit} a component'}")
     say(f"{settings.out}: {len(cameras)} predicted views ({model})")
     return predicted
 

@@ -42,6 +42,11 @@ class VoxelField(Field):
         self.coefficients = coefficients
 
     @classmethod
+    def of(cls, coefficients: Float[Tensor, "z y x"], grid: Grid, degree: int, boundary: Boundary) -> VoxelField:
+        """Return the spline of coefficients that go on beyond the box as the boundary has it."""
+        return cls(boundary.extend(coefficients, (degree + 1) // 2), grid, degree)
+
+    @classmethod
     def through(cls, values: Float[Tensor, "z y x"], grid: Grid) -> VoxelField:
         """Return the cubic spline that passes through `values` at the voxel centres, mirrored about the outermost."""
         if tuple(values.shape) != grid.shape:

@@ -8,6 +8,7 @@ autograd, and the whole can be compiled (`torch.compile` cannot differentiate tw
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -58,6 +59,9 @@ ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 """Each gives the activation and its derivative."""
 
 
+UNBOUNDED = (-math.inf, math.inf)
+SHARPNESS = 10.0  # of the bounds: within 0.3 units of one the output bends towards it
+
 ATTENUATION = 0.3  # of a signal by one layer with torch's initial weights; deeper networks than 4 make up for it
 
 
@@ -95,13 +99,25 @@ class Network(nn.Module):
 
     Octave k of the encoding is given to the first layer times 2^(-k octave_decay), and from the sixth on (k > 4) times
     4^(4 - k) as well: its slope grows like 2^k, and is noise until the octaves below have found the field.
+
+    Where there are bounds a <= N <= b, the n head is not the last layer's output v but one that cannot leave them:
+
+        N = a + (softplus(k (v - a)) - softplus(k (v - b))) / k,     N = v far from both
+
+    Parameters
+    ----------
+    shape : NetworkShape
+    encoded : numbers that the first layer is given; 0 for those of the encoding
+    bounds : lowest and highest value of the n head
     """
 
     gains: Tensor
+    bounds: Tensor
 
-    def __init__(self, shape: NetworkShape, encoded: int = 0) -> None:
+    def __init__(self, shape: NetworkShape, encoded: int = 0, bounds: tuple[float, float] = UNBOUNDED) -> None:
         super().__init__()
-        self.shape = shape
+        self.shape, self.limits = shape, bounds
+        self.register_buffer("bounds", torch.tensor(bounds, dtype=torch.float64))
         e, w = encoded or encoded_width(shape.octaves), shape.width
         inputs = [e] + [w + (e if i == shape.skip else 0) for i in range(1, shape.depth + 1)]
         self.layers = nn.ModuleList(nn.Linear(inputs[i], w) for i in range(shape.depth))
@@ -124,7 +140,7 @@ class Network(nn.Module):
         """Return the scaled index excess."""
         activate = ACTIVATIONS[self.shape.activation]
         h, _ = self._trunk(p, [])
-        return self._head(0, h, activate)[0]
+        return self._bounded(self._head(0, h, activate)[0])[0]
 
     def value_and_gradient(
         self, p: Float[Tensor, "n k"], heads: bool = False
@@ -133,6 +149,8 @@ class Network(nn.Module):
         slopes: list[Tensor] = []
         h, encoded = self._trunk(p, slopes)
         value, cotangent = self._head(0, h, ACTIVATIONS[self.shape.activation])
+        value, slope = self._bounded(value)
+        cotangent = cotangent if slope is None else cotangent * slope[:, None]
         # from here on the reverse pass: cotangent is d value / d (output of the layer)
         to_encoding: Tensor | None = None
         for i in range(self.shape.depth, 0, -1):
@@ -148,7 +166,23 @@ class Network(nn.Module):
         """Weights without gains are of networks whose octaves count alike but for octave_decay."""
         alike = 2.0 ** (-self.shape.octave_decay * torch.arange(self.shape.octaves))
         state_dict.setdefault(f"{prefix}gains", alike)
+        low, high = state_dict.setdefault(f"{prefix}bounds", torch.tensor(UNBOUNDED, dtype=torch.float64)).tolist()
+        self.limits = low, high
         super()._load_from_state_dict(state_dict, prefix, *others)
+
+    def _bounded(self, v: Float[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"] | None]:
+        """The n head within its bounds, and its derivative; None for 1."""
+        if self.limits == UNBOUNDED:
+            return v, None
+        low, high = self.limits
+        v = v.float()
+        value, slope = v, torch.ones_like(v)
+        for bound, sign in ((low, 1.0), (high, -1.0)):
+            if math.isfinite(bound):
+                beyond = SHARPNESS * sign * (bound - v)  # above 0 beyond the bound
+                value = value + sign * torch.nn.functional.softplus(beyond) / SHARPNESS
+                slope = slope - torch.sigmoid(beyond)
+        return value, slope
 
     def _encode(self, p: Tensor) -> Tensor:
         """What the first layer is given of a point."""
@@ -193,18 +227,18 @@ def _linear(module: nn.Module) -> nn.Linear:
 
 
 class NeuralField(Field):
-    """A network in physical units: excess = index_scale (network((x - centre) / half_edge) - offset).
+    """A network in physical units: f(x) = scale (network((x - centre) / half_edge) - offset).
 
     Parameters
     ----------
     network : Network
     box : Box, mm; its longest edge is mapped to [-1, 1]
-    index_scale : index excess of one unit of network output
+    scale : field of one unit of network output
     offset : network output that counts as ambient (the gauge)
     """
 
-    def __init__(self, network: Network, box: Box, index_scale: float, offset: float = 0.0) -> None:
-        self.network, self.box, self.index_scale, self.offset = network, box, index_scale, offset
+    def __init__(self, network: Network, box: Box, scale: float, offset: float = 0.0) -> None:
+        self.network, self.box, self.scale, self.offset = network, box, scale, offset
         self.half_edge = max(box.edges) / 2
 
     def to(self, device: torch.device | str) -> NeuralField:
@@ -225,9 +259,9 @@ class NeuralField(Field):
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
         value, gradient, _ = self.network.value_and_gradient(self._inputs(points))
-        value = self.index_scale * (value - self.offset)
-        gradient = gradient * (self.index_scale / self.half_edge)
+        value = self.scale * (value - self.offset)
+        gradient = gradient * (self.scale / self.half_edge)
         return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
 
     def __call__(self, points: Points) -> Values:
-        return (self.index_scale * (self.network(self._inputs(points)) - self.offset)).reshape(points.shape[:-1])
+        return (self.scale * (self.network(self._inputs(points)) - self.offset)).reshape(points.shape[:-1])

@@ -17,7 +17,7 @@ from nerif.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.geometry import Box
 
-__all__ = ["Flame", "GaussianBalls", "Octahedron", "make_phantom"]
+__all__ = ["Flame", "GaussianBalls", "Octahedron", "Scaled", "make_phantom"]
 
 
 class GaussianBalls(Field):
@@ -160,6 +160,23 @@ class Octahedron(Field):
         height = 1.5 - p.abs().sum(-1)
         inside = (height >= 0).to(p)
         return self.amplitude * height * inside, -(self.amplitude / self.unit) * p.sign() * inside[..., None]
+
+
+class Scaled(Field):
+    """Another field times a factor: the burnt fraction of a flame as its extinction or emission.
+
+    Parameters
+    ----------
+    field : Field
+    factor : in the unit wanted over that of the field
+    """
+
+    def __init__(self, field: Field, factor: float) -> None:
+        self.field, self.factor = field, factor
+
+    def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
+        value, gradient = self.field.value_and_gradient(points)
+        return self.factor * value, self.factor * gradient
 
 
 FLAME_INTERVAL = 1e-4  # s between the six instants that stand for the paper's Phantoms 2-7

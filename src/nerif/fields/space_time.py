@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from nerif.conventions import Points
 from nerif.fields.encoding import encode, encode_pullback, encoded_width
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.mlp import UNBOUNDED, Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 
 __all__ = ["AtTimes", "SpaceTimeField", "SpaceTimeNetwork", "with_time"]
@@ -30,11 +30,12 @@ class SpaceTimeNetwork(Network):
     ----------
     shape : NetworkShape, of the layers
     time_octaves : of the encoding of time
+    bounds : lowest and highest value of the n head
     """
 
-    def __init__(self, shape: NetworkShape, time_octaves: int) -> None:
+    def __init__(self, shape: NetworkShape, time_octaves: int, bounds: tuple[float, float] = UNBOUNDED) -> None:
         self.time_octaves = time_octaves
-        super().__init__(shape, 2 * encoded_width(shape.octaves) + 1 + 2 * time_octaves)
+        super().__init__(shape, 2 * encoded_width(shape.octaves) + 1 + 2 * time_octaves, bounds)
         self.drift = nn.Parameter(torch.zeros(3))  # half edges of the box per unit of tau
 
     def _encode(self, p: Float[Tensor, "n 4"]) -> Tensor:
@@ -89,14 +90,14 @@ class SpaceTimeField(NeuralField):
     network : SpaceTimeNetwork
     box : Box, mm; its longest edge is mapped to [-1, 1]
     tau : the instant, in [-1, 1]
-    index_scale : index excess of one unit of network output
+    scale : field of one unit of network output
     offset : network output that counts as ambient (the gauge)
     """
 
     def __init__(
-        self, network: SpaceTimeNetwork, box: Box, tau: float, index_scale: float, offset: float = 0.0
+        self, network: SpaceTimeNetwork, box: Box, tau: float, scale: float, offset: float = 0.0
     ) -> None:
-        super().__init__(network, box, index_scale, offset)
+        super().__init__(network, box, scale, offset)
         self.network: SpaceTimeNetwork = network
         self.tau = tau
 

@@ -175,8 +175,8 @@ class Camera:
         origin = (self.centre + start @ self.rotation).expand_as(direction)
         zero = torch.zeros_like(pixels[..., 0])
         number = torch.full(zero.shape, view, dtype=torch.int16)
-        background = self._background_points(origin, direction, sensitivity)
-        return Rays(origin, direction, zero, zero, pixels, number, background, self.projection.begin)
+        ends = self._background_points(origin, direction, sensitivity)
+        return Rays(origin, direction, zero, zero, pixels, number, ends, self.projection.begin)
 
     def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
         """Where rays meet the background, and S there."""

@@ -1,7 +1,7 @@
 """Rays: all that a path integral needs to know of a measurement, and nothing about cameras.
 
-A ray is back-traced from a pixel. Where it ends on a background, refraction by dn at path length s moves the point it ends
-on by (s_b - s) dn / n, and the sensitivity S (2 x 3, px/mm) turns that movement into pixels:
+A ray is back-traced from a pixel. Where it ends on a background, refraction by dn at path length s moves the point it
+ends on by (s_b - s) dn / n, and the sensitivity S (2 x 3, px/mm) turns that movement into pixels:
 
     d = integral (s_b - s) S grad(n) / n ds
 """

@@ -145,7 +145,7 @@ def with_flow_masks(
                     "in px, or drawn masks of all views"
                 )
             known = usable[i][inside].numpy()
-            d = np.where(known[..., None], measurement.displacement[i][inside].numpy(), np.nan)
+            d = np.where(known[..., None], measurement.displacements[i][inside].numpy(), np.nan)
             own = measurement.sigma[i][inside].numpy() if sigma is None and measurement.sigma is not None else sigma
             mask = flow_mask(d, np.broadcast_to(np.asarray(own, dtype=np.float32), d.shape), settings)
             if not (mask & known).any():

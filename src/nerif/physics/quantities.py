@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
-from nerif.volume import QUANTITIES, Volume
+from nerif.volume import QUANTITIES, Volume, quantities_of
 
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
@@ -45,6 +45,8 @@ class GasSettings:
         InputError
             If density and temperature cannot be computed of it: before the long work, not after it.
         """
+        if "density" not in quantities_of(measurement.quantity):
+            return self
         wavelength = measurement.wavelength_nm
         gas = self if wavelength is None else replace(self, wavelength_nm=wavelength)
         density_from_index(0.0, measurement.n_ambient, gladstone_dale(gas.composition, gas.wavelength_nm))
@@ -70,9 +72,10 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
     InputError
         If the quantity is unknown.
     """
-    if quantity not in QUANTITIES:
-        raise InputError(f"quantity: expected one of {', '.join(QUANTITIES)}, got '{quantity}'")
-    if quantity == "index_excess":
+    known = quantities_of(excess.quantity)
+    if quantity not in known:
+        raise InputError(f"quantity: expected one of {', '.join(known)}, got '{quantity}'")
+    if quantity == excess.quantity:
         return excess
     n_ambient = float(excess.attributes["n_ambient"])
     if quantity == "n":
@@ -103,8 +106,8 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
 
 
 def derive_all(excess: Volume, gas: GasSettings) -> list[Volume]:
-    """Return index_excess, n, density and temperature; see `derive`."""
-    return [derive(excess, quantity, gas) for quantity in QUANTITIES]
+    """Return index_excess, n, density and temperature, see `derive`; a volume of anything else alone."""
+    return [derive(excess, quantity, gas) for quantity in quantities_of(excess.quantity)]
 
 
 def masked_lines(volumes: list[Volume]) -> list[str]:

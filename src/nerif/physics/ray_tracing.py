@@ -22,7 +22,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Rays
-from nerif.physics.deflection import ForwardModel
+from nerif.physics.path_integral import Projector
 
 __all__ = ["CurvedRays", "background_points", "trace"]
 
@@ -71,7 +71,7 @@ def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: flo
 
 
 @dataclass(frozen=True)
-class CurvedRays(ForwardModel):
+class CurvedRays(Projector):
     """The `traced` model: d = S (X - X0) with X the background point that the bent ray finds.
 
     Parameters
@@ -79,6 +79,8 @@ class CurvedRays(ForwardModel):
     steps : Runge-Kutta steps through the box
     n_ambient : refractive index the excess is counted from
     """
+
+    channels = 2
 
     steps: int = 150
     n_ambient: float = 1.0

@@ -16,7 +16,7 @@ from torch import Tensor
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
-from nerif.volume import Volume
+from nerif.volume import Volume, describe
 
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 
@@ -101,9 +101,10 @@ class Reconstruction:
 
     Parameters
     ----------
-    field : Field of index excess
+    field : Field of the quantity
     box : where it holds, mm
-    n_ambient : refractive index the excess is counted from
+    n_ambient : refractive index that an excess is counted from
+    quantity : what the field is (volume.QUANTITIES)
     history : one record a logged step
     outcome : why it stopped
     settings : what the method was asked, as plain values
@@ -123,6 +124,7 @@ class Reconstruction:
     peak_memory_bytes: int = 0
     device: str = "cpu"
     state: State | None = dataclasses.field(default=None, repr=False)
+    quantity: str = "index_excess"
 
     @property
     def model(self) -> str:
@@ -130,8 +132,9 @@ class Reconstruction:
         return str(self.settings["model"])
 
     def volume(self, grid: Grid) -> Volume:
-        """Return the index excess at the voxel centres of a grid."""
-        return Volume(self.field.sample(grid, self.device), grid, attributes={"n_ambient": self.n_ambient})
+        """Return the field at the voxel centres of a grid."""
+        values, unit = self.field.sample(grid, self.device), describe(self.quantity)[0]
+        return Volume(values, grid, self.quantity, unit, {"n_ambient": self.n_ambient})
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the three middle slices, why it stopped, how long it took, and the misfit."""
@@ -146,7 +149,8 @@ class Reconstruction:
                 rows.append(("Misfit", f"{number(last[name], 3)} {meaning}"))
                 break
         picture = show_slices(volume)
-        return panel("Reconstruction", rows + volume.summary(), picture, "Index excess in the three middle slices")
+        caption = f"{describe(self.quantity)[1].capitalize()} in the three middle slices"
+        return panel("Reconstruction", rows + volume.summary(), picture, caption)
 
 
 class Reconstructor(ABC):

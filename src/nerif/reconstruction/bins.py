@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nerif.geometry import Box, Camera, Rays
 from nerif.measurement import Measurement
+from nerif.observation import Observation
 
 __all__ = ["binned_rays", "coarsest_edge"]
 
@@ -28,26 +29,30 @@ def coarsest_edge(measurement: Measurement) -> int:
 
 
 def binned_rays(
-    measurement: Measurement, edge: int, open_faces: tuple[str, ...] = ()
-) -> tuple[Rays, Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
-    """Return rays, displacement and sigma (px) of square bins of the usable pixels that cross none of the open faces.
+    measurement: Measurement, observation: Observation, edge: int, open_faces: tuple[str, ...] = ()
+) -> tuple[Rays, Float[Tensor, "n c"], Float[Tensor, "n c"]]:
+    """Return rays, values and sigma of square bins of the usable pixels that cross none of the open faces.
 
-    Where sigma is not known, that of a pixel counts as 1 px.
+    Where sigma is not known, that of a pixel counts as 1.
 
     Parameters
     ----------
+    observation : what was measured by one technique
     edge : of a bin, px
     """
-    usable = measurement.usable
-    parts, displacement, sigma = [], [], []
+    usable, channels = measurement.usable_for(observation), observation.values.shape[-1]
+    parts, values, sigma = [], [], []
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
         mask = usable[i, :height, :width]
-        known = None if measurement.sigma is None else measurement.sigma[i, :height, :width]
-        weight = mask[..., None].expand(height, width, 2).double()
+        if not bool(mask.any()):
+            continue
+        camera = observation.technique.seen_by(camera)
+        known = None if observation.sigma is None else observation.sigma[i, :height, :width]
+        weight = mask[..., None].expand(height, width, channels).double()
         if known is not None:
             weight = torch.where(mask[..., None], known.double().pow(-2), 0.0)
-        d = torch.where(mask[..., None], measurement.displacement[i, :height, :width], 0.0)
+        d = torch.where(mask[..., None], observation.values[i, :height, :width], 0.0)
         total = _sums(weight, edge)
         mean = total.mean(-1, keepdim=True)
         moment = _sums(weight.mean(-1, keepdim=True) * camera.pixel_grid(), edge)
@@ -56,9 +61,9 @@ def binned_rays(
         rays = camera.rays(pixels, view=i).clip(measurement.box)
         crosses = rays.crosses
         parts.append(rays[crosses].to(dtype=torch.float32))
-        displacement.append((_sums(weight * d, edge)[keep] / total[keep])[crosses].float())
+        values.append((_sums(weight * d, edge)[keep] / total[keep])[crosses].float())
         sigma.append(total[keep][crosses].rsqrt().float())
-    return Rays.concatenate(parts), torch.cat(displacement), torch.cat(sigma)
+    return Rays.concatenate(parts), torch.cat(values), torch.cat(sigma)
 
 
 def _sums(x: Float[Tensor, "row column k"], edge: int) -> Float[Tensor, "r c k"]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -54,7 +55,7 @@ class Ensemble:
         number: int,
         reconstructor: Reconstructor,
         measurement: Measurement,
-        noise: Float[Tensor, "view row column 2"],
+        noise: Mapping[str, Float[Tensor, "view row column c"]],
     ) -> tuple[Reconstructor, Measurement]:
         """Return what member `number` is reconstructed by and from.
 
@@ -63,14 +64,17 @@ class Ensemble:
         number : 1 to members
         reconstructor : settings of the run; its seed, if it has one, is moved on
         measurement : what was measured
-        noise : standard deviation of the noise to add, px
+        noise : standard deviation of the noise to add, by the name of the technique
         """
         seed = getattr(reconstructor, "seed", 0)
         generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + number)
-        noisy = measurement.displacement + noise * torch.randn(noise.shape, generator=generator)
-        # the noise is there twice now, and independent: variances add
-        sigma = None if measurement.sigma is None else measurement.sigma * math.sqrt(2)
-        member = replace(measurement, displacement=noisy, sigma=sigma)
+        noisy, sigmas = {}, {}
+        for o in measurement.observations:
+            name = o.technique.name
+            noisy[name] = o.values + noise[name] * torch.randn(o.values.shape, generator=generator)
+            # the noise is there twice now, and independent: variances add
+            sigmas[name] = None if o.sigma is None else o.sigma * math.sqrt(2)
+        member = measurement.observed(noisy, sigmas)
         out = self.left_out(number, measurement)
         if out:
             member = member.select([name for name in member.names if name not in out])

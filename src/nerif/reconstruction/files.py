@@ -16,8 +16,11 @@ from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
+from nerif.volume import INDEX
 
-__all__ = ["CHECKPOINT", "FIELD", "checkpoints", "read_field", "read_state", "write_field", "write_state"]
+__all__ = [
+    "CHECKPOINT", "FIELD", "checkpoints", "read_field", "read_quantity", "read_state", "write_field", "write_state",
+]  # fmt: skip
 
 FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
 
@@ -26,6 +29,7 @@ def write_field(directory: Path, result: Reconstruction) -> None:
     """Write a field, and all that is needed to evaluate it, atomically."""
     field = result.field
     about: dict[str, Any] = {"n_ambient": result.n_ambient, "outcome": vars(result.outcome)}
+    about["quantity"] = result.quantity
     if isinstance(field, VoxelField):
         box = field.grid.box
         about |= {"kind": "voxels", "shape": field.grid.shape, "degree": field.degree}
@@ -34,7 +38,7 @@ def write_field(directory: Path, result: Reconstruction) -> None:
         assert isinstance(field, NeuralField)
         box = field.box
         about |= {"kind": "neural", "network": vars(field.network.shape)}
-        about |= {"index_scale": field.index_scale, "offset": field.offset}
+        about |= {"index_scale": field.scale, "offset": field.offset}
         tensors = {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}
     _save(directory / FIELD, tensors, {**about, "box": [box.lower, box.upper]})
 
@@ -64,6 +68,11 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: not a field of this version of nerif ({type(error).__name__}: {error})") from None
+
+
+def read_quantity(directory: Path) -> str:
+    """Read what the field of a result directory is (volume.QUANTITIES)."""
+    return str(_load(directory / FIELD)[1].get("quantity", INDEX))
 
 
 def write_state(directory: Path, state: State) -> None:

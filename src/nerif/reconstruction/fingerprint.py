@@ -23,12 +23,15 @@ def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> d
     measurement : Measurement
     open_faces : faces whose rays are dropped
     """
-    usable = measurement.usable
+    usable, seen = measurement.usable, {}
+    for o in measurement.observations:
+        own = measurement.usable_for(o)
+        seen[o.technique.measured] = digest([o.values[own]])
+        seen[o.technique.sigma] = digest([None if o.sigma is None else o.sigma[own]])
     return {
         "views": digest(measurement.names),
         "cameras": digest(part for camera in measurement.cameras for part in _parts(camera)),
-        "displacement": digest([measurement.displacement[usable]]),
-        "sigma": digest([None if measurement.sigma is None else measurement.sigma[usable]]),
+        **seen,
         "valid pixels": digest([usable]),
         "flow_mask": digest([measurement.flow_mask]),
         "box": digest([measurement.box.lower, measurement.box.upper]),

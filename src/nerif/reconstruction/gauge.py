@@ -1,4 +1,4 @@
-"""The gauge: where the index is known to be ambient. Displacements fix n only up to a constant.
+"""The gauge: where the field is known to be ambient, 0. Displacements fix n only up to a constant.
 
 By default the side faces of the box; where flow masks are given, all that lies outside the visual hull as well.
 """
@@ -16,12 +16,22 @@ from nerif.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
 
-__all__ = ["AmbientRegion", "check_gauge", "visual_hull"]
+__all__ = ["AmbientRegion", "ambient_faces", "check_gauge", "is_open", "visual_hull"]
+
+
+def is_open(measurement: Measurement) -> bool:
+    """Return whether what was measured leaves a constant of the field open."""
+    return all(kind.gauge for kind in measurement.techniques)
+
+
+def ambient_faces(measurement: Measurement, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return the faces on which the field is to be ambient: those asked for, else, where it needs any, the file's."""
+    return asked or (measurement.ambient_faces if is_open(measurement) else ())
 
 
 def check_gauge(measurement: Measurement, faces: tuple[str, ...], hull: bool = True) -> None:
-    """Refuse a reconstruction of which nothing is known to be ambient."""
-    if not faces and not (hull and measurement.flow_mask is not None):
+    """Refuse a reconstruction that leaves a constant open, and of which nothing is known to be ambient."""
+    if is_open(measurement) and not faces and not (hull and measurement.flow_mask is not None):
         raise InputError(
             "ambient_faces: expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
             "fix the index only up to a constant"
@@ -68,13 +78,19 @@ class AmbientRegion:
     voxel: tuple[float, float, float]
 
     @classmethod
-    def of(cls, measurement: Measurement, faces: tuple[str, ...], resolution: int = 48) -> AmbientRegion:
-        """Find the ambient region of a measurement; with neither faces nor masks there is no gauge, an error."""
+    def of(cls, measurement: Measurement, asked: tuple[str, ...], resolution: int = 48) -> AmbientRegion | None:
+        """Find the ambient region of a measurement, with the faces asked for or its own.
+
+        None where nothing is known to be ambient and nothing has to be; an error where something has.
+        """
+        faces = ambient_faces(measurement, asked)
         grid = Grid.of_resolution(measurement.box, resolution)
         empty = torch.zeros(0, 3)
         if measurement.flow_mask is not None:
             empty = grid.points()[~visual_hull(measurement, grid)]
         check_gauge(measurement, faces, bool(len(empty)))
+        if not faces and not len(empty):
+            return None
         return cls(measurement.box, faces, empty, grid.spacing)
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:

@@ -2,18 +2,20 @@
 
 See kernels_torch.py for the same in plain PyTorch. Along ray r the samples m = 0 ... count - 1 stand at
 
-    x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array),   w_m = lever_0 + m lever_1
+    x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
-and d = matrix sum_m w_m grad n(x_m). Arithmetic is in double precision, whatever the arrays are.
+with the weight w_m = profile_0 + m profile_1, or profile_m where there are more than two. A matrix (n, c, 3) takes
+sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m). Arithmetic is in double precision, whatever the arrays.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numba import njit, prange
-from numba.extending import overload
+from numba.extending import overload, register_jitable
 
 __all__ = ["adjoint", "forward"]
 
@@ -23,14 +25,14 @@ SLAB = 4  # planes; at least the 4 that a cubic spline touches, so that slabs of
 BLOCK = 64  # rays, neighbours in an image mostly, of which is known between which planes they stay
 
 
-def forward(degree: int, padded: np.ndarray, rays: tuple[np.ndarray, ...], displacement: np.ndarray) -> None:
-    """Write the displacement (n, 2) of each ray through the padded coefficients (z, y, x)."""
-    _forward(padded, *rays, displacement, LINEAR if degree == 1 else CUBIC)
+def forward(degree: int, padded: np.ndarray, path: Sequence[np.ndarray], matrix: np.ndarray, seen: np.ndarray) -> None:
+    """Add to `seen` (n, c) what the matrix of each ray makes of the padded coefficients (z, y, x)."""
+    _forward(padded, *path, matrix, seen, LINEAR if degree == 1 else CUBIC)
 
 
-def adjoint(degree: int, displacement: np.ndarray, rays: tuple[np.ndarray, ...], padded: np.ndarray) -> None:
-    """Add to the padded coefficients (z, y, x) what the adjoint makes of displacements (n, 2)."""
-    _adjoint(padded, *rays, displacement, LINEAR if degree == 1 else CUBIC)
+def adjoint(degree: int, seen: np.ndarray, path: Sequence[np.ndarray], matrix: np.ndarray, padded: np.ndarray) -> None:
+    """Add to the padded coefficients (z, y, x) what the adjoint makes of `seen` (n, c)."""
+    _adjoint(padded, *path, matrix, seen, LINEAR if degree == 1 else CUBIC)
 
 
 def _linear(t: Any, spline: Any) -> Any:
@@ -56,8 +58,12 @@ def _compiled_weights(t: Any, spline: Any) -> Any:
 
 
 @njit(fastmath=FASTMATH)
-def _integrate(c, start, stride, count, lever, spline):
-    """Sum of w grad n along one ray, in index per voxel."""
+def _weight(profile, m):
+    return profile[0] + m * profile[1] if profile.shape[0] == 2 else profile[m]
+
+
+def _see_slope(c, start, stride, profile, count, spline, matrix, seen):
+    """Add B sum w grad f along one ray, in field per voxel."""
     neighbours = len(spline)
     qx = qy = qz = 0.0
     for m in range(count):
@@ -77,36 +83,69 @@ def _integrate(c, start, stride, count, lever, spline):
                 gx += slope * by[j] * bz[k]
                 gy += along * sy[j] * bz[k]
                 gz += along * by[j] * sz[k]
-        w = lever[0] + m * lever[1]
+        w = _weight(profile, m)
         qx += w * gx
         qy += w * gy
         qz += w * gz
-    return qx, qy, qz
+    for i in range(seen.shape[0]):
+        seen[i] += matrix[i, 0] * qx + matrix[i, 1] * qy + matrix[i, 2] * qz
+
+
+def _see_value(c, start, stride, profile, count, spline, matrix, seen):
+    """Add A sum w f along one ray."""
+    neighbours, q = len(spline), 0.0
+    for m in range(count):
+        x, y, z = start[0] + m * stride[0], start[1] + m * stride[1], start[2] + m * stride[2]
+        ix, iy, iz = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+        bx, by, bz = _weights(x - ix, spline)[0], _weights(y - iy, spline)[0], _weights(z - iz, spline)[0]
+        total = 0.0
+        for k in range(neighbours):
+            for j in range(neighbours):
+                along = 0.0
+                for i in range(neighbours):
+                    along += c[iz + k, iy + j, ix + i] * bx[i]
+                total += along * by[j] * bz[k]
+        q += _weight(profile, m) * total
+    for i in range(seen.shape[0]):
+        seen[i] += matrix[i] * q
+
+
+def _see(c, start, stride, profile, count, spline, matrix, seen):
+    """Add what one ray sees, by its matrix (c, 3) of the gradient or (c,) of the value."""
+    raise NotImplementedError("compiled only")
+
+
+@overload(_see, jit_options={"fastmath": FASTMATH})
+def _compiled_see(c, start, stride, profile, count, spline, matrix, seen):
+    return _see_slope if matrix.ndim == 2 else _see_value
 
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _forward(c, start, stride, lever, matrix, count, displacement, spline):
+def _forward(c, start, stride, profile, count, matrix, seen, spline):
     for r in prange(count.shape[0]):
-        qx, qy, qz = _integrate(c, start[r], stride[r], count[r], lever[r], spline)
-        for i in range(2):
-            displacement[r, i] = matrix[r, i, 0] * qx + matrix[r, i, 1] * qy + matrix[r, i, 2] * qz
+        _see(c, start[r], stride[r], profile[r], count[r], spline, matrix[r], seen[r])
 
 
 @njit(fastmath=FASTMATH)
-def _spread(c, start, stride, count, lever, q, first, last, spline):
-    """Add w q . grad of each basis function along one ray, for the samples between planes `first` and `last`."""
-    neighbours = len(spline)
+def _samples_between(start, stride, count, first, last):
+    """About which samples stand between planes: one more at both ends, for each is to be asked again."""
     low, high = 0, count
-    # about which samples: one more at both ends, for each is asked again below
     if abs(stride[2]) * count > 1e-3:
         a, b = (first - start[2]) / stride[2], (last - start[2]) / stride[2]
         if a > b:
             a, b = b, a
         if b < -1 or a > count:
-            return
+            return 0, 0
         low = max(0, int(a) - 1)
         if b < count - 2:
             high = int(b) + 2
+    return low, high
+
+
+def _spread_slope(c, start, stride, profile, count, spline, q, first, last):
+    """Add w q . grad of each basis function along one ray, for the samples between planes `first` and `last`."""
+    neighbours = len(spline)
+    low, high = _samples_between(start, stride, count, first, last)
     for m in range(low, high):
         z = start[2] + m * stride[2]
         iz = int(np.floor(z))
@@ -117,7 +156,7 @@ def _spread(c, start, stride, count, lever, q, first, last, spline):
         bx, sx = _weights(x - ix, spline)
         by, sy = _weights(y - iy, spline)
         bz, sz = _weights(z - iz, spline)
-        w = lever[0] + m * lever[1]
+        w = _weight(profile, m)
         ax, ay, az = w * q[0], w * q[1], w * q[2]
         for k in range(neighbours):
             for j in range(neighbours):
@@ -127,8 +166,66 @@ def _spread(c, start, stride, count, lever, q, first, last, spline):
                     c[iz + k, iy + j, ix + i] += slope * sx[i] + along * bx[i]
 
 
+def _spread_value(c, start, stride, profile, count, spline, q, first, last):
+    """Add w q of each basis function along one ray, for the samples between planes `first` and `last`."""
+    neighbours = len(spline)
+    low, high = _samples_between(start, stride, count, first, last)
+    for m in range(low, high):
+        z = start[2] + m * stride[2]
+        iz = int(np.floor(z))
+        if iz < first or iz >= last:
+            continue
+        x, y = start[0] + m * stride[0], start[1] + m * stride[1]
+        ix, iy = int(np.floor(x)), int(np.floor(y))
+        bx, by, bz = _weights(x - ix, spline)[0], _weights(y - iy, spline)[0], _weights(z - iz, spline)[0]
+        w = _weight(profile, m) * q[0]
+        for k in range(neighbours):
+            for j in range(neighbours):
+                along = w * by[j] * bz[k]
+                for i in range(neighbours):
+                    c[iz + k, iy + j, ix + i] += along * bx[i]
+
+
+def _spread(c, start, stride, profile, count, spline, q, first, last, matrix):
+    """Add the adjoint of `_see` for one ray, for the samples between planes `first` and `last`."""
+    raise NotImplementedError("compiled only")
+
+
+@overload(_spread, jit_options={"fastmath": FASTMATH})
+def _compiled_spread(c, start, stride, profile, count, spline, q, first, last, matrix):
+    slope, value = register_jitable(_spread_slope), register_jitable(_spread_value)
+    if matrix.ndim == 2:
+        return lambda c, start, stride, profile, count, spline, q, first, last, matrix: slope(
+            c, start, stride, profile, count, spline, q, first, last
+        )
+    return lambda c, start, stride, profile, count, spline, q, first, last, matrix: value(
+        c, start, stride, profile, count, spline, q, first, last
+    )
+
+
+def _gather(matrix, seen, q):
+    """Write what the matrix of one ray, transposed, makes of what it sees."""
+    raise NotImplementedError("compiled only")
+
+
+@overload(_gather, jit_options={"fastmath": FASTMATH})
+def _compiled_gather(matrix, seen, q):
+    def slope(matrix, seen, q):
+        for i in range(3):
+            q[i] = 0.0
+            for j in range(seen.shape[0]):
+                q[i] += matrix[j, i] * seen[j]
+
+    def value(matrix, seen, q):
+        q[0] = 0.0
+        for j in range(seen.shape[0]):
+            q[0] += matrix[j] * seen[j]
+
+    return slope if matrix.ndim == 2 else value
+
+
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _adjoint(c, start, stride, lever, matrix, count, displacement, spline):
+def _adjoint(c, start, stride, profile, count, matrix, seen, spline):
     # each slab of planes is one thread's; every second one first, then the others, so that no two write to the same
     # voxel: one array is enough, and the sum is the same however many threads there are
     rays = count.shape[0]
@@ -138,8 +235,7 @@ def _adjoint(c, start, stride, lever, matrix, count, displacement, spline):
     for b in prange(blocks):
         below, above = 1e30, -1e30
         for r in range(b * BLOCK, min(rays, (b + 1) * BLOCK)):
-            for i in range(3):
-                q[r, i] = matrix[r, 0, i] * displacement[r, 0] + matrix[r, 1, i] * displacement[r, 1]
+            _gather(matrix[r], seen[r], q[r])
             end = start[r, 2] + stride[r, 2] * count[r]
             below, above = min(below, start[r, 2], end), max(above, start[r, 2], end)
         low[b], high[b] = below, above
@@ -151,4 +247,6 @@ def _adjoint(c, start, stride, lever, matrix, count, displacement, spline):
                 if high[b] < first - 1 or low[b] > first + SLAB + 1:
                     continue
                 for r in range(b * BLOCK, min(rays, (b + 1) * BLOCK)):
-                    _spread(c, start[r], stride[r], count[r], lever[r], q[r], first, first + SLAB, spline)
+                    _spread(
+                        c, start[r], stride[r], profile[r], count[r], spline, q[r], first, first + SLAB, matrix[r]
+                    )

@@ -2,14 +2,15 @@
 
 See kernels_numba.py for the same on all cores of a CPU. Along ray r the samples m = 0 ... count - 1 stand at
 
-    x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array),   w_m = lever_0 + m lever_1
+    x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
-and d = matrix sum_m w_m grad n(x_m).
+with the weight w_m = profile_0 + m profile_1, or profile_m where there are more than two. A matrix (n, c, 3) takes
+sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float
@@ -25,48 +26,61 @@ POINTS = {"cpu": 1 << 14, "cuda": 1 << 22}
 CHUNK_BYTES = 1 << 30  # of the arrays that a chunk on a GPU takes, some 60 numbers a sample
 
 
-def forward(degree: int, padded: Tensor, rays: tuple[Tensor, ...], displacement: Float[Tensor, "n 2"]) -> None:
-    """Write the displacement of each ray through the padded coefficients (z, y, x)."""
+def forward(
+    degree: int, padded: Tensor, path: Sequence[Tensor], matrix: Tensor, seen: Float[Tensor, "n c"]
+) -> None:
+    """Add to `seen` what the matrix of each ray makes of the padded coefficients (z, y, x)."""
     flat, shape = padded.reshape(-1), padded.shape
-    for part, (start, stride, lever, matrix, count) in _chunks(rays):
-        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, lever, count)
-        gx, gy, gz = (torch.zeros_like(w) for _ in range(3))
+    for part, (start, stride, profile, count) in _chunks(path):
+        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, profile, count)
+        f, gx, gy, gz = (torch.zeros_like(w) for _ in range(4))
         for k in range(degree + 1):
             for j in range(degree + 1):
                 line = flat[_line(index, k, j, shape, degree)]
-                along, slope = (line * bx).sum(-1), (line * sx).sum(-1)
-                gx += slope * by[..., j] * bz[..., k]
+                along = (line * bx).sum(-1)
+                if matrix.ndim == 2:
+                    f += along * by[..., j] * bz[..., k]
+                    continue
+                gx += (line * sx).sum(-1) * by[..., j] * bz[..., k]
                 gy += along * sy[..., j] * bz[..., k]
                 gz += along * by[..., j] * sz[..., k]
-        q = torch.stack([(w * g).sum(-1) for g in (gx, gy, gz)], dim=-1)
-        displacement[part] = torch.einsum("nij,nj->ni", matrix, q)
+        if matrix.ndim == 2:
+            seen[part] += matrix[part] * (w * f).sum(-1, keepdim=True)
+        else:
+            q = torch.stack([(w * g).sum(-1) for g in (gx, gy, gz)], dim=-1)
+            seen[part] += torch.einsum("nij,nj->ni", matrix[part], q)
 
 
-def adjoint(degree: int, displacement: Float[Tensor, "n 2"], rays: tuple[Tensor, ...], padded: Tensor) -> None:
-    """Add to the padded coefficients (z, y, x) what the adjoint makes of displacements."""
+def adjoint(
+    degree: int, seen: Float[Tensor, "n c"], path: Sequence[Tensor], matrix: Tensor, padded: Tensor
+) -> None:
+    """Add to the padded coefficients (z, y, x) what the adjoint makes of `seen`."""
     flat, shape = padded.reshape(-1), padded.shape
-    for part, (start, stride, lever, matrix, count) in _chunks(rays):
-        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, lever, count)
-        ax, ay, az = (w * q[:, None] for q in torch.einsum("nij,ni->nj", matrix, displacement[part]).unbind(-1))
+    for part, (start, stride, profile, count) in _chunks(path):
+        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, profile, count)
+        q = torch.einsum("ni...,ni->n...", matrix[part], seen[part])
         for k in range(degree + 1):
             for j in range(degree + 1):
-                slope = ax * by[..., j] * bz[..., k]
-                along = ay * sy[..., j] * bz[..., k] + az * by[..., j] * sz[..., k]
-                share = slope[..., None] * sx + along[..., None] * bx
+                if matrix.ndim == 2:
+                    share = (w * q[:, None] * by[..., j] * bz[..., k])[..., None] * bx
+                else:
+                    ax, ay, az = (w * a[:, None] for a in q.unbind(-1))
+                    along = ay * sy[..., j] * bz[..., k] + az * by[..., j] * sz[..., k]
+                    share = (ax * by[..., j] * bz[..., k])[..., None] * sx + along[..., None] * bx
                 flat.index_add_(0, _line(index, k, j, shape, degree).reshape(-1), share.reshape(-1))
 
 
-def _chunks(rays: tuple[Tensor, ...]) -> Iterator[tuple[slice, list[Tensor]]]:
-    count = rays[-1]
+def _chunks(path: Sequence[Tensor]) -> Iterator[tuple[slice, list[Tensor]]]:
+    count = path[-1]
     longest = max(1, int(count.max())) if len(count) else 1
     size = max(1, POINTS.get(count.device.type, 1 << 14) // longest)
     for first in range(0, len(count), size):
         part = slice(first, first + size)
-        yield part, [a[part] for a in rays]
+        yield part, [a[part] for a in path]
 
 
 def _samples(
-    degree: int, start: Tensor, stride: Tensor, lever: Tensor, count: Tensor
+    degree: int, start: Tensor, stride: Tensor, profile: Tensor, count: Tensor
 ) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
     """First neighbour, weights and slopes along x, y, z, and w of every sample; w = 0 beyond a ray's own count."""
     m = torch.arange(max(1, int(count.max())), device=start.device)
@@ -74,7 +88,9 @@ def _samples(
     x = start[:, None] + step[..., None] * stride[:, None]
     cell = x.floor()
     weights, slopes = spline_weights(x - cell, degree)
-    w = (lever[:, :1] + step * lever[:, 1:]) * (m < count[:, None])
+    even = profile.shape[1] == 2
+    w = profile[:, :1] + step * profile[:, 1:] if even else profile.gather(1, step.long())
+    w = w * (m < count[:, None])
     return cell.long(), weights.unbind(-2), slopes.unbind(-2), w
 
 

@@ -3,7 +3,8 @@
     loss = w_c |grad(n)_AD - grad(n)_net| + w_n |d_ND - d| + w_h |d_net - d| + w_a |d_AD - d| + w_g |n|_ambient
 
 d_ND integrates central differences of n, d_net the gradient heads, d_AD the exact gradient of n; the first three
-terms are the paper's. The last but one is its noise-free twin, the last the gauge.
+terms are the paper's. The last but one is its noise-free twin, the last the gauge. What is integrated, and how the
+samples count, is the forward model's (techniques/); one that sees the field and not its gradient has w_a alone.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import NeuralField
-from nerif.geometry import Rays
-from nerif.physics.deflection import bend, integration_weights
-from nerif.reconstruction.target import Target
+from nerif.reconstruction.target import Part
+from nerif.techniques.base import Weights
 
 __all__ = ["Evaluator", "LossWeights", "loss_terms"]
 
@@ -64,13 +64,11 @@ class Evaluator(Protocol):
 def loss_terms(
     field: NeuralField,
     network: Evaluator,
-    target: Target,
+    part: Part,
     s: Float[Tensor, "n m"],
     step: Float[Tensor, "n m"],
     weights: LossWeights,
-    model: str,
     norm: str,
-    n_ambient: float,
 ) -> dict[str, Tensor]:
     """Return the terms with positive weight by name, not yet weighted.
 
@@ -78,73 +76,78 @@ def loss_terms(
 
     Parameters
     ----------
+    part : rays, what they measured, and the forward model
     s : path lengths of the samples, mm
     step : length that each sample stands for, mm; the central differences reach half of it to either side
     norm : "l2" (mean length of the residual vectors, the paper's) or "squared" (mean square)
     """
-    rays, shape = target.rays, s.shape
+    rays, model, shape = part.rays, part.model, s.shape
     points, tilt = rays.at(s), None
-    unit = field.index_scale / field.half_edge  # 1/mm of one unit of network gradient
-    if model == "curved":  # along the ray as the present field bends it
+    unit = field.scale / field.half_edge  # 1/mm of one unit of network gradient
+    integral = model.weights(rays, s, step).in_units(field.scale, unit)
+    if not model.straight:
         with torch.no_grad():
-            _, bending, _ = network.value_and_gradient(field.normalise(points).reshape(-1, 3), False)
-            bending = bending.float().reshape(*shape, 3)
-            offset, angle = bend(bending * unit, rays, s, step, n_ambient)
-            points = points + offset
-            tilt = angle * torch.einsum("nmi,ni->nm", bending, rays.direction)[..., None]
+            value, slope, _ = network.value_and_gradient(field.normalise(points).reshape(-1, 3), False)
+            value, slope = value.float().reshape(shape) * field.scale, slope.float().reshape(*shape, 3) * unit
+            offset, tilt = model.bend(value, slope, rays, s, step)
+            points, tilt = points + offset, tilt / unit
     p = field.normalise(points).reshape(-1, 3)
-    weight = integration_weights(rays, s, step, model) * (unit / n_ambient)
+    if integral.slope is None:
+        return {"automatic": reduce(part.residual(integral(network.value(p).float().reshape(shape), None)), norm)}
 
-    def data(gradient: Float[Tensor, "p 3"]) -> Tensor:
+    def data(value: Tensor | None, gradient: Float[Tensor, "p 3"]) -> Tensor:
         gradient = gradient.float().reshape(*shape, 3)
-        if tilt is not None:
-            gradient = gradient - tilt
-        d = torch.einsum("nm,nij,nmj->ni", weight, rays.ends.sensitivity, gradient)
-        return reduce((d - target.displacement) * target.inverse_scale, norm)
+        gradient = gradient if tilt is None else gradient - tilt
+        value = None if value is None else value.float().reshape(shape)
+        return reduce(part.residual(integral(value, gradient)), norm)
 
     terms = {}
     if weights.automatic or weights.head or weights.consistency:
         heads = bool(weights.head or weights.consistency)
-        _, automatic, head = network.value_and_gradient(p, heads)
+        value, automatic, head = network.value_and_gradient(p, heads)
         if weights.automatic:
-            terms["automatic"] = data(automatic)
+            terms["automatic"] = data(value, automatic)
         if head is not None:
             if weights.head:
-                terms["head"] = data(head)
+                terms["head"] = data(value, head)
             if weights.consistency:
                 terms["consistency"] = reduce(automatic.float() - head.float(), norm)
     if weights.numerical:
-        d = numerical_displacement(network.value, rays, p.reshape(*shape, 3), step / (2 * field.half_edge), weight)
-        terms["numerical"] = reduce((d - target.displacement) * target.inverse_scale, norm)
+        reach = step / (2 * field.half_edge)
+        seen = by_differences(network.value, integral, p.reshape(*shape, 3), reach)
+        terms["numerical"] = reduce(part.residual(seen), norm)
     return terms
 
 
-def numerical_displacement(
+def by_differences(
     value: Callable[[Float[Tensor, "n 3"]], Float[Tensor, " n"]],
-    rays: Rays,
+    integral: Weights,
     p: Float[Tensor, "n m 3"],
     reach: Float[Tensor, "n m"],
-    weight: Float[Tensor, "n m"],
-) -> Float[Tensor, "n 2"]:
-    """Return the displacement by central differences of n (paper, Eq. (samplegrad)), px.
+) -> Float[Tensor, "n c"]:
+    """Return the prediction by central differences of n (paper, Eq. (samplegrad)).
 
-    S grad(n) asks for the derivatives along the two rows of S only, so four evaluations a sample serve.
+    B grad(n) asks for the derivatives along the rows of B only, so two evaluations a sample and channel serve.
 
     Parameters
     ----------
     value : the n head
+    integral : Weights in the units of the network
     p : sample points in the coordinates of the network
     reach : of the differences to either side, in the same coordinates
-    weight : lever arm times step in the units of the network
     """
-    length = rays.ends.sensitivity.norm(dim=-1)  # px/mm
-    along = rays.ends.sensitivity / length[..., None]
-    offset = reach[..., None, None] * along[:, None]  # n m 2 3
+    assert integral.slope is not None
+    length = integral.slope.norm(dim=-1)
+    along = integral.slope / length[..., None]
+    offset = reach[..., None, None] * along[:, None]  # n m c 3
     centre = p[:, :, None, :]
-    points = torch.stack([centre + offset, centre - offset])  # 2 n m 2 3
+    points = torch.stack([centre + offset, centre - offset])  # 2 n m c 3
     n = value(points.reshape(-1, 3)).float().reshape(points.shape[:-1])
-    slope = (n[0] - n[1]) / (2 * reach[..., None])  # n m 2
-    return (weight[..., None] * slope).sum(dim=1) * length
+    slope = (n[0] - n[1]) / (2 * reach[..., None])  # n m c
+    total = (integral.profile[..., None] * slope).sum(dim=1) * length
+    if integral.value is not None:
+        total = total + Weights(integral.profile, value=integral.value)(n.mean(dim=(0, 3)), None)
+    return total
 
 
 def reduce(residual: Float[Tensor, "n k"], norm: str) -> Tensor:

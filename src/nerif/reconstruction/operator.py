@@ -1,11 +1,11 @@
-"""The linear map from voxels to displacements, never formed as a matrix, and its adjoint."""
+"""The linear map from voxels to what rays see of them, never formed as a matrix, and its adjoint."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from types import ModuleType
+from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,38 +13,42 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.geometry import Grid, Rays
+from nerif.techniques.base import ForwardModel
 
-__all__ = ["MODELS", "STEPS", "DeflectionOperator", "operator_norm"]
+__all__ = ["STEPS", "VoxelOperator", "operator_norm"]
 
 STEPS = {"linear": 0.5, "cubic": 1.0}
 """Voxels between samples: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
-MODELS = ("lever_arm", "paraxial")
+
+EVEN = 1e-9  # of the largest weight: how far the one in the middle of a ray may be from the mean of those at its ends
+CHUNK = 1 << 15  # rays whose weights are looked at a time, sample by sample
 
 
-class DeflectionOperator:
-    """Displacements of rays through a B-spline on a voxel grid, to first order in its coefficients c.
+class VoxelOperator:
+    """What rays see of a B-spline on a voxel grid by a linear forward model; c are the spline's coefficients.
 
-        (A c)_r = sum_m w_rm S_r grad n(x_rm) / n_ambient,    n(x) = sum_ijk c_ijk b_ijk(x)
+        (A c)_r = sum_m w_rm [A_r f(x_rm) + B_r grad f(x_rm)],    f(x) = sum_ijk c_ijk b_ijk(x)
 
-    w_rm is the lever arm s_b - s at sample m (`lever_arm`) or that of the middle of the ray (`paraxial`), times the
-    interval; samples stand at the middles of equal intervals between near and far, no longer than `step` voxels.
-    `A(c)` applies it, `A.T(d)` its exact adjoint. On a CPU it runs on all cores (Numba), on CUDA in PyTorch.
+    Profile w, A and B are the model's (techniques/base.py); samples stand at the middles of equal intervals between
+    near and far, no longer than `step` voxels. The kernels take the profile of a ray as first value and increment; one
+    that does not grow evenly is kept sample by sample. `A(c)` applies the operator, `A.T(y)` its exact adjoint. On a
+    CPU it runs on all cores (Numba), on CUDA in PyTorch.
 
     Parameters
     ----------
     rays : Rays clipped to the box of the grid
     grid : Grid
-    n_ambient : refractive index the excess is counted from
-    model : "lever_arm" or "paraxial"
+    model : linear ForwardModel
     basis : "linear" (coefficients are the values at voxel centres) or "cubic"
     boundary : how the coefficients go on beyond the box
     step : longest distance between samples, in edges of a voxel; None for that of STEPS
-    device, dtype : where and in which precision c and d are
+    device, dtype : where and in which precision c and y are
 
     Raises
     ------
     InputError
-        If no ray crosses the box, one is not clipped to it, or a setting is not one of those named.
+        If no ray crosses the box, one is not clipped to it, the model is not linear, or a setting is not one of those
+        named.
 
     Source: docs/conventions.md (forward model); Joseph, IEEE Trans. Med. Imaging 1 (1982), for projection by
     interpolation.
@@ -54,16 +58,15 @@ class DeflectionOperator:
         self,
         rays: Rays,
         grid: Grid,
-        n_ambient: float = 1.0,
-        model: str = "lever_arm",
+        model: ForwardModel,
         basis: str = "linear",
         boundary: Boundary | None = None,
         step: float | None = None,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        if model not in MODELS:
-            raise InputError(f"model: expected {' or '.join(MODELS)}, got '{model}'")
+        if not model.linear:
+            raise InputError(f"model: expected a linear one, got {type(model).__name__}")
         if basis not in DEGREES:
             raise InputError(f"basis: expected {' or '.join(DEGREES)}, got '{basis}'")
         step = STEPS[basis] if step is None else step
@@ -76,15 +79,15 @@ class DeflectionOperator:
         self.layers = (self.degree + 1) // 2
         self.device, self.dtype = torch.device(device), dtype
         self.domain_shape = grid.shape
-        self.range_shape = (len(rays), 2)
+        self.range_shape = (len(rays), len(model.channels))
         if min(grid.shape) < self.layers:
             raise InputError(
                 f"voxels: expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}"
             )
-        self._rays = self._prepare(rays, n_ambient, model, step)
+        self.path, self.matrices = self._prepare(rays, model, step)
 
-    def _prepare(self, rays: Rays, n_ambient: float, model: str, step: float) -> tuple[Tensor, ...]:
-        """What the kernels need of each ray: start, stride, lever, matrix, count."""
+    def _prepare(self, rays: Rays, model: ForwardModel, step: float) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+        """What the kernels need: start, stride, profile and count of each ray; its A and B, in voxels."""
         rays = rays.to(dtype=torch.float64)  # cameras stand far off: positions lose digits in single precision
         spacing = torch.tensor(self.grid.spacing, dtype=torch.float64, device=rays.near.device)
         lower = torch.tensor(self.grid.box.lower, dtype=torch.float64, device=rays.near.device)
@@ -98,13 +101,18 @@ class DeflectionOperator:
         missing = ~rays.crosses[:, None]  # no sample of theirs is taken, but each has to have a place
         start, stride = start.masked_fill(missing, 1.0), stride.masked_fill(missing, 0.0)
         self._check_inside(start, start + (count - 1).clamp_min(0)[:, None] * stride)
-        if model == "paraxial":
-            lever = torch.stack([rays.ends.distance - 0.5 * (rays.near + rays.far), torch.zeros_like(s)], dim=-1)
-        else:
-            lever = torch.stack([rays.ends.distance - s, -interval], dim=-1)
-        matrix = rays.ends.sensitivity * (interval / n_ambient)[:, None, None] / spacing
-        kept = (a.to(self.device, self.dtype).contiguous() for a in (start, stride, lever, matrix))
-        return (*kept, count.to(self.device, torch.int32))
+        last = (count - 1).clamp_min(0)
+        ends = s[:, None] + torch.stack([0 * last, 0.5 * last, last], dim=1) * interval[:, None]
+        weights = model.weights(rays, ends, interval[:, None].expand_as(ends))
+        first, middle, final = weights.profile.unbind(1)
+        profile = torch.stack([first, (final - first) / last.clamp_min(1)], dim=1)
+        if bool(((middle - 0.5 * (first + final)).abs() > EVEN * weights.profile.abs().amax()).any()):
+            profile = _tabulated(model, rays, s, interval, int(count.max()))
+        kept = [a.to(self.device, self.dtype).contiguous() for a in (start, stride, profile)]
+        matrices = [] if weights.slope is None else [weights.slope / spacing]
+        matrices += [] if weights.value is None else [weights.value]
+        path = (*kept, count.to(self.device, torch.int32))
+        return path, [a.to(self.device, self.dtype).contiguous() for a in matrices]
 
     def _check_inside(self, *positions: Tensor) -> None:
         """Refuse samples beyond the coefficients: the kernels would read memory that is not theirs."""
@@ -115,61 +123,72 @@ class DeflectionOperator:
                     f"rays: expected rays clipped to the box of the grid, {self.grid.box}, got longer ones"
                 )
 
-    def __call__(self, coefficients: Float[Tensor, "z y x"]) -> Float[Tensor, "n 2"]:
-        """Return the displacement of every ray, px."""
+    def __call__(self, coefficients: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
+        """Return what every ray sees."""
         if tuple(coefficients.shape) != self.domain_shape:
             raise InputError(f"coefficients: expected {self.domain_shape}, got {tuple(coefficients.shape)}")
         return self.through(self.boundary.extend(coefficients.to(self.device, self.dtype), self.layers))
 
-    def through(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n 2"]:
-        """Return the displacement, px, of every ray through coefficients that go on beyond the box already."""
+    def through(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n c"]:
+        """Return what every ray sees of coefficients that go on beyond the box already."""
         padded = padded.to(self.device, self.dtype).contiguous()
-        displacement = torch.empty(self.range_shape, dtype=self.dtype, device=self.device)
-        if self.device.type == "cpu":
-            kernels = _numba()
-            kernels.forward(self.degree, padded.numpy(), self._arrays(), displacement.numpy())
-        else:
-            from nerif.reconstruction import kernels_torch
+        seen = torch.zeros(self.range_shape, dtype=self.dtype, device=self.device)
+        kernels, convert = self._kernels()
+        for matrix in self.matrices:
+            path = [convert(a) for a in self.path]
+            kernels.forward(self.degree, convert(padded), path, convert(matrix), convert(seen))
+        return seen
 
-            kernels_torch.forward(self.degree, padded, self._rays, displacement)
-        return displacement
-
-    def T(self, displacement: Float[Tensor, "n 2"]) -> Float[Tensor, "z y x"]:
-        """Return the adjoint of the operator, applied to displacements."""
-        if tuple(displacement.shape) != self.range_shape:
-            raise InputError(f"displacement: expected {self.range_shape}, got {tuple(displacement.shape)}")
+    def T(self, seen: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
+        """Return the adjoint of the operator, applied to what rays see."""
+        if tuple(seen.shape) != self.range_shape:
+            raise InputError(f"seen: expected {self.range_shape}, got {tuple(seen.shape)}")
         shape = tuple(n + 2 * self.layers for n in self.domain_shape)
         padded = torch.zeros(shape, dtype=self.dtype, device=self.device)
-        displacement = displacement.to(self.device, self.dtype).contiguous()
-        if self.device.type == "cpu":
-            kernels = _numba()
-            kernels.adjoint(self.degree, displacement.numpy(), self._arrays(), padded.numpy())
-        else:
-            from nerif.reconstruction import kernels_torch
-
-            kernels_torch.adjoint(self.degree, displacement, self._rays, padded)
+        seen = seen.to(self.device, self.dtype).contiguous()
+        kernels, convert = self._kernels()
+        for matrix in self.matrices:
+            path = [convert(a) for a in self.path]
+            kernels.adjoint(self.degree, convert(seen), path, convert(matrix), convert(padded))
         return self.boundary.fold(padded, self.layers)
 
-    def _arrays(self) -> tuple[np.ndarray, ...]:
-        return tuple(a.numpy() for a in self._rays)
+    def _kernels(self) -> tuple[Any, Callable[[Tensor], Any]]:
+        """The kernels of the device, and how they take arrays."""
+        if self.device.type == "cpu":
+            return _numba(), Tensor.numpy
+        from nerif.reconstruction import kernels_torch
+
+        return kernels_torch, lambda a: a
 
     def field(self, coefficients: Float[Tensor, "z y x"]) -> VoxelField:
-        """Return the field of index excess that coefficients stand for."""
-        return VoxelField(self.boundary.extend(coefficients, self.layers), self.grid, self.degree)
+        """Return the field that coefficients stand for."""
+        return VoxelField.of(coefficients, self.grid, self.degree, self.boundary)
 
     def norm(self, iterations: int = 30) -> float:
-        """Return an estimate of the largest singular value, px (per unit of index), from below."""
+        """Return an estimate of the largest singular value, from below."""
         start = torch.rand(self.domain_shape, generator=torch.Generator().manual_seed(0), dtype=self.dtype)
         return operator_norm(self, self.T, start.to(self.device), iterations)
 
     @staticmethod
-    def memory_bytes(rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32) -> int:
-        """Return what an operator holds while it is applied: the rays, and the padded grid twice."""
+    def memory_bytes(
+        rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32, channels: int = 2
+    ) -> int:
+        """Return what an operator holds while it is applied: rays, B in so many channels, and the padded grid twice."""
         layers = (DEGREES[basis] + 1) // 2
         padded = 1
         for n in grid.shape:
             padded *= n + 2 * layers
-        return rays * (14 * dtype.itemsize + 4) + 2 * padded * dtype.itemsize
+        return rays * ((8 + 3 * channels) * dtype.itemsize + 4) + 2 * padded * dtype.itemsize
+
+
+def _tabulated(model: ForwardModel, rays: Rays, s: Tensor, interval: Tensor, most: int) -> Float[Tensor, "n m"]:
+    """The profile of a model at every sample of every ray; three or more, or it would be first value and increment."""
+    m = torch.arange(max(most, 3), dtype=s.dtype, device=s.device)
+    parts = []
+    for i in torch.arange(len(rays), device=s.device).split(CHUNK):
+        at = s[i, None] + m * interval[i, None]
+        parts.append(model.weights(rays[i], at, interval[i, None].expand_as(at)).profile)
+    return torch.cat(parts)
 
 
 def operator_norm(

@@ -1,16 +1,16 @@
 """The linear least-squares problem that the classical methods share, on one grid and in numbers of order one.
 
-    min_x  |F x - b|^2 + weight R(x),     F = (1/sigma) A index_scale / sqrt(N),   b = (1/sigma) d / sqrt(N), |b| = 1
+    min_x  |F x - b|^2 + weight R(x),     F = (1/sigma) A scale / sqrt(N),   b = (1/sigma) y / sqrt(N), |b| = 1
 
-x is the index excess over index_scale, one coefficient a voxel; N counts displacement components; lengths in the
-penalties are in units of the box (cube root of its volume), and sums over voxels are means, so that a weight means the
-same on every grid. Voxels that are not free are ambient: x = 0.
+x is the field over its scale, one coefficient a voxel; y is what was measured, all techniques one after the other, and
+N counts its numbers; lengths in the penalties are in units of the box (cube root of its volume), and sums over voxels
+are means, so that a weight means the same on every grid. Voxels that are not free are ambient: x = 0.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nerif.fields.grid import Boundary
 from nerif.geometry import Grid
-from nerif.reconstruction.operator import DeflectionOperator
+from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.target import Target
 
 __all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients"]
@@ -84,38 +84,53 @@ class Differences:
 
 
 class Problem:
-    """The data and the operator on one grid; see the head of this file.
+    """The data and the operators on one grid; see the head of this file.
 
     Parameters
     ----------
-    operator : DeflectionOperator
-    target : Target, on the operator's device
-    free : (z, y, x) voxels that are not pinned to the ambient index, or None for all
-    bounds : lowest and highest index excess, or None
+    operators : VoxelOperator of each part of the target
+    target : Target, on the operators' device
+    free : (z, y, x) voxels that are not pinned to the ambient, or None for all
+    bounds : lowest and highest value of the field, or None
     """
 
     def __init__(
         self,
-        operator: DeflectionOperator,
+        operators: Sequence[VoxelOperator],
         target: Target,
         free: Bool[Tensor, "z y x"] | None = None,
         bounds: Bounds | None = None,
     ) -> None:
-        self.operator, self.target, self.scale = operator, target, target.index_scale
+        self.operators, self.target, self.scale = tuple(operators), target, target.scale
+        self.operator = operator = self.operators[0]
         self.differences = Differences(operator.grid, operator.boundary)
         self.voxels = math.prod(operator.grid.shape)
         self._free = None if free is None else free.to(operator.device, operator.dtype)
-        self._inverse = (target.inverse_scale / math.sqrt(2 * len(target))).to(operator.device, operator.dtype)
-        self.data = self._inverse * target.displacement.to(operator.device, operator.dtype)
+        root = math.sqrt(target.numbers)
+        self._inverse = [(part.inverse_scale / root).to(operator.device, operator.dtype) for part in target.parts]
+        self.data = self._joined(
+            [inverse * part.measured.to(inverse) for inverse, part in zip(self._inverse, target.parts, strict=True)]
+        )
         self.bounds = None if bounds is None else (bounds[0] / self.scale, bounds[1] / self.scale)
 
-    def forward(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "n 2"]:
+    def forward(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, " n"]:
         """Return F x."""
-        return self.operator(self.pin(x) * self.scale) * self._inverse
+        x = self.pin(x) * self.scale
+        return self._joined([a(x) * inverse for a, inverse in zip(self.operators, self._inverse, strict=True)])
 
-    def adjoint(self, y: Float[Tensor, "n 2"]) -> Float[Tensor, "z y x"]:
+    def adjoint(self, y: Float[Tensor, " n"]) -> Float[Tensor, "z y x"]:
         """Return F^T y."""
-        return self.pin(self.operator.T(y * self._inverse) * self.scale)
+        parts = y.split([inverse.numel() for inverse in self._inverse])
+        total: Tensor | None = None
+        for operator, inverse, part in zip(self.operators, self._inverse, parts, strict=True):
+            own = operator.T(part.reshape(inverse.shape) * inverse)
+            total = own if total is None else total + own
+        assert total is not None
+        return self.pin(total * self.scale)
+
+    @staticmethod
+    def _joined(parts: list[Tensor]) -> Float[Tensor, " n"]:
+        return parts[0].reshape(-1) if len(parts) == 1 else torch.cat([part.reshape(-1) for part in parts])
 
     def pin(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """Return x with 0, the ambient index, where it is not free."""

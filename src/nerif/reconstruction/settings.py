@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 
 from nerif.conventions import InputError, parse_faces
 from nerif.fields.mlp import NetworkShape
-from nerif.physics.deflection import MODELS
 from nerif.reconstruction.base import Reconstructor
+from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS
+from nerif.techniques.registry import AUTO, check_model
 
 __all__ = ["TrainingSettings"]
 
 CHOICES = {
-    "model": MODELS,
     "optimiser": OPTIMISERS,
     "sampling": ("adaptive", "random", "shifted", "regular"),
     "norm": ("l2", "squared"),
@@ -34,8 +34,13 @@ class TrainingSettings(Reconstructor):
     """Weights of the terms of the loss."""
     norm: str = "squared"
     """Either "squared" residuals (maximum likelihood for Gaussian noise) or "l2", the paper's."""
-    model: str = "lever_arm"
-    """Forward model: lever_arm, paraxial, or curved (along the ray that the present field bends)."""
+    model: str = AUTO
+    """Forward model: of displacements lever_arm (auto), paraxial, or curved (along the ray as the present field bends
+    it); of absorption absorbance (auto), or intensity (where little light is left, its logarithm is skewed)."""
+    lower: float | None = None
+    """Lowest value that the field can have (of the index excess of hot gas: -2.7e-4); else that of the technique."""
+    upper: float | None = None
+    """Highest value that the field can have (of the index excess of hot gas in air: 0)."""
     samples: tuple[int, int] = (12, 24)
     """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
     sample_jitter: int = 4
@@ -117,5 +122,7 @@ class TrainingSettings(Reconstructor):
             )
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
             raise InputError("weights: the head and consistency terms need gradient_head = true")
+        check_model(self.model)
+        check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")

@@ -1,4 +1,4 @@
-"""What a reconstruction is to meet: the usable rays of a measurement, their displacements and how far to trust them."""
+"""What a reconstruction is to meet: the usable rays of a measurement, what they measured and how far to trust it."""
 
 from __future__ import annotations
 
@@ -12,76 +12,145 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
+from nerif.observation import Observation
 from nerif.reconstruction.bins import binned_rays
+from nerif.techniques.base import ForwardModel
+from nerif.techniques.registry import AUTO, forward_models
 
-__all__ = ["Target"]
+__all__ = ["Part", "Target"]
 
 
 @dataclass(frozen=True)
-class Target:
-    """Rays and what they measured.
+class Part:
+    """Rays, and what they measured by one technique.
 
     Parameters
     ----------
+    model : ForwardModel
     rays : Rays
-    displacement : (n, 2) px
-    inverse_scale : (n, 2) 1/px; residuals are multiplied by it: 1/sigma, scaled so that a zero field has mean square 1
-    index_scale : the index excess that makes displacements of the size measured
-    chi_square_scale : mean square of displacement/sigma, which turns the mean square of a scaled residual into that in
-        units of the noise; None where sigma is not known
+    measured : (n, c) as the model reads it
+    inverse_scale : (n, c) one over the unit of `measured`; residuals are multiplied by it: 1/sigma, scaled so that the
+        ambient field has mean square 1 over all parts of a target
     """
 
+    model: ForwardModel
     rays: Rays
-    displacement: Float[Tensor, "n 2"]
-    inverse_scale: Float[Tensor, "n 2"]
-    index_scale: float = 1.0
-    chi_square_scale: float | None = None
-
-    @classmethod
-    def of(cls, measurement: Measurement, open_faces: tuple[str, ...] = (), edge: int = 1) -> Target:
-        """Collect the usable rays that cross none of the open faces, or those of bins of edge x edge pixels.
-
-        Raises
-        ------
-        InputError
-            If no ray is left.
-        """
-        binned = edge > 1
-        rays, displacement, sigma = binned_rays(measurement, edge, open_faces) if binned else measurement.rays()
-        keep = ~rays.exit_faces(measurement.box, open_faces)
-        if not bool(keep.any()):
-            raise InputError("open_faces: every ray crosses one of them, so none is left; name fewer faces")
-        if not bool(keep.all()):
-            rays, displacement, sigma = rays[keep], displacement[keep], None if sigma is None else sigma[keep]
-        rms = float(displacement.square().mean().sqrt())
-        if rms == 0:
-            rms = 1.0  # no displacement at all: the answer is the ambient index, in whatever scale
-        lever = rays.ends.distance - 0.5 * (rays.near + rays.far)
-        pixels_per_radian = lever * rays.ends.sensitivity.norm(dim=(1, 2)) / math.sqrt(2)
-        index_scale = float((displacement / pixels_per_radian[:, None]).square().mean().sqrt()) or 1e-6
-        if sigma is None:
-            return cls(rays, displacement, torch.full_like(displacement, 1 / rms), index_scale)
-        inverse = 1 / sigma
-        chi_square = float((displacement * inverse).square().mean()) or 1.0
-        known = None if measurement.sigma is None else chi_square
-        return cls(rays, displacement, inverse / math.sqrt(chi_square), index_scale, known)
+    measured: Float[Tensor, "n c"]
+    inverse_scale: Float[Tensor, "n c"]
 
     def __len__(self) -> int:
         return len(self.rays)
 
-    def __getitem__(self, index: Tensor | slice) -> Target:
-        return replace(
-            self,
-            rays=self.rays[index],
-            displacement=self.displacement[index],
-            inverse_scale=self.inverse_scale[index],
-        )
+    def __getitem__(self, index: Tensor | slice) -> Part:
+        measured, inverse = self.measured[index], self.inverse_scale[index]
+        return Part(self.model, self.rays[index], measured, inverse)
+
+    def to(self, device: torch.device | str) -> Part:
+        """Return the same on another device."""
+        return Part(self.model, self.rays.to(device), self.measured.to(device), self.inverse_scale.to(device))
+
+    def residual(self, prediction: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        """Return the scaled difference between a path integral and what was measured."""
+        return (self.model.read(prediction) - self.measured) * self.inverse_scale
+
+    @property
+    def of_nothing(self) -> Float[Tensor, "n c"]:
+        """The scaled residual of the ambient field."""
+        return self.residual(torch.zeros_like(self.measured))
+
+
+@dataclass(frozen=True)
+class Target:
+    """What was measured, technique by technique.
+
+    Parameters
+    ----------
+    parts : one for each technique
+    scale : the size of field that makes measurements of the size given
+    chi_square : mean square of the ambient field's residual over sigma (over 1, where sigma is not known), which turns
+        the mean square of a scaled residual into that in units of the noise
+    sigma_known : whether it is
+    """
+
+    parts: tuple[Part, ...]
+    scale: float
+    chi_square: float
+    sigma_known: bool
+
+    @classmethod
+    def of(
+        cls, measurement: Measurement, open_faces: tuple[str, ...] = (), edge: int = 1, model: str = AUTO,
+        linear: bool = False,
+    ) -> Target:  # fmt: skip
+        """Collect the usable rays that cross none of the open faces, or those of bins of edge x edge pixels.
+
+        Parameters
+        ----------
+        model : name of the forward model, or auto
+        linear : whether it has to be linear
+
+        Raises
+        ------
+        InputError
+            If no ray is left, or there is no such model.
+        """
+        models = forward_models(measurement.techniques, measurement, model, linear)
+        parts, scales = [], []
+        known = all(o.sigma is not None for o in measurement.observations)
+        for forward, observation in zip(models, measurement.observations, strict=True):
+            rays, values, sigma = _rays(measurement, observation, open_faces, edge)
+            scales.append(forward.field_scale(rays, values))
+            read, noise = forward.reading(values, sigma)
+            inverse = torch.ones_like(read) if noise is None else 1 / noise
+            parts.append(Part(forward, rays, read, inverse))
+        empty = torch.cat([part.of_nothing.flatten() for part in parts])
+        # nothing measured at all: the answer is the ambient, in whatever scale
+        chi_square = float(empty.square().mean()) or 1.0
+        parts = [replace(part, inverse_scale=part.inverse_scale / math.sqrt(chi_square)) for part in parts]
+        scale = math.sqrt(sum(s**2 for s in scales) / len(scales)) or 1e-6
+        return cls(tuple(parts), scale, chi_square, known)
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts)
+
+    @property
+    def noise(self) -> float | None:
+        """Mean square of the noise over that of what was measured; None where it is not known."""
+        return 1 / self.chi_square if self.sigma_known else None
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers were measured."""
+        return sum(part.measured.numel() for part in self.parts)
+
+    def __getitem__(self, index: Tensor) -> Target:
+        """Return the rays of those numbers, counted through all parts."""
+        if len(self.parts) == 1:
+            return replace(self, parts=(self.parts[0][index],))
+        chosen, first = [], 0
+        for part in self.parts:
+            own = index[(index >= first) & (index < first + len(part))]
+            chosen.append(part[own - first])
+            first += len(part)
+        return replace(self, parts=tuple(chosen))
 
     def to(self, device: torch.device | str) -> Target:
         """Return the same on another device."""
-        return replace(
-            self,
-            rays=self.rays.to(device),
-            displacement=self.displacement.to(device),
-            inverse_scale=self.inverse_scale.to(device),
-        )
+        return replace(self, parts=tuple(part.to(device) for part in self.parts))
+
+
+def _rays(
+    measurement: Measurement, observation: Observation, open_faces: tuple[str, ...], edge: int
+) -> tuple[Rays, Tensor, Tensor | None]:
+    """Rays that cross none of the open faces, what they measured, and its sigma."""
+    if edge > 1:
+        found: tuple[Rays, Tensor, Tensor | None] = binned_rays(measurement, observation, edge, open_faces)
+    else:
+        found = measurement.rays(observation)
+    rays, values, sigma = found
+    keep = ~rays.exit_faces(measurement.box, open_faces)
+    if not bool(keep.any()):
+        raise InputError("open_faces: every ray crosses one of them, so none is left; name fewer faces")
+    if bool(keep.all()):
+        return rays, values, sigma
+    return rays[keep], values[keep], None if sigma is None else sigma[keep]

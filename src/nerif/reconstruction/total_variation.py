@@ -31,7 +31,7 @@ class TotalVariation(WeightedVoxelReconstructor):
     """
 
     softness: float = 0.1
-    """Gradient, in index_scale per box edge, below which the penalty is quadratic."""
+    """Gradient, in units of the field's own scale per box edge, below which the penalty is quadratic."""
     round: int = 20
     """Conjugate-gradient iterations between new weights."""
     iterations: int = 60

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
+from nerif.fields.mlp import UNBOUNDED
 from nerif.fields.space_time import AtTimes, with_time
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.budget import Budget
@@ -31,7 +33,7 @@ from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.sampling import SamplingDensity, sample_count, sample_rays
 from nerif.reconstruction.settings import TrainingSettings
-from nerif.reconstruction.target import Target
+from nerif.reconstruction.target import Part
 from nerif.reconstruction.training_data import TrainingData
 from nerif.reconstruction.warm_start import adopt, fit_network
 from nerif.reconstruction.watch import Watch
@@ -44,6 +46,23 @@ GAUGE_POINTS = 256  # a step
 DENSITY_EVERY = 60  # steps between looks at where the field varies
 LEVEL_POINTS = 1 << 14  # at which the ambient level is taken at the end
 LOG_EVERY, KEEP_EVERY = 20, 200  # steps
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Rays of one technique in a step.
+
+    Parameters
+    ----------
+    part : rays, what they measured, and the forward model
+    tau : (n,) their instants, or None
+    s, interval : (n, m) path lengths of the samples, and the length that each stands for, mm
+    """
+
+    part: Part
+    tau: Tensor | None
+    s: Tensor
+    interval: Tensor
 
 
 class Training:
@@ -106,22 +125,23 @@ class Training:
             if not self.settled and budget.progress >= PIONEERS:
                 self._settle()
                 clock, rays_then = time.perf_counter(), budget.rays_done
-            target, tau, s, interval, rays = self._batch()
-            terms = self._terms(target, tau, s, interval)
+            pieces, whole = self._batch()
+            terms, mine = self._terms(pieces), sum(piece.part.measured.numel() for piece in pieces)
             loss = sum(getattr(settings.weights, name) * term for name, term in terms.items())
             assert isinstance(loss, Tensor)
             rate = self._learning_rate()
             self.optimiser.zero_grad()
             loss.backward()
-            self.ranks.average_gradients(self.field.network, len(target), rays)
+            self.ranks.average_gradients(self.field.network, mine, whole)
             self.optimiser.step({"adam": rate, "muon": rate * settings.matrix_rate})
             budget.step += 1
             outcome = self._outcome()
             if self.device.type == "cuda" and budget.step % LOG_EVERY and outcome is None:
                 continue  # looking at a number waits for the GPU, so look now and then
-            empty = reduce(target.displacement * target.inverse_scale, settings.norm)
+            empty = sum(share * reduce(piece.part.of_nothing, settings.norm) for piece, share in shares(pieces))
+            assert isinstance(empty, Tensor)
             figures = torch.stack([term.detach().float() for term in (*terms.values(), loss, empty)])
-            means = self.ranks.average(figures, len(target), rays).tolist()
+            means = self.ranks.average(figures, mine, whole).tolist()
             values = dict(zip((*terms, "loss"), means, strict=False))
             if not math.isfinite(values["loss"]) or (outcome is not None and not self._finite()):
                 outcome = self._take_back()
@@ -200,39 +220,50 @@ class Training:
         self.watch.noise = self.data.noise
         self._log({"bin_edge": float(edge)})
 
-    def _batch(self) -> tuple[Target, Tensor | None, Tensor, Tensor, int]:
-        """Rays, their instants and samples: this process's share of a step, and how many rays the step has in all."""
+    def _batch(self) -> tuple[list[Piece], int]:
+        """This process's share of a step, and how many measured numbers the step has in all."""
         settings, step = self.settings, self.budget.step
         count = sample_count(self.budget.progress, *settings.samples, settings.sample_jitter, self.generator)
         rays = min(max(self.ranks.size, settings.points_per_batch // count), len(self.data))
-        target, tau = self.data.batch(self._draw(rays))
+        batch = self.data.batch(self._draw(rays))
         if settings.sampling == "adaptive" and step and step % DENSITY_EVERY == 0:
             self._look()
-        s, interval = sample_rays(target.rays, count, self.generator, settings.sampling, self.density)
-        mine = self.ranks.share
-        return target[mine], None if tau is None else tau[mine], s[mine], interval[mine], rays
+        pieces, mine = [], self.ranks.share
+        for part, tau in batch:
+            s, interval = sample_rays(part.rays, count, self.generator, settings.sampling, self.density)
+            pieces.append(Piece(part[mine], None if tau is None else tau[mine], s[mine], interval[mine]))
+        return [p for p in pieces if len(p.part)], sum(part.measured.numel() for part, _ in batch)
 
     def _look(self) -> None:
         """Look at where the field varies."""
         self.density.update(*(self._at(tau) for tau in self.data.instants))
 
-    def _terms(self, target: Target, tau: Tensor | None, s: Tensor, interval: Tensor) -> dict[str, Tensor]:
+    def _terms(self, pieces: list[Piece]) -> dict[str, Tensor]:
+        """The terms of the loss, each the mean over all measured numbers of the pieces."""
         settings = self.settings
         self.network.low = self.budget.progress < settings.full_precision_from
-        terms = loss_terms(
-            self.field, self._at(tau), target, s, interval,
-            settings.weights, settings.model, settings.norm, self.data.n_ambient,
-        )  # fmt: skip
-        terms["gauge"] = self._at_ambient(GAUGE_POINTS, self.generator).square().mean()
+        terms: dict[str, Tensor] = {}
+        for piece, share in shares(pieces):
+            found = loss_terms(
+                self.field, self._at(piece.tau), piece.part, piece.s, piece.interval, settings.weights, settings.norm
+            )
+            for name, term in found.items():
+                terms[name] = terms[name] + share * term if name in terms else share * term
+        ambient = self._at_ambient(GAUGE_POINTS, self.generator)
+        if ambient is not None:
+            terms["gauge"] = ambient.square().mean()
         return terms
 
     def _at(self, tau: Tensor | None) -> Evaluator:
         """The network as a function of space, at the instants given."""
         return self.network if tau is None else AtTimes(self.network, tau)
 
-    def _at_ambient(self, count: int, generator: torch.Generator) -> Tensor:
-        """What the network gives where it should give one constant, in full precision."""
-        points, tau = self.data.ambient_points(count, generator)
+    def _at_ambient(self, count: int, generator: torch.Generator) -> Tensor | None:
+        """What the network gives where it should give 0, in full precision; None where no place is known."""
+        found = self.data.ambient_points(count, generator)
+        if found is None:
+            return None
+        points, tau = found
         return self.field.network(with_time(self.field.normalise(points), tau))
 
     def _learning_rate(self) -> float:
@@ -280,9 +311,9 @@ class Training:
         if empty and (retries > RETRIES or self.budget.exhausted()):
             return Outcome(
                 "collapsed",
-                f"no field was found: after {retries} attempt(s) {min(left, 9.99):.0%} of the squared "
-                "displacement, noise apart, is not explained; try a smaller --learning-rate, and nerif check on the "
-                "measurement",
+                f"no field was found: after {retries} attempt(s) {min(left, 9.99):.0%} of what was "
+                "measured, squared and noise apart, is not explained; try a smaller --learning-rate, and nerif check "
+                "on the measurement",
             )
         if retries > RETRIES:
             return Outcome(
@@ -341,8 +372,9 @@ class Training:
             again = f"; taken back {self.retries} time(s) to the last good state" if self.retries else ""
             outcome = Outcome(outcome.reason, outcome.message + again + self.watch.remark)
         self.field.network.eval().requires_grad_(False)
-        # the constant that the data leave open
-        self.field.offset = float(self._at_ambient(LEVEL_POINTS, torch.Generator().manual_seed(0)).mean())
+        ambient = self._at_ambient(LEVEL_POINTS, torch.Generator().manual_seed(0))
+        if ambient is not None and self.data.open and self.field.network.limits == UNBOUNDED:
+            self.field.offset = float(ambient.mean())  # the constant that the data leave open
         return Reconstruction(
             field=self.field,
             box=self.data.box,
@@ -354,4 +386,12 @@ class Training:
             peak_memory_bytes=peak_memory(self.device),
             device=str(self.device),
             state=state,
+            quantity=self.data.quantity,
         )
+
+
+def shares(pieces: list[Piece]) -> Iterator[tuple[Piece, float]]:
+    """Give each piece with its share of all measured numbers."""
+    total = sum(piece.part.measured.numel() for piece in pieces)
+    for piece in pieces:
+        yield piece, piece.part.measured.numel() / total

@@ -16,11 +16,12 @@ from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 from nerif.measurement import Measurement
 from nerif.reconstruction.bins import coarsest_edge
+from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import fingerprint
-from nerif.reconstruction.gauge import AmbientRegion
+from nerif.reconstruction.gauge import AmbientRegion, is_open
 from nerif.reconstruction.settings import TrainingSettings
-from nerif.reconstruction.target import Target
+from nerif.reconstruction.target import Part, Target
 
 __all__ = ["FrameData", "TrainingData"]
 
@@ -34,10 +35,15 @@ class TrainingData(ABC):
     box : Box, mm
     n_ambient : refractive index that the excess is counted from
     fingerprint : a digest of each part of the data, by its name
+    open : whether the data leave a constant of the field open
+    quantity : what the field is
     """
 
-    def __init__(self, device: torch.device, box: Box, n_ambient: float, fingerprint: dict[str, str]) -> None:
+    def __init__(
+        self, device: torch.device, box: Box, n_ambient: float, fingerprint: dict[str, str], open: bool, quantity: str
+    ) -> None:
         self.device, self.box, self.n_ambient, self.fingerprint = device, box, n_ambient, fingerprint
+        self.open, self.quantity = open, quantity
 
     coarsest: int = 1
     """Edge of the largest bins that the data can be given in, px."""
@@ -53,14 +59,14 @@ class TrainingData(ABC):
         """Rays of all instants."""
 
     @abstractmethod
-    def batch(self, index: Int[Tensor, " b"]) -> tuple[Target, Float[Tensor, " b"] | None]:
-        """Return the rays of those numbers with what they measured, and their instants."""
+    def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
+        """Return the rays of those numbers with what they measured, technique by technique, and their instants."""
 
     @abstractmethod
     def ambient_points(
         self, count: int, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"] | None]:
-        """Draw about `count` points at which the index is ambient, mm, and their instants."""
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"] | None] | None:
+        """Draw about `count` points at which the field is ambient, mm, and their instants; None if none is known."""
 
     @property
     @abstractmethod
@@ -69,7 +75,7 @@ class TrainingData(ABC):
 
     @abstractmethod
     def untrained(self, shape: NetworkShape) -> NeuralField:
-        """Return a field with random weights, drawn from torch's own generator."""
+        """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
 
 
 class FrameData(TrainingData):
@@ -83,29 +89,34 @@ class FrameData(TrainingData):
     """
 
     def __init__(self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None) -> None:
-        known = fingerprint(measurement, settings.open_faces)
-        super().__init__(resolve_device(settings.device), measurement.box, measurement.n_ambient, known)
+        super().__init__(
+            resolve_device(settings.device), measurement.box, measurement.n_ambient,
+            fingerprint(measurement, settings.open_faces), is_open(measurement), measurement.quantity,
+        )  # fmt: skip
         self.settings, self.measurement = settings, measurement
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
-        self.ambient = AmbientRegion.of(measurement, settings.ambient_faces or measurement.ambient_faces)
+        self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
+        self.bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.refine(self.coarsest)
 
     def refine(self, edge: int) -> None:
-        self.target = Target.of(self.measurement, self.settings.open_faces, edge).to(self.device)
-        self.noise = 1 / self.target.chi_square_scale if self.target.chi_square_scale else 0.0
+        settings = self.settings
+        self.target = Target.of(self.measurement, settings.open_faces, edge, settings.model).to(self.device)
+        self.noise = self.target.noise or 0.0
 
     def __len__(self) -> int:
         return len(self.target)
 
-    def batch(self, index: Int[Tensor, " b"]) -> tuple[Target, None]:
-        return self.target[index.to(self.device)], None
+    def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
+        return [(part, None) for part in self.target[index.to(self.device)].parts if len(part)]
 
-    def ambient_points(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], None]:
-        return self.ambient.sample(count, generator).to(self.device), None
+    def ambient_points(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], None] | None:
+        return None if self.ambient is None else (self.ambient.sample(count, generator).to(self.device), None)
 
     @property
     def instants(self) -> list[Float[Tensor, " 1"] | None]:
         return [None]
 
     def untrained(self, shape: NetworkShape) -> NeuralField:
-        return NeuralField(Network(shape).to(self.device), self.box, self.target.index_scale)
+        network = Network(shape, bounds=in_units(self.bounds, self.target.scale)).to(self.device)
+        return NeuralField(network, self.box, self.target.scale)

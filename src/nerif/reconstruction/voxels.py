@@ -19,18 +19,20 @@ from torch import Tensor
 
 from nerif.conventions import InputError, parse_faces
 from nerif.fields.base import Field
-from nerif.fields.grid import DEGREES, Boundary
+from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step
+from nerif.reconstruction.bounds import check_bounds, field_bounds
 from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
 from nerif.reconstruction.fingerprint import check_fingerprint, fingerprint
-from nerif.reconstruction.gauge import check_gauge, visual_hull
-from nerif.reconstruction.operator import MODELS, DeflectionOperator
+from nerif.reconstruction.gauge import ambient_faces, check_gauge, visual_hull
+from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.weight import FIRST, choose_weight
+from nerif.techniques.registry import AUTO, check_model
 
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 
@@ -48,8 +50,8 @@ class VoxelReconstructor(Reconstructor):
     """Voxels along the longest edge of the box, of the reconstruction and of the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
     """Between voxel centres: cubic B-splines, or trilinear (two to three times faster, less accurate)."""
-    model: Literal["lever_arm", "paraxial"] = "lever_arm"
-    """Forward model."""
+    model: str = AUTO
+    """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
     step: float | None = None
     """Longest distance between samples along a ray, in voxels; by default 1 (cubic) or 0.5 (linear)."""
     coarse_to_fine: bool = True
@@ -59,9 +61,9 @@ class VoxelReconstructor(Reconstructor):
     time_limit: float = 0.0
     """Stop after so many seconds; 0 for no limit."""
     lower: float | None = None
-    """Lowest index excess, if known (of hot gas in air: -2.7e-4)."""
+    """Lowest value that the field can have (of the index excess of hot gas: -2.7e-4); else that of the technique."""
     upper: float | None = None
-    """Highest index excess, if known (of hot gas in air: 0)."""
+    """Highest value that the field can have (of the index excess of hot gas in air: 0)."""
     hull: bool = True
     """Pin voxels outside the visual hull to the ambient index, where the measurement has flow masks."""
     ambient_faces: tuple[str, ...] = ()
@@ -76,7 +78,7 @@ class VoxelReconstructor(Reconstructor):
     """Most iterations on each grid and with each weight."""
 
     def __post_init__(self) -> None:
-        for name, allowed in (("basis", tuple(DEGREES)), ("model", MODELS), ("precision", ("float32", "float64"))):
+        for name, allowed in (("basis", tuple(DEGREES)), ("precision", ("float32", "float64"))):
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
         for name in ("voxels", "iterations"):
@@ -87,21 +89,10 @@ class VoxelReconstructor(Reconstructor):
         for name in ("tolerance", "time_limit"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        low, high = self.bounds or (-1.0, 1.0)
-        if not low <= 0 <= high or low == high:
-            raise InputError(
-                "lower, upper: expected bounds of the index excess around 0, the ambient, "
-                f"got {self.lower} to {self.upper}"
-            )
+        check_model(self.model)
+        check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")
-
-    @property
-    def bounds(self) -> tuple[float, float] | None:
-        """Lowest and highest index excess, or None where neither is given."""
-        if self.lower is None and self.upper is None:
-            return None
-        return (-math.inf if self.lower is None else self.lower, math.inf if self.upper is None else self.upper)
 
     @property
     def weight(self) -> float | None:
@@ -121,7 +112,7 @@ class VoxelReconstructor(Reconstructor):
         """Return what a run will need at most, beside what the process holds already."""
         rays, size = int(measurement.usable.sum()), 4 if self.precision == "float32" else 8
         dtype = torch.float32 if size == 4 else torch.float64
-        operator = DeflectionOperator.memory_bytes(rays, grid, self.basis, dtype)
+        operator = VoxelOperator.memory_bytes(rays, grid, self.basis, dtype)
         preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
         around = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
         return operator + VOLUMES * math.prod(grid.shape) * size + DATA * 2 * rays * size + preparing + around
@@ -172,7 +163,7 @@ class _Run:
     ) -> None:
         self.settings, self.measurement, self.on_step, self.field_before = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
-        self.faces = settings.ambient_faces or measurement.ambient_faces
+        self.faces = ambient_faces(measurement, settings.ambient_faces)
         check_gauge(measurement, self.faces, settings.hull)
         self.grids = _grids(measurement, settings)
         needed = settings.memory_bytes(measurement, self.grids[-1], self.device.type)
@@ -186,8 +177,10 @@ class _Run:
         self.free = (
             visual_hull(measurement, self.grids[-1]) if settings.hull and measurement.flow_mask is not None else None
         )
-        self.target = Target.of(measurement, settings.open_faces).to(self.device)
-        self.noise = None if self.target.chi_square_scale is None else 1 / self.target.chi_square_scale
+        bounds = field_bounds(measurement, settings.lower, settings.upper)
+        self.bounds = bounds if math.isfinite(bounds[0]) or math.isfinite(bounds[1]) else None
+        self.target = Target.of(measurement, settings.open_faces, model=settings.model, linear=True).to(self.device)
+        self.noise = self.target.noise
         self.history: list[dict[str, float]] = []
         # a field to start from makes the coarse grids needless
         self.level, self.done, self.total = 0 if start is None else len(self.grids) - 1, 0, 0
@@ -236,25 +229,27 @@ class _Run:
         if self.x is not None and tuple(self.x.shape) == shape:
             return self.x.to(problem.operator.device, problem.operator.dtype)
         if self.x is not None:
-            before = self._operator(self.grids[self.level - 1])
-            field: Field = before.field(self.x * self.target.index_scale)
+            field: Field = self._field(self.grids[self.level - 1])
         elif self.field_before is not None:
             field = self.field_before
         else:
             return problem.zero()
         values = field.sample(problem.operator.grid, self.device).to(problem.operator.device, problem.operator.dtype)
-        return problem.clip(values / self.target.index_scale)
+        return problem.clip(values / self.target.scale)
 
-    def _operator(self, grid: Grid) -> DeflectionOperator:
-        settings = self.settings
-        return DeflectionOperator(
-            self.target.rays, grid, self.measurement.n_ambient, settings.model, settings.basis, Boundary(self.faces),
-            settings.step, self.device, getattr(torch, settings.precision),
-        )  # fmt: skip
+    def _field(self, grid: Grid) -> VoxelField:
+        """The field of the present solution, which is on that grid."""
+        assert self.x is not None
+        return VoxelField.of(self.x * self.target.scale, grid, DEGREES[self.settings.basis], Boundary(self.faces))
 
     def _problem(self, grid: Grid) -> Problem:
-        free = None if self.free is None else _coarser(self.free, grid)
-        return Problem(self._operator(grid), self.target, free, self.settings.bounds)
+        settings, boundary = self.settings, Boundary(self.faces)
+        dtype = getattr(torch, settings.precision)
+        operators = [
+            VoxelOperator(part.rays, grid, part.model, settings.basis, boundary, settings.step, self.device, dtype)
+            for part in self.target.parts
+        ]
+        return Problem(operators, self.target, None if self.free is None else _coarser(self.free, grid), self.bounds)
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -368,9 +363,8 @@ class _Run:
 
     def _result(self, outcome: Outcome) -> Reconstruction:
         assert self.x is not None
-        operator = self._operator(self.grids[self.level])
         return Reconstruction(
-            field=operator.field(self.x * self.target.index_scale).to("cpu"),
+            field=self._field(self.grids[self.level]).to("cpu"),
             box=self.measurement.box,
             n_ambient=self.measurement.n_ambient,
             history=self.history,
@@ -380,18 +374,18 @@ class _Run:
             peak_memory_bytes=peak_memory(self.device),
             device=str(self.device),
             state=self._capture(),
+            quantity=self.measurement.quantity,
         )
 
 
 def _grids(measurement: Measurement, settings: VoxelReconstructor) -> list[Grid]:
     """The grids to solve on, coarse to fine."""
-    finest = Grid.of_resolution(measurement.box, settings.voxels)
-    grids = [finest]
-    while settings.coarse_to_fine and max(grids[0].shape) >= 2 * COARSEST:
-        nz, ny, nx = grids[0].shape
-        grids.insert(0, Grid(finest.box, (max(4, nz // 2), max(4, ny // 2), max(4, nx // 2))))
-        if min(grids[0].shape) <= 4:
-            break
+    least = (DEGREES[settings.basis] + 1) // 2  # what the basis needs along each edge, of a slice too
+    shape = [max(least, n) for n in Grid.of_resolution(measurement.box, settings.voxels).shape]
+    grids = [Grid(measurement.box, (shape[0], shape[1], shape[2]))]
+    while settings.coarse_to_fine and max(shape) >= 2 * COARSEST:
+        shape = [min(n, max(4, n // 2)) for n in shape]
+        grids.insert(0, Grid(measurement.box, (shape[0], shape[1], shape[2])))
     return grids
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from nerif.fields.base import Field
-from nerif.fields.mlp import NeuralField
+from nerif.fields.mlp import UNBOUNDED, NeuralField
 from nerif.reconstruction.losses import Evaluator
 
 __all__ = ["adopt", "fit_network"]
@@ -28,8 +28,10 @@ def adopt(field: NeuralField, start: Field) -> bool:
         return False
     if start.network.shape != field.network.shape or start.box != field.box:
         return False
+    if start.network.limits != UNBOUNDED or field.network.limits != UNBOUNDED:
+        return False  # a change of scale is not one of the last layer alone
     field.network.load_state_dict(start.network.state_dict())
-    ratio = start.index_scale / field.index_scale
+    ratio = start.scale / field.scale
     with torch.no_grad():
         for output in field.network.outputs:
             assert isinstance(output, nn.Linear)  # so that a change of scale goes over
@@ -70,7 +72,7 @@ def fit_network(
         points = (lower + edges * torch.rand(points_per_batch, 3, generator=generator)).to(device)
         with torch.no_grad():
             value, gradient = start.value_and_gradient(points)
-            value, gradient = value / field.index_scale, gradient * (field.half_edge / field.index_scale)
+            value, gradient = value / field.scale, gradient * (field.half_edge / field.scale)
             tiny = torch.finfo(value.dtype).tiny
             value_scale = 1 / value.square().mean().clamp_min(tiny)
             gradient_scale = 1 / gradient.square().sum(-1).mean().clamp_min(tiny)

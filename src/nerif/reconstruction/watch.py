@@ -75,7 +75,7 @@ class Watch:
         """What to say at the end of a run that found less than half."""
         if self.since < LEAST or self.left <= HALF:
             return ""
-        return f"; {self.left:.0%} of the squared displacement, noise apart, is not explained yet"
+        return f"; {self.left:.0%} of what was measured, squared and noise apart, is not explained yet"
 
     def kept(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""

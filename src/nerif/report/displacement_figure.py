@@ -20,7 +20,7 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
     from matplotlib.figure import Figure
 
     step = _step(measurement)
-    usable, d = (x[:, ::step, ::step].numpy() for x in (measurement.usable, measurement.displacement))
+    usable, d = (x[:, ::step, ::step].numpy() for x in (measurement.usable, measurement.displacements))
     d = np.where(usable[..., None], d, np.nan)
     limit = float(np.nanpercentile(np.abs(d), 99.5)) or 1.0
     count = len(measurement.cameras)
@@ -56,7 +56,7 @@ def save_masks(path: Path, measurement: Measurement) -> None:
     assert measurement.flow_mask is not None
     step = _step(measurement)
     usable, components, masks = (
-        x[:, ::step, ::step].numpy() for x in (measurement.usable, measurement.displacement, measurement.flow_mask)
+        x[:, ::step, ::step].numpy() for x in (measurement.usable, measurement.displacements, measurement.flow_mask)
     )
     d = np.where(usable, np.linalg.norm(components, axis=-1), np.nan)
     limit = float(np.nanpercentile(d, 99.5)) or 1.0
@@ -86,4 +86,4 @@ def save_masks(path: Path, measurement: Measurement) -> None:
 
 def _step(measurement: Measurement) -> int:
     """Distance of the pixels that are drawn: more than MOST along an edge would not show."""
-    return max(1, -(-max(measurement.displacement.shape[1:3]) // MOST))
+    return max(1, -(-max(measurement.displacements.shape[1:3]) // MOST))

@@ -125,7 +125,7 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
     measurement = reprojection.measurement
     height_px, width_px = measurement.cameras[i].image_size
     usable = measurement.usable[i, :height_px, :width_px, None].numpy()
-    measured = np.where(usable, measurement.displacement[i, :height_px, :width_px].numpy(), np.nan)
+    measured = np.where(usable, measurement.displacements[i, :height_px, :width_px].numpy(), np.nan)
     predicted = reprojection.predicted[i, :height_px, :width_px].numpy()
     limit = float(np.nanmax(np.abs(measured))) or 1.0
     figure = _page(width, min(1.2, 0.62 * height_px / width_px + 0.08))
@@ -155,7 +155,7 @@ def residuals_over_sigma(reprojection: Reprojection, most: int = 1 << 20) -> np.
         pixels = camera.pixel_grid()[::step, ::step]
         crosses = camera.rays(pixels.reshape(-1, 2)).clip(m.box).crosses.reshape(pixels.shape[:2])
         seen = usable[i, rows, columns] & crosses
-        residual = reprojection.predicted[i, rows, columns] - m.displacement[i, rows, columns]
+        residual = reprojection.predicted[i, rows, columns] - m.displacements[i, rows, columns]
         found.append((residual[seen] / m.sigma[i, rows, columns][seen]).flatten())
     return torch.cat(found).numpy()
 

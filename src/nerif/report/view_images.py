@@ -53,7 +53,7 @@ def colour_table(name: str) -> list[tuple[int, int, int]]:
 
 def lattice_step(measurement: Measurement, most: int) -> int:
     """Return the step, px, of the regular lattice on which a measurement has at most about `most` pixels."""
-    views, height, width, _ = measurement.displacement.shape
+    views, height, width, _ = measurement.displacements.shape
     return max(1, math.ceil(math.sqrt(views * height * width / most)))
 
 
@@ -70,7 +70,7 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
     some = usable[:, ::step, ::step]
     if not bool(some.any()):
         step, some = 1, usable
-    d, predicted = m.displacement[:, ::step, ::step][some], reprojection.predicted[:, ::step, ::step][some]
+    d, predicted = m.displacements[:, ::step, ::step][some], reprojection.predicted[:, ::step, ::step][some]
     limit = float(np.quantile(d.abs().flatten().numpy(), 0.998)) or 1.0
     apart = float(np.quantile((predicted - d).abs().flatten().numpy(), 0.995)) or 1.0
     largest = min(LARGEST, math.isqrt(ALL_PICTURES // (6 * len(m.cameras))))
@@ -79,7 +79,7 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
         height, width = camera.image_size
         shrink = (-(-height // largest), -(-width // largest))
         valid = usable[i, :height, :width, None].numpy()
-        measured = np.where(valid, m.displacement[i, :height, :width].numpy(), np.nan)
+        measured = np.where(valid, m.displacements[i, :height, :width].numpy(), np.nan)
         seen = reprojection.predicted[i, :height, :width].numpy()
         rows = {}
         for c, component in enumerate("uv"):

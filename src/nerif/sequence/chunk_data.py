@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,16 +16,18 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerif.conventions import InputError
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.mlp import UNBOUNDED, NetworkShape
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
+from nerif.reconstruction.bounds import in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import digest
 from nerif.reconstruction.settings import TrainingSettings
-from nerif.reconstruction.target import Target
+from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.training import LEVEL_POINTS
 from nerif.reconstruction.training_data import FrameData, TrainingData
+from nerif.techniques.base import ForwardModel
 
 __all__ = ["ChunkData"]
 
@@ -53,43 +56,47 @@ class ChunkData(TrainingData):
     ) -> None:
         parts = {name: digest(f.fingerprint[name] for f in frames) for name in frames[0].fingerprint}
         parts["settings"] = digest([settings, tau, time_octaves])
-        super().__init__(resolve_device(settings.device), frames[0].box, frames[0].n_ambient, parts)
+        like = frames[0]
+        device = resolve_device(settings.device)
+        super().__init__(device, like.box, like.n_ambient, parts, like.open, like.quantity)
+        self.bounds = like.bounds
         self.tau, self.time_octaves = tau, time_octaves
         self.regions = [frame.ambient for frame in frames]
-        targets, places = [frame.target for frame in frames], _places([f.measurement for f in frames], settings)
-        known, first = np.unique(np.concatenate(places), return_index=True)
-        self.rays = Rays.concatenate([t.rays for t in targets])[torch.from_numpy(first)]
-        self.displacement = torch.full((len(frames), len(known), 2), float("nan"))
-        self.inverse_scale = torch.zeros_like(self.displacement)
-        for i, (target, place) in enumerate(zip(targets, places, strict=True)):
-            row = np.searchsorted(known, place)
-            self.displacement[i, row] = target.displacement
-            # each target is scaled so that its own mean square is 1; together they are weighed by their sigma
-            own = target.chi_square_scale or float(target.displacement.square().mean()) or 1.0
-            self.inverse_scale[i, row] = target.inverse_scale * math.sqrt(own)
-        measured = torch.isfinite(self.displacement)
-        scaled = self.displacement[measured] * self.inverse_scale[measured]
-        mean_square = float(scaled.square().mean()) or 1.0
-        self.inverse_scale /= math.sqrt(mean_square)
-        self.noise = 1 / mean_square if all(t.chi_square_scale for t in targets) else 0.0
-        self.measured = measured.all(-1).reshape(-1).nonzero()[:, 0]  # frame r + ray
-        self.index_scale = float(np.sqrt(np.mean([t.index_scale**2 for t in targets])))
+        targets = [frame.target for frame in frames]
+        squares = [target.chi_square for target in targets]
+        # each target is scaled so that its own mean square is 1; together they are weighed by their sigma
+        mean = math.fsum(c * t.numbers for c, t in zip(squares, targets, strict=True)) / sum(t.numbers for t in targets)
+        weights = [math.sqrt(c / mean) for c in squares]
+        places = _places([f.measurement for f in frames], targets)
+        self.films = [
+            Film.of([t.parts[i] for t in targets], [p[i] for p in places], weights)
+            for i in range(len(targets[0].parts))
+        ]
+        self.noise = 1 / mean if all(t.sigma_known for t in targets) else 0.0
+        self.scale = float(np.sqrt(np.mean([t.scale**2 for t in targets])))
 
     def __len__(self) -> int:
-        return len(self.measured)
+        return sum(len(film) for film in self.films)
 
-    def batch(self, index: Int[Tensor, " b"]) -> tuple[Target, Float[Tensor, " b"]]:
-        place = self.measured[index]
-        frame, ray = place // len(self.rays), place % len(self.rays)
-        target = Target(self.rays[ray], self.displacement[frame, ray], self.inverse_scale[frame, ray], self.index_scale)
-        return target.to(self.device), self.tau[frame].to(self.device)
+    def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
+        found: list[tuple[Part, Float[Tensor, " n"] | None]] = []
+        first = 0
+        for film in self.films:
+            part, frame = film[index[(index >= first) & (index < first + len(film))] - first]
+            if len(part):
+                found.append((part.to(self.device), self.tau[frame].to(self.device)))
+            first += len(film)
+        return found
 
     def ambient_points(
         self, count: int, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]] | None:
         chosen = torch.randint(len(self.regions), (AMBIENT_FRAMES,), generator=generator).tolist()
-        points = [self.regions[i].sample(count // AMBIENT_FRAMES, generator) for i in chosen]
-        tau = torch.cat([self.tau[i].expand(len(p)) for i, p in zip(chosen, points, strict=True)])
+        known = [(i, region) for i in chosen for region in [self.regions[i]] if region is not None]
+        if not known:
+            return None
+        points = [region.sample(count // AMBIENT_FRAMES, generator) for _, region in known]
+        tau = torch.cat([self.tau[i].expand(len(p)) for (i, _), p in zip(known, points, strict=True)])
         return torch.cat(points).to(self.device), tau.to(self.device)
 
     @property
@@ -97,32 +104,72 @@ class ChunkData(TrainingData):
         return [*torch.linspace(-1, 1, INSTANTS, device=self.device)[:, None]]
 
     def untrained(self, shape: NetworkShape) -> SpaceTimeField:
-        network = SpaceTimeNetwork(shape, self.time_octaves).to(self.device)
-        return SpaceTimeField(network, self.box, 0.0, self.index_scale)
+        network = SpaceTimeNetwork(shape, self.time_octaves, in_units(self.bounds, self.scale)).to(self.device)
+        return SpaceTimeField(network, self.box, 0.0, self.scale)
 
     @torch.no_grad()
     def field(self, trained: SpaceTimeField, frame: int) -> SpaceTimeField:
-        """Return the field at the instant of a frame, its ambient level taken off."""
-        field = SpaceTimeField(trained.network, self.box, float(self.tau[frame]), self.index_scale)
-        points = self.regions[frame].sample(LEVEL_POINTS, torch.Generator().manual_seed(0)).to(self.device)
-        field.offset = float((field(points) / self.index_scale).mean())
+        """Return the field at the instant of a frame, its ambient level taken off where the data leave it open."""
+        field = SpaceTimeField(trained.network, self.box, float(self.tau[frame]), self.scale)
+        region = self.regions[frame]
+        if region is not None and self.open and trained.network.limits == UNBOUNDED:
+            points = region.sample(LEVEL_POINTS, torch.Generator().manual_seed(0)).to(self.device)
+            field.offset = float((field(points) / self.scale).mean())
         return field
 
 
-def _places(frames: list[Measurement], settings: TrainingSettings) -> list[np.ndarray]:
-    """A number for each ray of each frame's target: the same pixel of the same view has the same in every frame."""
+@dataclass(frozen=True)
+class Film:
+    """What the rays of one technique measured over the frames; the rays are there once.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    rays : (ray,) Rays
+    measured, inverse_scale : (frame, ray, c) as a Part of a Target has them; 0 where nothing was measured
+    known : (n,) which were measured, frame x rays + ray
+    """
+
+    model: ForwardModel
+    rays: Rays
+    measured: Float[Tensor, "f r c"]
+    inverse_scale: Float[Tensor, "f r c"]
+    known: Int[Tensor, " n"]
+
+    @classmethod
+    def of(cls, parts: Sequence[Part], places: Sequence[np.ndarray], weights: Sequence[float]) -> Film:
+        """Lay the parts of all frames, whose rays have such places, over one another."""
+        union, first = np.unique(np.concatenate(places), return_index=True)
+        rays = Rays.concatenate([part.rays for part in parts])[torch.from_numpy(first)]
+        measured = torch.zeros(len(parts), len(union), parts[0].measured.shape[1])
+        inverse, known = torch.zeros_like(measured), torch.zeros(measured.shape[:2], dtype=torch.bool)
+        for i, (part, place, weight) in enumerate(zip(parts, places, weights, strict=True)):
+            row = torch.from_numpy(np.searchsorted(union, place))
+            measured[i, row], inverse[i, row], known[i, row] = part.measured, part.inverse_scale * weight, True
+        return cls(parts[0].model, rays, measured, inverse, known.reshape(-1).nonzero()[:, 0])
+
+    def __len__(self) -> int:
+        return len(self.known)
+
+    def __getitem__(self, index: Int[Tensor, " b"]) -> tuple[Part, Int[Tensor, " b"]]:
+        """Return the rays of those numbers, and their frames."""
+        place = self.known[index]
+        frame, ray = place // len(self.rays), place % len(self.rays)
+        return Part(self.model, self.rays[ray], self.measured[frame, ray], self.inverse_scale[frame, ray]), frame
+
+
+def _places(frames: list[Measurement], targets: list[Target]) -> list[list[np.ndarray]]:
+    """A number for each ray of each part of a target: the same pixel of the same view has the same in every frame."""
     whole = max(frames, key=lambda m: len(m.cameras))
     if any(name not in whole.names for frame in frames for name in frame.names):
         raise InputError("joint: expected a frame in which all views measured, got none; hold the lost ones out")
-    height, width = whole.displacement.shape[1:3]
-    places = []
-    for frame in frames:
-        usable, numbers = frame.usable, []
-        for i, camera in enumerate(frame.cameras):
-            mask = usable[i, : camera.image_size[0], : camera.image_size[1]]
-            rows, columns = mask.nonzero(as_tuple=True)
-            crosses = camera.rays(camera.pixel_grid()[mask]).clip(frame.box).crosses
-            numbers.append(((whole.names.index(camera.name) * height + rows) * width + columns)[crosses])
-        rays, _, _ = frame.rays()
-        places.append(torch.cat(numbers)[~rays.exit_faces(frame.box, settings.open_faces)].numpy())
-    return places
+    _, height, width = whole.shape
+    found = []
+    for frame, target in zip(frames, targets, strict=True):
+        number = torch.tensor([whole.names.index(name) for name in frame.names])
+        numbers = []
+        for part in target.parts:
+            column, row = part.rays.pixel.round().long().unbind(-1)
+            numbers.append(((number[part.rays.view.long()] * height + row) * width + column).numpy())
+        found.append(numbers)
+    return found

@@ -14,7 +14,6 @@ import time
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
@@ -23,13 +22,14 @@ from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.metrics import correlation
-from nerif.physics.deflection import Deflection, project
+from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.quantities import derive
 from nerif.reconstruction.base import OnStep, Step
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
-from nerif.volume import Volume
+from nerif.techniques.registry import forward_model
+from nerif.volume import Volume, describe
 
 __all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame", "reconstruct_frames"]
 
@@ -109,8 +109,9 @@ def _frame(
 def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return what is written of a field: its volumes, and how it compares with what was measured."""
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
-    excess = Volume(field.sample(grid, device), grid, attributes={"n_ambient": measurement.n_ambient})
-    volumes = [derive(excess, quantity, plan.settings.gas) for quantity in plan.settings.quantities]
+    quantity, attributes = measurement.quantity, {"n_ambient": measurement.n_ambient}
+    found = Volume(field.sample(grid, device), grid, quantity, describe(quantity)[0], {**attributes})
+    volumes = [derive(found, wanted, plan.settings.gas) for wanted in plan.settings.quantities]
     cc, rms = _against_measured(plan.cold.model, field, measurement, device)
     return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)
 
@@ -118,19 +119,18 @@ def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurem
 def _against_measured(
     model: str, field: Field, measurement: Measurement, device: str
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Correlation and rms difference (px) in every view, held-out ones included, over some of its pixels."""
-    forward = Deflection(model, SAMPLES, measurement.n_ambient)
-    usable, cc, rms = measurement.usable, {}, {}
-    for i, camera in enumerate(measurement.cameras):
-        height, width = camera.image_size
-        mask = usable[i, :height, :width]
-        rays = camera.rays(camera.pixel_grid()[mask]).clip(measurement.box)
-        seen = rays.crosses.nonzero()[:, 0]
-        if not len(seen):
+    """Correlation and rms difference in every view, held-out ones included, over some of its pixels."""
+    cc, rms = {}, {}
+    observation = measurement.observations[0]
+    projector = PathIntegral(forward_model(observation.technique, measurement, model), SAMPLES)
+    rays, measured, _ = measurement.rays(observation)
+    for i, name in enumerate(measurement.names):
+        own = (rays.view == i).nonzero()[:, 0]
+        if not len(own):
             continue
-        seen = seen[:: max(1, len(seen) // PIXELS)]
-        measured = measurement.displacement[i][usable[i]][seen].numpy()
-        predicted = project(forward, field, rays[seen].to(dtype=torch.float32), device).numpy()
-        cc[camera.name] = correlation(measured, predicted)
-        rms[camera.name] = float(np.sqrt(np.mean((measured - predicted) ** 2)))
+        own = own[:: max(1, len(own) // PIXELS)]
+        predicted = project(projector, field, rays[own], device).numpy()
+        seen = measured[own].numpy()
+        cc[name] = correlation(seen, predicted)
+        rms[name] = float(np.sqrt(np.mean((seen - predicted) ** 2)))
     return cc, rms

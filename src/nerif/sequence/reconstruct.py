@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ from pathlib import Path
 from nerif.conventions import InputError
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.cluster import check_workers, open_cluster
 from nerif.sequence.plan import SequencePlan, SequenceSettings
@@ -94,7 +96,9 @@ def reconstruct_sequence(
 
 def _store(plan: SequencePlan, sequence: MeasurementSequence, force: bool) -> SequenceStore:
     """The store that is there if it was begun with the same settings, else a new one."""
-    kept = {"frames": len(sequence), **plan.kept}
+    bounds = field_bounds(sequence.first_good(), plan.cold.lower, plan.cold.upper)
+    limits = [bound if math.isfinite(bound) else None for bound in bounds]  # JSON knows no infinity
+    kept = {"frames": len(sequence), "bounds": limits, **plan.kept}
     if plan.out.exists() and not force:
         store = SequenceStore(plan.out)
         store.check_same(kept)

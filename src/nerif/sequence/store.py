@@ -25,6 +25,7 @@ from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence, add_frames
 from nerif.netcdf import reading
+from nerif.reconstruction.bounds import in_units
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
 
@@ -107,7 +108,7 @@ class SequenceStore(VolumeSequence):
             add_frames(group, "cc", frames, *seen, units="1", long_name="correlation with what the view measured")
             add_frames(group, "rms_px", frames, *seen, units="px", long_name="rms difference to what the view measured")
             add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
-            add("index_scale", "float64", nan, "index excess of one unit of network output")
+            add("index_scale", "float64", nan, "field of one unit of network output")
             add("offset", "float64", nan, "network output that counts as ambient")
             add("seconds", "float64", nan, "spent on the frame, s")  # as units they would be read as a time span
             add("steps", "int32", 0, "steps of training")
@@ -139,8 +140,8 @@ class SequenceStore(VolumeSequence):
         self.write(index, frame.volumes)
         weights = [p.detach().cpu().float().reshape(-1) for p in frame.field.network.parameters()]
         self.array("weights")[index] = torch.cat(weights).numpy()
-        for name in ("index_scale", "offset"):
-            self.array(name)[index] = getattr(frame.field, name)
+        self.array("index_scale")[index] = frame.field.scale
+        self.array("offset")[index] = frame.field.offset
         for name in ("cc", "rms_px"):
             found = getattr(frame, name)
             self.array(name)[index] = np.array([found.get(view, np.nan) for view in self.attributes["views"]])
@@ -167,7 +168,7 @@ class SequenceStore(VolumeSequence):
         if int(self.read("status", index)) != DONE:
             raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
         with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
-            network = _network(self.attributes)
+            network = _network(self.attributes, float(self.read("index_scale", index)))
             length = int(self.attributes["chunk"]) if isinstance(network, SpaceTimeNetwork) else 1
         weights, at = torch.from_numpy(self.read("weights", index)), 0
         scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
@@ -212,12 +213,14 @@ def _checkpoints(path: Path) -> Path:
     return path.with_name(path.name + ".joint")
 
 
-def _network(attributes: dict[str, Any]) -> Network:
-    """An empty network of the kind that a store was made with."""
+def _network(attributes: dict[str, Any], scale: float = 1.0) -> Network:
+    """An empty network of the kind that a store was made with, for a field in units of `scale`."""
     shape = NetworkShape(**attributes["network"])
+    low, high = attributes.get("bounds", (None, None))  # JSON knows no infinity
+    bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
     if attributes.get("temporal") == "joint":
-        return SpaceTimeNetwork(shape, int(attributes["time_octaves"]))
-    return Network(shape)
+        return SpaceTimeNetwork(shape, int(attributes["time_octaves"]), bounds)
+    return Network(shape, bounds=bounds)
 
 
 def chunk_tau(times: Sequence[float], index: int, first: int, last: int) -> float:

@@ -1,0 +1,62 @@
+"""What a Measurement tells of itself: the rows of its summary, and what a notebook shows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from nerif.notebook import PIXELS, number, panel, show_views
+from nerif.observation import Observation
+
+if TYPE_CHECKING:
+    from nerif.measurement import Measurement
+
+__all__ = ["as_html", "summary"]
+
+
+def summary(measurement: Measurement, held_out: int = 0) -> list[tuple[str, str]]:
+    """Return what was measured as names and values with units; `held_out` of the views were not used."""
+    cameras = measurement.cameras
+    sizes = sorted({c.image_size for c in cameras})
+    inside = sum(height * width for height, width in (c.image_size for c in cameras))
+    held = f", of which {held_out} held out" if held_out else ""
+    light = f" at {measurement.wavelength_nm:g} nm" if measurement.wavelength_nm else ""
+    return [
+        ("Views", f"{len(cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
+        *(row for observation in measurement.observations for row in _sizes(measurement, observation)),
+        ("Usable pixels", f"{max(int(measurement.usable.sum()), 1) / inside:.1%}"),
+        ("Volume", " × ".join(f"{e:g}" for e in measurement.box.edges) + " mm (x, y, z)"),
+        ("Ambient index", f"{measurement.n_ambient:.7g}{light}"),
+    ]
+
+
+def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str, str]]:
+    """How large values and noise of a technique are."""
+    kind, usable = observation.technique, measurement.usable_for(observation)
+    squares, noise, largest = 0.0, 0.0, 0.0
+    for i, mask in enumerate(usable):  # view by view: pictures may be large
+        values = observation.values[i][mask].double()
+        if len(values):
+            squares, largest = squares + float(values.square().sum()), max(largest, float(values.abs().max()))
+        if observation.sigma is not None:
+            noise += float(observation.sigma[i][mask].double().square().sum())
+    count = max(int(usable.sum()), 1) * len(kind.channels)
+    rms, sigma = (number((total / count) ** 0.5, 3) for total in (squares, noise))
+    unit = "" if kind.unit == "1" else f" {kind.unit}"
+    return [
+        (kind.measured.capitalize(), f"rms {rms}{unit}, up to {number(largest, 3)}{unit}"),
+        ("Noise σ", "not known" if observation.sigma is None else f"rms {sigma}{unit}"),
+    ]
+
+
+def as_html(measurement: Measurement) -> str:
+    """Return what a notebook shows: the maps of the views, and the summary."""
+    observation, maps = measurement.observations[0], []
+    usable = measurement.usable_for(observation)
+    for i, (height, width) in enumerate(c.image_size for c in measurement.cameras):
+        step = -(-max(height, width) // PIXELS)
+        part = i, slice(0, height, step), slice(0, width, step)
+        maps.append(torch.where(usable[part][..., None], observation.values[part], torch.nan).numpy())
+    picture = show_views(measurement.names, maps)
+    return panel("Measurement", measurement.summary(), picture, observation.caption)

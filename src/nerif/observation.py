@@ -1,0 +1,95 @@
+"""What cameras saw by one technique, and whether it can be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.techniques.base import ForwardModel
+from nerif.techniques.registry import TECHNIQUES, forward_model
+
+if TYPE_CHECKING:
+    from nerif.measurement import Measurement
+
+__all__ = ["Observation", "check_observations"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the cameras saw by one technique.
+
+    Parameters
+    ----------
+    technique : what a pixel measures
+    values : (view, row, column, c) in the technique's unit; NaN where not measured
+    sigma : (view, row, column, c) standard deviation of the noise, or None
+    """
+
+    technique: type[ForwardModel]
+    values: Float[Tensor, "view row column c"]
+    sigma: Float[Tensor, "view row column c"] | None = None
+
+    @property
+    def caption(self) -> str:
+        """What pictures of the views show."""
+        kind = self.technique
+        names = " and ".join(name for name in kind.channels if name)
+        unit = "" if kind.unit == "1" else f", in {kind.unit}"
+        return f"{kind.measured.capitalize()} {names}".rstrip() + f" of each view{unit}"
+
+    def measured(self, view: int) -> Bool[Tensor, "row column"]:
+        """Which pixels of a view have a value and, where it is known, a sigma within the limits of the technique."""
+        least, most = self.technique.limits
+        mask = (self.values[view].abs() <= most).all(dim=-1)  # NaN compares false
+        if self.sigma is not None:
+            mask &= ((self.sigma[view] >= least) & (self.sigma[view] <= most)).all(dim=-1)
+        return mask
+
+
+def check_observations(measurement: Measurement) -> None:
+    """Refuse what a technique cannot have measured, techniques that do not go together, and maps of none.
+
+    Raises
+    ------
+    InputError
+        Saying what is wrong, and what to do.
+    """
+    observations = measurement.observations
+    known = {name for kind in TECHNIQUES.values() for name in (kind.measured, kind.sigma)}
+    for name in measurement.maps:
+        if name not in known:
+            raise InputError(f"maps: expected names out of {', '.join(sorted(known))}, got '{name}'")
+    names = " and ".join(o.technique.name for o in observations)
+    if len({o.technique.quantity for o in observations}) > 1:
+        raise InputError(f"technique: expected techniques of one field, got {names}; split them into two measurements")
+    if len(observations) > 1 and any(o.sigma is None for o in observations):
+        wanted = " and ".join(o.technique.sigma for o in observations)
+        raise InputError(f"technique: {names} together are weighed by their noise: expected {wanted}, got not both")
+    _check_backgrounds(measurement, names)
+    for o in observations:
+        forward_model(o.technique, measurement)  # refuses what it lacks
+        for i, (name, usable) in enumerate(zip(measurement.names, measurement.usable_for(o), strict=True)):
+            try:
+                o.technique.check(o.values[i], None if o.sigma is None else o.sigma[i], usable)
+            except InputError as error:
+                raise InputError(f"view '{name}': {error}") from None
+
+
+def _check_backgrounds(measurement: Measurement, names: str) -> None:
+    needed = any(o.technique.background for o in measurement.observations)
+    for i, camera in enumerate(measurement.cameras):
+        if camera.background is not None and not needed:
+            raise InputError(
+                f"background of view '{camera.name}': expected none for {names}, got one; leave out "
+                "background_normal and background_offset"
+            )
+        for o in measurement.observations:
+            if o.technique.background and camera.background is None and bool(o.measured(i).any()):
+                raise InputError(
+                    f"background of view '{camera.name}': expected a plane for {o.technique.name}, got none; give "
+                    "background_normal and background_offset, or say which technique it is"
+                )

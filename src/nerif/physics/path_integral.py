@@ -1,0 +1,76 @@
+"""What the pixels see of a field: the path integral of a forward model (techniques/) along each ray."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.fields.base import Field
+from nerif.geometry import Rays
+from nerif.techniques.base import ForwardModel, midpoints
+
+__all__ = ["PathIntegral", "Projector", "project"]
+
+
+class Projector(ABC):
+    """From a field and rays to what the pixels see."""
+
+    channels: int
+    """Numbers that a pixel measures."""
+
+    @abstractmethod
+    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]:
+        """Return what the pixels of rays that are clipped to the box see."""
+
+
+@dataclass(frozen=True)
+class PathIntegral(Projector):
+    """The integral of a forward model by midpoints of equal intervals.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    samples : number of samples along a ray
+    """
+
+    model: ForwardModel
+    samples: int = 200
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise InputError(f"samples: expected at least one sample along a ray, got {self.samples}")
+
+    @property
+    def channels(self) -> int:  # type: ignore[override]
+        return len(self.model.channels)
+
+    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]:
+        model = self.model
+        s, step = midpoints(rays, self.samples)
+        points, weights = rays.at(s), model.weights(rays, s, step)
+        if weights.slope is None:
+            return weights(field(points), None)
+        if model.straight:
+            return weights(*field.value_and_gradient(points))
+        offset, tilt = model.bend(*field.value_and_gradient(points), rays, s, step)
+        value, gradient = field.value_and_gradient(points + offset)
+        return weights(value, gradient - tilt)
+
+
+@torch.no_grad()
+def project(
+    projector: Projector, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int | None = None
+) -> Float[Tensor, "n c"]:
+    """Return what many rays see of a field, chunk by chunk; 0 where a ray misses the box."""
+    if chunk is None:  # arrays that stay in the cache of a CPU, and fill a GPU
+        chunk = 32 if torch.device(device).type == "cpu" else 4096
+    result = torch.zeros(len(rays), projector.channels, dtype=rays.origin.dtype)
+    index, field = rays.crosses.nonzero()[:, 0], field.to(device)
+    for part in torch.split(index, chunk):
+        result[part] = projector(field, rays[part].to(device)).to(result)
+    return result

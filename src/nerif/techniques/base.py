@@ -1,0 +1,191 @@
+"""The forward model: what the pixels see of a field along their rays. One file beside this one is one technique.
+
+A linear model says what each sample x_m of a ray counts for, in each of its channels:
+
+    prediction = sum_m a_m f(x_m) + b_m . grad f(x_m),      a_m = w_m A,   b_m = w_m B
+
+w is the profile along the ray, A and B belong to the ray. The loss of the network, the voxel operator and its adjoint,
+re-projection, the check of views and simulation take these weights from here and from nowhere else. A model that is not
+linear moves the samples first (`bend`), or makes of the integral what the pixel reads (`read`).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.geometry import Camera, Rays
+
+__all__ = ["ForwardModel", "Light", "Weights", "midpoints"]
+
+
+class Light(Protocol):
+    """What a forward model has to know of a measurement."""
+
+    @property
+    def n_ambient(self) -> float:
+        """Refractive index around the flow."""
+
+    @property
+    def wavelength_nm(self) -> float | None:
+        """Wavelength of the light, nm."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What the samples of rays count for: a_m = profile_m value, b_m = profile_m slope.
+
+    Parameters
+    ----------
+    profile : (n, m) along each ray; holds the length that a sample stands for
+    value : (n, c) of f, or None for 0
+    slope : (n, c, 3) of grad f, or None for 0
+    """
+
+    profile: Float[Tensor, "n m"]
+    value: Float[Tensor, "n c"] | None = None
+    slope: Float[Tensor, "n c 3"] | None = None
+
+    def __call__(self, value: Tensor | None, gradient: Tensor | None) -> Float[Tensor, "n c"]:
+        """Return the prediction from f (n, m) and grad f (n, m, 3) at the samples; what does not count may be None."""
+        total: Tensor | None = None
+        if self.slope is not None:
+            assert gradient is not None
+            total = torch.einsum("nm,nij,nmj->ni", self.profile, self.slope, gradient)
+        if self.value is not None:
+            assert value is not None
+            part = (self.profile * value).sum(dim=1, keepdim=True) * self.value
+            total = part if total is None else total + part
+        assert total is not None, "a model sees the field or its gradient"
+        return total
+
+    def in_units(self, value: float, gradient: float) -> Weights:
+        """Return the weights of a field and a gradient given in such units."""
+        return Weights(
+            self.profile,
+            None if self.value is None else self.value * value,
+            None if self.slope is None else self.slope * gradient,
+        )
+
+    def sizes(self, length: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """Return the prediction, rms over channels, of a field of 1 whose gradient is 1 over a length (mm)."""
+        along = self.profile.abs().sum(dim=1)
+        size = torch.zeros_like(along)
+        if self.value is not None:
+            size = size + along * self.value.square().mean(dim=1).sqrt()
+        if self.slope is not None:
+            size = size + along * self.slope.square().sum(dim=2).mean(dim=1).sqrt() / length
+        return size
+
+
+class ForwardModel(ABC):
+    """A technique: what is reconstructed, what a pixel measures of it, and how the one gives the other."""
+
+    name: ClassVar[str]
+    """Of the technique, as attribute `technique` of a measurement file has it."""
+    measured: ClassVar[str]
+    """What a pixel measures: the variable of the file."""
+    sigma: ClassVar[str]
+    """The variable with its standard deviation."""
+    channels: ClassVar[tuple[str, ...]]
+    """Names of the components of what a pixel measures."""
+    unit: ClassVar[str]
+    """Of what a pixel measures."""
+    limits: ClassVar[tuple[float, float]]
+    """Least sigma, and largest value and sigma, that can have been measured."""
+    quantity: ClassVar[str]
+    """The field that is reconstructed (volume.QUANTITIES)."""
+    gauge: ClassVar[bool] = False
+    """Whether the measurement leaves a constant of the field open."""
+    background: ClassVar[bool] = False
+    """Whether the cameras have to look at a background."""
+    bounds: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
+    """Lowest and highest value that the field can have, in its unit."""
+    straight: ClassVar[bool] = True
+    """Whether samples stand on the straight ray."""
+    linear: ClassVar[bool] = True
+    """Whether the weights say all: neither `bend` nor `read` changes anything."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, light: Light, model: str) -> ForwardModel:
+        """Return the model of the technique in a light; `model` names one of several where there are such."""
+
+    @abstractmethod
+    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+        """Return what samples at path lengths s (mm) count for, each of which stands for a length (mm)."""
+
+    @property
+    def linear_twin(self) -> ForwardModel:
+        """The linear model of the same integral: itself, if it is linear."""
+        assert self.linear, f"{type(self).__name__} has to name its linear twin"
+        return self
+
+    @classmethod
+    def seen_by(cls, camera: Camera) -> Camera:
+        """Return the camera, without its background if the technique looks at none."""
+        return camera if cls.background or camera.background is None else replace(camera, background=None)
+
+    def bend(
+        self,
+        value: Float[Tensor, "n m"],
+        gradient: Float[Tensor, "n m 3"],
+        rays: Rays,
+        s: Float[Tensor, "n m"],
+        step: Float[Tensor, "n m"],
+    ) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"]]:
+        """Return by how much (mm) samples leave the straight ray, and what is to be taken off the gradient there.
+
+        Asked only of a model that is not `straight`, and given the field and its gradient on the straight ray.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has straight rays")
+
+    @classmethod
+    def check(
+        cls,
+        values: Float[Tensor, "row column c"],
+        sigma: Float[Tensor, "row column c"] | None,
+        usable: Bool[Tensor, "row column"],
+    ) -> None:
+        """Refuse the map of a view that cannot be what the technique measures.
+
+        Raises
+        ------
+        InputError
+            Saying what is wrong, and what to do.
+        """
+        return
+
+    def reading(
+        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None
+    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
+        """Return what was measured, and its sigma, as `read` has it."""
+        return values, sigma
+
+    def read(self, prediction: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        """Return what the pixel reads of the integral: the integral itself."""
+        return prediction
+
+    def index_offset(self, n_ambient: float) -> float:
+        """Return the constant that L2 of a truth is measured from, beside its variation: 0 but for an index."""
+        return 0.0
+
+    def field_scale(self, rays: Rays, measured: Float[Tensor, "n c"]) -> float:
+        """Return the size of field that makes measurements of the size given; 0 where all of them are 0."""
+        length = rays.far - rays.near
+        middle = 0.5 * (rays.near + rays.far)
+        sizes = self.weights(rays, middle[:, None], length[:, None]).sizes(length)
+        return float((measured / sizes[:, None]).square().mean().sqrt())
+
+
+def midpoints(rays: Rays, samples: int) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+    """Return the midpoints of `samples` equal intervals between near and far, and their length, both mm."""
+    step = ((rays.far - rays.near) / samples)[:, None].expand(-1, samples)
+    index = torch.arange(samples, dtype=rays.near.dtype, device=rays.near.device) + 0.5
+    return rays.near[:, None] + index * step, step

@@ -1,0 +1,112 @@
+"""Deflection: background-oriented schlieren. The pattern behind the flow seems displaced, by d px.
+
+    d = integral (s_b - s) S grad(n) / n_ambient ds      lever_arm (default)
+    d = (s_b - s_mid) integral S grad(n) / n_ambient ds  paraxial: one lever arm for the whole ray (paper, Eq. (3))
+    d = integral (s_b - s) S [grad(n)(x + delta) - theta dn/ds] / n ds
+                                                         curved: the ray bent by delta and theta, to second order
+
+In a gas n is within 3e-4 of n_ambient. Rays are traced through, to every order, in physics/ray_tracing.py.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.geometry import Rays
+from nerif.techniques.base import ForwardModel, Light, Weights
+
+__all__ = ["Curved", "Deflection", "LeverArm", "Paraxial"]
+
+
+@dataclass(frozen=True)
+class Deflection(ForwardModel):
+    """Displacement of a background by refraction.
+
+    Parameters
+    ----------
+    n_ambient : refractive index the excess is counted from
+
+    Source: the forward model in docs/conventions.md; paper, Eqs. (1) and (3).
+    """
+
+    name = "deflection"
+    measured, sigma = "displacement", "sigma"
+    channels = ("u", "v")
+    unit = "px"
+    limits = (1e-6, 1e5)
+    quantity = "index_excess"
+    gauge = True
+    background = True
+
+    n_ambient: float = 1.0
+
+    @classmethod
+    def of(cls, light: Light, model: str) -> ForwardModel:
+        return MODELS[model](light.n_ambient)
+
+    @abstractmethod
+    def lever(self, rays: Rays, s: Float[Tensor, "n m"]) -> Float[Tensor, "n m"]:
+        """Return the distance (mm) over which a deflection at path length s moves the background point."""
+
+    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+        return Weights(self.lever(rays, s) * step, slope=rays.ends.sensitivity / self.n_ambient)
+
+    def index_offset(self, n_ambient: float) -> float:
+        return n_ambient - 1
+
+
+@dataclass(frozen=True)
+class LeverArm(Deflection):
+    """Each sample by its own lever arm: exact to first order in the deflection."""
+
+    def lever(self, rays: Rays, s: Float[Tensor, "n m"]) -> Float[Tensor, "n m"]:
+        return rays.ends.distance[:, None] - s
+
+
+@dataclass(frozen=True)
+class Paraxial(Deflection):
+    """One lever arm for the whole ray (paper, Eq. (3))."""
+
+    def lever(self, rays: Rays, s: Float[Tensor, "n m"]) -> Float[Tensor, "n m"]:
+        return (rays.ends.distance - 0.5 * (rays.near + rays.far))[:, None].expand_as(s)
+
+
+@dataclass(frozen=True)
+class Curved(LeverArm):
+    """Each sample where the ray as the field bends it passes, right to second order in the deflection."""
+
+    straight = False
+    linear = False
+
+    @property
+    def linear_twin(self) -> ForwardModel:
+        return LeverArm(self.n_ambient)
+
+    def bend(
+        self,
+        value: Float[Tensor, "n m"],
+        gradient: Float[Tensor, "n m 3"],
+        rays: Rays,
+        s: Float[Tensor, "n m"],
+        step: Float[Tensor, "n m"],
+    ) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"]]:
+        """Return delta (mm) and theta dn/ds + grad(n) (n - n_ambient) / n_ambient (1/mm).
+
+        theta(s) = integral_near^s grad_perp(n) / n ds',   delta(s) = integral_near^s (s - s') grad_perp(n) / n ds'
+        """
+        along = torch.einsum("nmi,ni->nm", gradient, rays.direction)
+        turn = (gradient - along[..., None] * rays.direction[:, None]) * (step / self.n_ambient)[..., None]
+        before = turn.cumsum(1) - turn  # of the intervals before the sample's own, of which half lies behind it
+        offset = s[..., None] * before - ((s[..., None] * turn).cumsum(1) - s[..., None] * turn)
+        angle = before + turn / 2
+        slower = gradient * (value / self.n_ambient)[..., None]  # 1 / n where the weights have 1 / n_ambient
+        return offset + turn * (step / 8)[..., None], angle * along[..., None] + slower
+
+
+MODELS: dict[str, type[Deflection]] = {"lever_arm": LeverArm, "paraxial": Paraxial, "curved": Curved}
+"""The models of deflection by the names that settings have for them."""

@@ -1,0 +1,59 @@
+"""Emission: light that a medium gives off, such as chemiluminescence, radiance per length e.
+
+    L = integral e ds,       optically thin: the medium does not absorb its own light
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.techniques.base import ForwardModel, Light
+from nerif.techniques.line_integral import LineIntegral
+
+__all__ = ["Emission"]
+
+NEGATIVE = 0.05  # of the largest radiance, below which a pixel is not 0 by noise
+IMPOSSIBLE = 5.0  # standard deviations, likewise
+TOLERATED = 0.01  # share of such pixels
+
+
+@dataclass(frozen=True)
+class Emission(LineIntegral):
+    """Radiance, the integral of what is given off along the ray."""
+
+    name = "emission"
+    measured, sigma = "radiance", "radiance_sigma"
+    quantity = "emission"
+    bounds = (0.0, math.inf)
+
+    @classmethod
+    def of(cls, light: Light, model: str) -> ForwardModel:
+        return cls()
+
+    @property
+    def weight(self) -> float:
+        return 1.0
+
+    @classmethod
+    def check(
+        cls,
+        values: Float[Tensor, "row column c"],
+        sigma: Float[Tensor, "row column c"] | None,
+        usable: Bool[Tensor, "row column"],
+    ) -> None:
+        if not bool(usable.any()):
+            return
+        seen = values[usable]
+        noise = torch.zeros_like(seen) if sigma is None else IMPOSSIBLE * sigma[usable]
+        share = float((seen < -NEGATIVE * seen.abs().max() - noise).float().mean())
+        if share > TOLERATED:
+            raise InputError(
+                f"radiance: expected 0 or more, got less at {share:.0%} of the pixels; "
+                "is the dark picture that was subtracted the right one?"
+            )

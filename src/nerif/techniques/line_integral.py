@@ -1,0 +1,34 @@
+"""What absorption, emission and interferometry have in common: the integral of the field along the straight ray.
+
+    y = weight integral f ds
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.geometry import Rays
+from nerif.techniques.base import ForwardModel, Weights
+
+__all__ = ["LineIntegral"]
+
+
+@dataclass(frozen=True)
+class LineIntegral(ForwardModel):
+    """The integral of the field along the straight ray, one channel."""
+
+    channels = ("",)
+    unit = "1"
+    limits = (1e-12, 1e12)
+
+    @property
+    @abstractmethod
+    def weight(self) -> float:
+        """What a millimetre of a field of 1 counts for."""
+
+    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+        return Weights(step, value=step.new_full((len(rays), 1), self.weight))

@@ -1,0 +1,88 @@
+"""The techniques, and the models that settings choose from by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from nerif.conventions import InputError
+from nerif.techniques import absorption, deflection
+from nerif.techniques.absorption import Absorption
+from nerif.techniques.base import ForwardModel, Light
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.emission import Emission
+from nerif.techniques.interferometry import Interferometry
+
+__all__ = [
+    "AUTO", "MODELS", "TECHNIQUES", "check_model", "forward_model", "forward_models", "technique",
+    "technique_of",
+]  # fmt: skip
+
+TECHNIQUES: dict[str, type[ForwardModel]] = {c.name: c for c in (Deflection, Absorption, Emission, Interferometry)}
+"""By the name that files have for them; a technique of your own is one entry more."""
+
+AUTO = "auto"
+MODELS: dict[str, tuple[str, ...]] = {
+    Deflection.name: tuple(deflection.MODELS),
+    Absorption.name: tuple(absorption.MODELS),
+}
+"""Names of the models of those techniques that have several, the default first."""
+
+
+def technique(name: str) -> type[ForwardModel]:
+    """Return a technique by its name.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    if name not in TECHNIQUES:
+        raise InputError(f"technique: expected one of {', '.join(TECHNIQUES)}, got '{name}'")
+    return TECHNIQUES[name]
+
+
+def technique_of(quantity: str) -> type[ForwardModel]:
+    """Return the first technique that sees a field of that quantity."""
+    return next(kind for kind in TECHNIQUES.values() if kind.quantity == quantity)
+
+
+def check_model(model: str) -> None:
+    """Refuse a name that no technique has a model of."""
+    known = (AUTO, *(name for names in MODELS.values() for name in names))
+    if model not in known:
+        raise InputError(f"model: expected one of {', '.join(known)}, got '{model}'")
+
+
+def forward_model(kind: type[ForwardModel], light: Light, model: str = AUTO) -> ForwardModel:
+    """Return the model of one technique; its own default where the name is auto or another technique's."""
+    names = MODELS.get(kind.name, (AUTO,))
+    return kind.of(light, model if model in names else names[0])
+
+
+def forward_models(
+    kinds: Sequence[type[ForwardModel]], light: Light, model: str = AUTO, linear: bool = False
+) -> tuple[ForwardModel, ...]:
+    """Return the model of each technique of a measurement.
+
+    Parameters
+    ----------
+    kinds : techniques
+    light : the measurement
+    model : auto, or the name of a model of one of the techniques
+    linear : whether only linear models serve
+
+    Raises
+    ------
+    InputError
+        If the name is of none of them, or the model is not linear where it has to be.
+    """
+    check_model(model)
+    offered = [name for kind in kinds for name in MODELS.get(kind.name, ())]
+    if model != AUTO and model not in offered:
+        names = " and ".join(kind.name for kind in kinds)
+        raise InputError(f"model: expected one of {', '.join((AUTO, *offered))} for {names}, got '{model}'")
+    models = tuple(forward_model(kind, light, model) for kind in kinds)
+    for found in models:
+        if linear and not found.linear:
+            raise InputError(f"model: expected a linear one, got '{model}', which only --method nerif can fit")
+    return models
