@@ -164,6 +164,7 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
     return {
         "cameras": _cameras(dataset),
         "box": _box(dataset),
+        "displacement": None,
         **{name: _map(dataset, name) for name in own if name in dataset},
         "maps": {name: _map(dataset, name) for name in map_names() if name in dataset and name not in own},
         "about_views": {name: _array(dataset, name) for name in ABOUT_VIEWS if name in dataset},

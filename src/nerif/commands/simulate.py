@@ -20,7 +20,7 @@ __all__ = ["Simulate", "main", "run"]
 
 @dataclass(frozen=True)
 class Simulate(Settings):
-    """Trace curved rays through a phantom and write a measurement, with its truth as a volume beside it."""
+    """Trace rays through a phantom and write a measurement, with its truth as a volume beside it."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Measurement to write, NAME.nc; the truth becomes NAME.truth.nc. With --times NAME.zarr and NAME.truth.zarr."""
@@ -52,9 +52,11 @@ def run(settings: Simulate) -> None:
         measurement, volume = settings.simulation(cameras, bar)
     measurement.write(settings.out)
     write_netcdf(truth, [volume])
-    rays, d, _ = measurement.rays()
-    rms = float(d.square().mean().sqrt())
-    say(f"{settings.out}: {len(cameras)} views, {len(rays)} rays cross the box, rms displacement {rms:.3f} px")
+    for observation in measurement.observations:
+        rays, values, _ = measurement.rays(observation)
+        rms, kind = float(values.square().mean().sqrt()), observation.technique
+        size = f"rms {kind.measured} {rms:.3g}" + ("" if kind.unit == "1" else f" {kind.unit}")
+        say(f"{settings.out}: {len(cameras)} views, {len(rays)} rays cross the box, {size}")
     say(f"{truth}: the truth on {' x '.join(map(str, volume.grid.shape))} voxels (z, y, x)")
 
 
