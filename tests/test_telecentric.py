@@ -17,6 +17,7 @@ from nerif.physics.path_integral import PathIntegral
 from nerif.physics.ray_tracing import background_points
 from nerif.prediction import _interpolated, reproject
 from nerif.reconstruction.bins import binned_rays
+from nerif.reconstruction.fingerprint import _parts, digest
 from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov
@@ -112,6 +113,12 @@ def test_a_field_comes_back_and_is_seen_again(seen, ball, box):
     usable = seen.usable
     left = (again.predicted - seen.displacement)[usable]
     assert float(left.norm() / seen.displacement[usable].norm()) < 0.07  # 0.057
+
+
+def test_a_run_is_not_resumed_with_another_projection():
+    camera = ring("perspective")[0]
+    assert digest(_parts(camera)) == digest(_parts(replace(camera)))
+    assert digest(_parts(camera)) != digest(_parts(replace(camera, projection=TELECENTRIC)))
 
 
 def test_a_background_before_the_box_is_refused(seen):
