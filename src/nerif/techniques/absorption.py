@@ -34,6 +34,7 @@ class Absorption(LineIntegral):
     name = "absorption"
     measured, sigma = "absorbance", "absorbance_sigma"
     quantity = "extinction"
+    additive = True
     bounds = (0.0, math.inf)
 
     @classmethod

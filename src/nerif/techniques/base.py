@@ -109,6 +109,8 @@ class ForwardModel(ABC):
     """Lowest and highest value that the field can have, in its unit."""
     straight: ClassVar[bool] = True
     """Whether samples stand on the straight ray."""
+    additive: ClassVar[bool] = False
+    """Whether a pixel sees a sum, with weights above 0, of a field that is never negative."""
     linear: ClassVar[bool] = True
     """Whether the weights say all: neither `bend` nor `read` changes anything."""
 

@@ -30,6 +30,7 @@ class Emission(LineIntegral):
     name = "emission"
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
+    additive = True
     bounds = (0.0, math.inf)
 
     @classmethod
