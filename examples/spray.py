@@ -2,9 +2,9 @@
 
     python examples/spray.py spray_Re6700.hdf5 --slice impingement --out spray
 
-The data are of N. Rahman et al., doi 10.4231/G20X-4Z27 (CC0). The scan itself tells its offset, its axis of rotation and
-by how much it falls short where little is left of the beam (nerif/imaging/line_scans.py). Every fifth angle is held out
-and predicted; the figure shows slice, sinogram, residuals and the angles that were predicted.
+The data are of N. Rahman et al., doi 10.4231/G20X-4Z27 (CC0). The scan itself tells its offset, its axis of rotation
+and by how much it falls short where little is left of the beam (nerif/imaging/line_scans.py). Every fifth angle is held
+out and predicted; the figure shows slice, sinogram, residuals and the angles that were predicted.
 """
 
 from __future__ import annotations

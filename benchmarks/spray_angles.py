@@ -1,11 +1,11 @@
 """X-ray absorption of a liquid spray: every fifth angle of a scan left out, and predicted from the others.
 
-    python benchmarks/spray.py spray_Re6700.hdf5 --write benchmarks/results/spray-cpu.md
+    python benchmarks/spray_angles.py spray_Re6700.hdf5 --write benchmarks/results/spray-cpu.md
 
 Relative rms error |predicted - measured| / |measured| of the angles left out. "on the axis" compares readings that are
-interpolated to a grid about the axis of rotation, as scikit-image's transforms need them and as its users see them; half
-of the noise is averaged away there. Peers, with the iteration that is best for the angles left out: SART of scikit-image
-and MLEM. TV and NeRIF know nothing of those angles. "but one" leaves out the reading that is furthest off.
+interpolated to a grid about the axis of rotation, as scikit-image's transforms need them and as its users see them;
+half of the noise is averaged away there. Peers, with the iteration that is best for the angles left out: SART of
+scikit-image and MLEM. TV and NeRIF know nothing of those angles. "but one" leaves out the reading furthest off.
 """
 
 from __future__ import annotations
