@@ -112,6 +112,8 @@ class ForwardModel(ABC):
     """Whether samples stand on the straight ray."""
     additive: ClassVar[bool] = False
     """Whether a pixel sees a sum, with weights above 0, of a field that is never negative."""
+    gains: ClassVar[bool] = False
+    """Whether cameras may be of different brightness, which a fit can tell."""
     linear: ClassVar[bool] = True
     """Whether the weights say all: neither `bend` nor `read` changes anything."""
 
