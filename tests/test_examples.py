@@ -46,13 +46,13 @@ SPRAY = Path(__file__).parents[2] / "shared" / "data" / "spray_absorption" / "sp
 @pytest.mark.skipif(not SPRAY.is_file(), reason="the data of the spray are not beside the project (shared/data)")
 def test_spray(tmp_path, monkeypatch, capsys):
     """Two jets of water: their density is that of water, though nothing was told of it."""
-    arguments = ["--slice", "jets", "--method", "nerif", "--steps", "60", "--out", str(tmp_path)]
+    arguments = ["--slice", "jets", "--method", "nerif", "--steps", "20", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["spray.py", str(SPRAY), *arguments])
     example = runpy.run_path(str(EXAMPLES / "spray.py"), run_name="__main__")
     said = capsys.readouterr().out
     assert "axis of rotation at -0.27" in said
     assert (tmp_path / "jets-nerif.png").stat().st_size > 20_000
-    method = example["TotalVariation"](voxels=50, basis="linear", regularisation=2e-3, iterations=40, device="cpu")
+    method = example["TotalVariation"](voxels=40, basis="linear", regularisation=2e-3, iterations=30, device="cpu")
     _, _, found, told = example["reconstruct"](example["read"](SPRAY, "jets"), example["HELD_OUT"], method)
     density = found.volume(Grid.of_resolution(found.box, 50)).values / example["WATER"] * 1e3
     inside = density[density > 0.5]

@@ -1,0 +1,88 @@
+"""Scans by parallel rays: what they tell of themselves, and that the slice they become is the right way round."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerif.conventions import InputError
+from nerif.imaging.line_scans import LineScan
+from nerif.reconstruction.tikhonov import Tikhonov
+
+ANGLES = np.radians(np.arange(0, 180, 12.0))
+POSITIONS = -6 + 0.25 * np.arange(47)  # not about the axis
+AXIS, OFFSET, BEND = -0.31, -0.6, 0.05
+BALLS = ((-1.5, 0.8, 0.6, 1.1), (2.0, -0.5, 0.5, 0.8))  # x, y, standard deviation, extinction
+
+
+def true_scan() -> LineScan:
+    """Integrals along lines through two Gaussian columns."""
+    at = POSITIONS - AXIS
+    total = np.zeros((len(ANGLES), len(at)))
+    for x, y, width, extinction in BALLS:
+        away = at - (x * np.cos(ANGLES) + y * np.sin(ANGLES))[:, None]
+        total += extinction * width * np.sqrt(2 * np.pi) * np.exp(-((away / width) ** 2) / 2)
+    return LineScan(ANGLES, POSITIONS, total)
+
+
+@pytest.fixture(scope="module")
+def measured() -> LineScan:
+    """With an offset, saturation and noise."""
+    scan = true_scan()
+    noise = np.random.default_rng(0).normal(0, 1e-3, scan.readings.shape)
+    return replace(scan, readings=LineScan.bent(scan.readings, BEND) + OFFSET + noise)
+
+
+def test_a_scan_tells_its_offset_axis_and_saturation(measured):
+    assert measured.offset == pytest.approx(OFFSET, abs=5e-4)
+    assert measured.noise == pytest.approx(1e-3, rel=0.3)
+    scan = measured.without_offset()
+    assert len(scan.complete) == len(ANGLES)
+    bend, before, after = scan.bend()
+    assert bend == pytest.approx(BEND, abs=0.005)
+    assert after < 0.3 * before
+    assert scan.unbent(BEND).axis() == pytest.approx(AXIS, abs=0.01)
+    absorbances = np.linspace(0, 4, 9)
+    bent = LineScan.bent(absorbances, BEND)
+    assert np.allclose(bent + BEND * bent**2, absorbances)
+
+
+def test_the_slice_is_the_right_way_round():
+    scan = true_scan()
+    result = Tikhonov(voxels=44, basis="linear", regularisation=1e-4, device="cpu")(scan.measurement(AXIS, 0.01))
+    assert result.quantity == "extinction"
+    for x, y, _, extinction in BALLS:
+        at = result.field(_point(x, y))
+        assert float(at) == pytest.approx(extinction, rel=0.15)
+        assert abs(float(result.field(_point(-x, y)))) < 0.1
+        assert abs(float(result.field(_point(x, -3 * y)))) < 0.1
+
+
+def _point(x: float, y: float):
+    import torch
+
+    return torch.tensor([x, y, 0.0])
+
+
+def test_angles_that_are_cut_off_are_not_counted_on():
+    scan = true_scan()
+    cut = scan.readings.copy()
+    cut[3, :5] = 0.4
+    assert 3 not in replace(scan, readings=cut).complete
+    with pytest.raises(InputError, match="three angles or more that hold all of the medium, got 0"):
+        replace(scan, readings=scan.readings + 1).bend()
+    with pytest.raises(InputError, match="four angles or more that hold all of the medium, got 2"):
+        replace(scan, readings=np.where(np.arange(len(ANGLES))[:, None] < 2, scan.readings, 1.0)).axis()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_scans_that_cannot_be():
+    scan = true_scan()
+    with pytest.raises(InputError, match="readings: expected one for each angle and position"):
+        LineScan(ANGLES[:-1], POSITIONS, scan.readings)
+    with pytest.raises(InputError, match="positions: expected evenly spaced, rising positions"):
+        LineScan(ANGLES, POSITIONS**3, scan.readings)
+    with pytest.raises(InputError, match="four angles and positions or more"):
+        scan.select([0, 1])
