@@ -34,6 +34,21 @@ class Observation:
     sigma: Float[Tensor, "view row column c"] | None = None
 
     @property
+    def components(self) -> tuple[str, ...]:
+        """What the channels are called: by their own names, or by what is measured where there is but one."""
+        return tuple(name or self.technique.measured for name in self.technique.channels)
+
+    @property
+    def label(self) -> str:
+        """What stands at a colour bar, with the unit."""
+        return f"{self.technique.measured} [{self.technique.unit}]"
+
+    @property
+    def signed(self) -> bool:
+        """Whether what is measured may be negative: not where the field may not."""
+        return self.technique.bounds[0] < 0
+
+    @property
     def caption(self) -> str:
         """What pictures of the views show."""
         kind = self.technique

@@ -32,6 +32,7 @@ class Absorption(LineIntegral):
     """Absorbance -ln(I / I0), the integral of the extinction coefficient."""
 
     name = "absorption"
+    tomography = "absorption tomography"
     measured, sigma = "absorbance", "absorbance_sigma"
     quantity = "extinction"
     bounds = (0.0, math.inf)

@@ -89,6 +89,8 @@ class ForwardModel(ABC):
 
     name: ClassVar[str]
     """Of the technique, as attribute `technique` of a measurement file has it."""
+    tomography: ClassVar[str] = "tomography"
+    """What reconstructing a volume by it is called."""
     measured: ClassVar[str]
     """What a pixel measures: the variable of the file."""
     sigma: ClassVar[str]

@@ -35,6 +35,7 @@ class Deflection(ForwardModel):
     """
 
     name = "deflection"
+    tomography = "background-oriented schlieren tomography"
     measured, sigma = "displacement", "sigma"
     channels = ("u", "v")
     unit = "px"

@@ -28,6 +28,7 @@ class Emission(LineIntegral):
     """Radiance, the integral of what is given off along the ray."""
 
     name = "emission"
+    tomography = "emission tomography"
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
     bounds = (0.0, math.inf)

@@ -31,6 +31,7 @@ class Interferometry(LineIntegral):
     """
 
     name = "interferometry"
+    tomography = "interferometric tomography"
     measured, sigma = "fringes", "fringes_sigma"
     quantity = "index_excess"
 
