@@ -20,6 +20,8 @@ from .prediction import predict as predict
 from .prediction import reproject as reproject
 from .reconstruction.base import Reconstruction as Reconstruction
 from .reconstruction.landweber import Landweber as Landweber
+from .reconstruction.multiplicative import MART as MART
+from .reconstruction.multiplicative import MLEM as MLEM
 from .reconstruction.neural import NeRIF as NeRIF
 from .reconstruction.presets import preset as preset
 from .reconstruction.tikhonov import Tikhonov as Tikhonov

@@ -103,6 +103,7 @@ class Result:
     def method(self) -> str:
         """Name of the method as a reader knows it."""
         names = {"nerif": "NeRIF", "tikhonov": "Tikhonov", "landweber": "Landweber", "tv": "total variation"}
+        names |= {"mlem": "MLEM", "mart": "MART"}
         method = str(self.settings.get("method", "unknown method"))
         return names.get(method, method)
 

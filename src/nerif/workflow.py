@@ -20,6 +20,7 @@ from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Ste
 from nerif.reconstruction.ensemble import Ensemble
 from nerif.reconstruction.files import checkpoints
 from nerif.reconstruction.landweber import Landweber
+from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.tikhonov import Tikhonov
@@ -37,6 +38,8 @@ METHODS: dict[str, type[Reconstructor]] = {
     "tikhonov": Tikhonov,
     "landweber": Landweber,
     "tv": TotalVariation,
+    "mlem": MLEM,
+    "mart": MART,
 }
 
 

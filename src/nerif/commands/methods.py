@@ -11,6 +11,7 @@ import tyro
 from nerif.commands.settings import Flat, Settings
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.landweber import Landweber
+from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
@@ -28,7 +29,7 @@ class Reconstruct(Settings):
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result directory to write."""
     method: str = "nerif"
-    """One of nerif, tikhonov, landweber, tv; --method NAME --help tells the options of each."""
+    """One of nerif, tikhonov, landweber, tv, mlem, mart; --method NAME --help tells the options of each."""
     force: bool = False
     """Overwrite an existing result directory."""
     resume: bool = False
@@ -84,9 +85,27 @@ class ReconstructTotalVariation(Reconstruct):
     reconstructor: Annotated[TotalVariation, Flat] = field(default_factory=TotalVariation)
 
 
+@dataclass(frozen=True)
+class ReconstructMLEM(Reconstruct):
+    """Reconstruct a field that is never negative from its line integrals by maximum likelihood (MLEM) on voxels."""
+
+    method: str = "mlem"
+    reconstructor: Annotated[MLEM, Flat] = field(default_factory=MLEM)
+
+
+@dataclass(frozen=True)
+class ReconstructMART(Reconstruct):
+    """Reconstruct a field that is never negative from its line integrals by MART on voxels."""
+
+    method: str = "mart"
+    reconstructor: Annotated[MART, Flat] = field(default_factory=MART)
+
+
 RECORDS: dict[str, type[Reconstruct]] = {
     "nerif": ReconstructNeRIF,
     "tikhonov": ReconstructTikhonov,
     "landweber": ReconstructLandweber,
     "tv": ReconstructTotalVariation,
+    "mlem": ReconstructMLEM,
+    "mart": ReconstructMART,
 }

@@ -84,7 +84,14 @@ class VoxelOperator:
             raise InputError(
                 f"voxels: expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}"
             )
+        self.step = step
         self.path, self.matrices = self._prepare(rays, model, step)
+
+    def for_rays(self, rays: Rays, model: ForwardModel) -> VoxelOperator:
+        """Return the operator of other rays on the same grid."""
+        return VoxelOperator(
+            rays, self.grid, model, self.basis, self.boundary, self.step, self.device, self.dtype
+        )  # fmt: skip
 
     def _prepare(self, rays: Rays, model: ForwardModel, step: float) -> tuple[tuple[Tensor, ...], list[Tensor]]:
         """What the kernels need: start, stride, profile and count of each ray; its A and B, in voxels."""

@@ -35,6 +35,7 @@ class Absorption(LineIntegral):
     tomography = "absorption tomography"
     measured, sigma = "absorbance", "absorbance_sigma"
     quantity = "extinction"
+    additive = True
     bounds = (0.0, math.inf)
 
     @classmethod
@@ -62,6 +63,15 @@ class Absorption(LineIntegral):
                 f"absorbance: expected -ln(I / I0) of 0 or more, as I is at most I0; {share:.0%} of the pixels are far "
                 f"below (down to {float(seen.min()):.3g}): subtract the offset that pixels beside the medium show"
             )
+
+    @classmethod
+    def detected(
+        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
+        """Return absorbances of so many quanta a pixel without the medium; the reference has no noise."""
+        passed = torch.poisson(counts * torch.exp(-values.nan_to_num()), generator)
+        found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_pictures=math.inf)
+        return torch.from_numpy(found).to(values), torch.from_numpy(sigma).to(values)
 
 
 @dataclass(frozen=True)

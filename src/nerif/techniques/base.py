@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.conventions import InputError
 from nerif.geometry import Camera, Rays
 
 __all__ = ["ForwardModel", "Light", "Weights", "midpoints"]
@@ -111,6 +112,8 @@ class ForwardModel(ABC):
     """Lowest and highest value that the field can have, in its unit."""
     straight: ClassVar[bool] = True
     """Whether samples stand on the straight ray."""
+    additive: ClassVar[bool] = False
+    """Whether a pixel sees a sum, with weights above 0, of a field that is never negative."""
     linear: ClassVar[bool] = True
     """Whether the weights say all: neither `bend` nor `read` changes anything."""
 
@@ -163,6 +166,19 @@ class ForwardModel(ABC):
             Saying what is wrong, and what to do.
         """
         return
+
+    @classmethod
+    def detected(
+        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
+        """Return what is measured with so many detected quanta, and its sigma.
+
+        Raises
+        ------
+        InputError
+            If the noise of the technique is not that of quanta.
+        """
+        raise InputError(f"counts: expected a technique that counts quanta, got {cls.name}; give --noise")
 
     def reading(
         self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None

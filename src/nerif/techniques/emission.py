@@ -31,6 +31,7 @@ class Emission(LineIntegral):
     tomography = "emission tomography"
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
+    additive = True
     bounds = (0.0, math.inf)
 
     @classmethod
@@ -40,6 +41,15 @@ class Emission(LineIntegral):
     @property
     def weight(self) -> float:
         return 1.0
+
+    @classmethod
+    def detected(
+        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
+        """Return radiances of so many quanta where they are largest; sigma is that of a quantum at least."""
+        quantum = float(values.nan_to_num().max()) / counts or 1.0
+        seen = torch.poisson((values.nan_to_num() / quantum).clamp_min(0), generator) * quantum
+        return torch.where(values.isnan(), values, seen), (seen * quantum).clamp_min(quantum**2).sqrt()
 
     @classmethod
     def check(
