@@ -26,7 +26,7 @@ LAYERS = (
     ("experiment",),
     ("reconstruction",),
     ("result", "monitor"),
-    ("prediction", "evaluation", "consistency", "mistakes"),
+    ("prediction", "evaluation", "consistency", "mistakes", "quick_views", "symptoms"),
     ("members",),
     ("report", "sequence"),
     ("workflow",),

@@ -122,6 +122,11 @@ class VolumeSequence:
             return np.asarray(self.array(name)[index])
 
     @property
+    def view_rms(self) -> Any:
+        """The array (time, view) of rms differences to what the views measured; its attribute `units` has the unit."""
+        return self.array("rms_px" if "rms_px" in self.group else "rms")
+
+    @property
     def quantities(self) -> tuple[str, ...]:
         """What is there over time and space."""
         volumes = ("time", "z", "y", "x")

@@ -35,6 +35,7 @@ class Absorption(LineIntegral):
     tomography = "absorption tomography"
     measured, sigma = "absorbance", "absorbance_sigma"
     quantity = "extinction"
+    misscaled = "another reference picture, or another wavelength"
     additive = True
     bounds = (0.0, math.inf)
 

@@ -39,6 +39,7 @@ class Deflection(ForwardModel):
     measured, sigma = "displacement", "sigma"
     channels = ("u", "v")
     unit = "px"
+    misscaled = "binning, or another lever arm"
     limits = (1e-6, 1e5)
     quantity = "index_excess"
     gauge = True

@@ -31,6 +31,7 @@ class Emission(LineIntegral):
     tomography = "emission tomography"
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
+    misscaled = "another gain or exposure"
     additive = True
     bounds = (0.0, math.inf)
 

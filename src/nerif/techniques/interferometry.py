@@ -34,6 +34,7 @@ class Interferometry(LineIntegral):
     tomography = "interferometric tomography"
     measured, sigma = "fringes", "fringes_sigma"
     quantity = "index_excess"
+    misscaled = "another wavelength, or a double pass"
 
     wavelength_nm: float = 532.0
 
