@@ -84,5 +84,5 @@ def _of_rim(kind: type[ForwardModel], offset: Tensor, shrunk: float) -> str:
         u, v = (float(x) * shrunk for x in offset)
         moved = f"its rim is displaced by ({u:.2f}, {v:.2f}) px as a whole; did the camera move?"
         return f"{moved} nerif displacement --shake-border removes it"
-    value = f"its rim has a {kind.measured} of {float(offset[0]):.3g} as a whole"
+    value = f"its rim shows {kind.measured} {float(offset[0]):.3g} as a whole"
     return f"{value}; if nothing but the ambient is there, subtract it as the offset of the background"

@@ -120,7 +120,8 @@ def test_names_of_views_become_names_of_files(whole):
     m = result.reprojection.measurement
     odd = ("a/b", "a b", "a$x_$", "é<")
     cameras = tuple(replace(c, name=name) for c, name in zip(m.cameras, odd, strict=True))
-    views = [{"name": name, "held_out": False, "cc": 0.9, "rms": 0.1, "measured": "displacement", "unit": "px"} for name in odd]
+    scores = {"held_out": False, "cc": 0.9, "rms": 0.1, "measured": "displacement", "unit": "px"}
+    views = [{"name": name, **scores} for name in odd]
     renamed = Result(
         whole,
         metrics={"views": views},

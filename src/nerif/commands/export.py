@@ -29,8 +29,8 @@ class Export(Settings):
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File to write; its ending says the format: .vti, .nc, .npz, .mat or .csv."""
     quantities: tuple[str, ...] = ()
-    """Of an index out of index_excess (1), n (1), density (kg/m3), temperature (K), by default the first three; else the
-    field itself."""
+    """Of an index out of index_excess (1), n (1), density (kg/m3), temperature (K); default: all but the last, or the
+    field where it is no index."""
     voxels: int = 100
     """Voxels along the longest edge; near-cubic voxels."""
     shape: tuple[int, int, int] | None = None

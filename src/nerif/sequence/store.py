@@ -109,7 +109,8 @@ class SequenceStore(VolumeSequence):
             nan, seen = float("nan"), ((views,), ("view",), "float64")
             add_frames(group, "cc", frames, *seen, units="1", long_name="correlation with what the view measured")
             meaning = f"rms difference to the {compared.measured} that the view measured"
-            add_frames(group, "rms_px" if compared.unit == "px" else "rms", frames, *seen, units=compared.unit, long_name=meaning)
+            rms = "rms_px" if compared.unit == "px" else "rms"
+            add_frames(group, rms, frames, *seen, units=compared.unit, long_name=meaning)
             add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
             add("index_scale", "float64", nan, "field of one unit of network output")
             add("offset", "float64", nan, "network output that counts as ambient")
