@@ -184,8 +184,8 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
             continue
         if correction.change is None:
             clear = len(views) >= FEW or gain < BETTER_OF_FEW
-            predicted = predicted_by_others(small, correction.views, voxels)
-            if not clear or _crossed(predicted, small, correction) > EXCHANGE:
+            expected = predicted_by_others(small, correction.views, voxels)
+            if not clear or _crossed(expected, small, correction) > EXCHANGE:
                 continue
         if len(correction.views) == len(views) or _fits(_without(correction, small), correction.views, enough, voxels):
             return correction

@@ -82,12 +82,12 @@ def _measurement(path: Path, m: Measurement) -> None:
         plane = c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
         good = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
-        rms = "".join(f"{float(values.square().mean().sqrt()) if len(values) else math.nan:18.4f}" for values in good)
+        sizes = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:18.4f}" for x in good)
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
         say(
             f"  {c.name:<14} {size:>10} {pixel:11.4g} {away:23.1f} {behind:>20} "
-            f"{share:8.1%}{rms}"
+            f"{share:8.1%}{sizes}"
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -117,7 +117,7 @@ def _curves(result: Result) -> list[tuple[str, str]]:
         several = len(result.reprojection.measurement.observations) > 1
         for name, residuals in residuals_over_sigma(result.reprojection).items():
             of = f" of {name}" if several else ""
-            found.append((f"Residuals{of} against the noise", svg(lambda axes, r=residuals: draw_residuals(axes, r))))
+            found.append((f"Residuals{of} against the noise", svg(partial(draw_residuals, residuals=residuals))))
     if result.metrics.get("slices"):
         slices = result.metrics["slices"]
         found.append(("Against the truth, slice by slice", svg(lambda axes: draw_slice_scores(axes, slices))))

@@ -109,9 +109,10 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
     found = field_of(result.volumes)
     spread = result.volumes.get("density_std", result.volumes.get(f"{found}_std"))
     if isinstance(ensemble, dict) and spread is not None:
-        rms = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
-        name, unit = LABELS.get(spread.quantity.removesuffix("_std"), (found, spread.unit))
-        text = f"σ of {name} rms {number(rms, 2)}{'' if unit == '1' else f' {unit}'}"
+        base = spread.quantity.removesuffix("_std")
+        size = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
+        name, unit = LABELS.get(base, (base, spread.unit))
+        text = f"σ of {name} rms {number(size, 2)}{'' if unit == '1' else f' {unit}'}"
         rows.append((f"Ensemble of {ensemble.get('members')}", text))
     coverage = result.metrics.get("coverage")
     if isinstance(coverage, dict):
