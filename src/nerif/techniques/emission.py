@@ -33,6 +33,7 @@ class Emission(LineIntegral):
     quantity = "emission"
     misscaled = "another gain or exposure"
     additive = True
+    gains = True
     bounds = (0.0, math.inf)
 
     @classmethod
