@@ -27,6 +27,8 @@ CHECKED += (
     "experiment",
     "consistency",
     "mistakes",
+    "quick_views",
+    "symptoms",
     "resolution",
     "measurement_sequence",
     "volume_sequence",

@@ -9,11 +9,13 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from nerif.cli import main
-from nerif.consistency import _fit, _open_faces, binned, check_consistency
+from nerif.consistency import check_consistency
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring, paper_rig
 from nerif.measurement import Measurement
+from nerif.quick_views import binned, fit
 from nerif.simulation import simulate
+from nerif.symptoms import open_faces
 
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))
 
@@ -64,7 +66,7 @@ MISTAKES = {
     "exchanged": (exchanged(1, 4), "views 30deg and 120deg: these two views are exchanged"),
     "swapped everywhere": (lambda d: d.flip(-1), "all views: u and v are swapped"),
     "sign of v everywhere": (lambda d: d * torch.tensor([1.0, -1.0]), "all views: the sign of one component"),
-    "too large": (in_view(2, lambda d: 2.5 * d), "view 60deg: displacements 2."),
+    "too large": (in_view(2, lambda d: 2.5 * d), "view 60deg: displacement 2."),
 }  # fmt: skip
 
 
@@ -131,8 +133,8 @@ def test_a_flame_that_ends_at_the_box_does_not_go_on_beyond_it(cut, smeared):
     """Optical flow smears the edges at the ends over its window."""
     d = torch.from_numpy(gaussian_filter(cut.displacement.numpy(), (0, smeared, smeared, 0)))
     small = replace(cut, displacement=d)
-    field, _ = _fit(small, 24, 3e-3)
-    assert _open_faces(field, small) == []
+    field, _ = fit(small, 24, 3e-3)
+    assert open_faces(field, small) == []
 
 
 @pytest.mark.slow
@@ -149,8 +151,8 @@ def tall() -> Measurement:
 
 
 def test_flow_that_leaves_through_the_ends_is_seen_in_the_rays_through_them(tall):
-    field, _ = _fit(tall, 20, 3e-3)
-    below, above = _open_faces(field, tall)
+    field, _ = fit(tall, 20, 3e-3)
+    below, above = open_faces(field, tall)
     assert below.startswith("face z-")
     assert above.startswith("face z+")
     assert "--open-faces z+" in above

@@ -26,7 +26,7 @@ LAYERS = (
     ("experiment",),
     ("reconstruction",),
     ("result", "monitor"),
-    ("prediction", "evaluation", "consistency", "mistakes", "gains"),
+    ("prediction", "evaluation", "consistency", "mistakes", "quick_views", "symptoms", "gains"),
     ("members",),
     ("report", "sequence"),
     ("workflow",),

@@ -93,12 +93,13 @@ def test_a_measurement_shows_its_views(measurement: Measurement):
 
 def test_of_many_views_some_are_drawn():
     maps = [np.random.default_rng(i).normal(size=(9, 30, 2)).astype(np.float32) for i in range(VIEWS + 5)]
-    pixels = Panel(panel("many", [], show_views([f"c{i}" for i in range(len(maps))], maps), "views")).pixels
+    names = [f"c{i}" for i in range(len(maps))]
+    pixels = Panel(panel("many", [], (show_views(names, maps, ("u", "v"), "d [px]"), "views"))).pixels
     assert pixels.shape[1] < 1200
 
 
 def test_names_cannot_break_the_page():
-    assert Panel(panel("<b>", [("a<script>", "1 & 2")], "data:,", 'the "thing"')).cells == ["a<script>", "1 & 2"]
+    assert Panel(panel("<b>", [("a<script>", "1 & 2")], ("data:,", 'the "thing"'))).cells == ["a<script>", "1 & 2"]
 
 
 def test_a_volume_shows_its_slices(ball: Field, box: Box):

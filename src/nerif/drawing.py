@@ -1,11 +1,11 @@
-"""Volumes and displacement maps, drawn into Axes that the caller gives and gets back: for print, pages and notebooks.
+"""Volumes and maps of views, drawn into Axes that the caller gives and gets back: for print, pages and notebooks.
 
 Sequential colour maps are perceptually uniform, diverging ones centred on 0; the colour-blind can read both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -22,13 +22,17 @@ __all__ = [
     "COLOUR_MAPS",
     "DIVERGING",
     "LABELS",
+    "SEQUENTIAL",
     "Drawable",
     "add_colour_bar",
     "colour_range",
-    "draw_displacement",
+    "draw_map",
     "draw_slice",
     "draw_slices",
+    "drawn_of",
     "label_of",
+    "map_colours",
+    "map_range",
     "shown",
     "style",
 ]
@@ -48,20 +52,28 @@ class Drawable(Protocol):
 PLANES = {"z": ("x", "y"), "y": ("x", "z"), "x": ("y", "z")}
 """Normal of a slice: the axes it is drawn over."""
 
-COLOUR_MAPS = {"temperature": "inferno"}
-"""By quantity; the others are drawn in viridis."""
+SEQUENTIAL, DIVERGING = "viridis", "RdBu_r"
 
-DIVERGING = "RdBu_r"
+COLOUR_MAPS = {"temperature": "inferno", "emission": "magma"}
+"""By quantity; the others are drawn in SEQUENTIAL."""
 
 COLOURS = {"blue": "#0072B2", "orange": "#D55E00", "green": "#009E73", "grey": "#595959"}  # Okabe & Ito
 
 LABELS = {
     "index_excess": ("n − n$_{ambient}$", "1"),
     "n": ("n − 1", "1"),
-    "density": ("density", "kg m$^{-3}$"),
+    "density": ("density", "kg m⁻³"),
     "temperature": ("temperature", "K"),
+    "extinction": ("extinction coefficient", "mm⁻¹"),
+    "emission": ("radiance per length", "mm⁻¹"),
 }
 """What stands at a colour bar, and the unit."""
+
+
+def drawn_of(quantities: Iterable[str]) -> tuple[str, ...]:
+    """Return which of the quantities of a result are drawn: of an index n, which stands for the excess too."""
+    statistics = ("mean", "std")
+    return tuple(q for q in quantities if q != "index_excess" and q.rpartition("_")[2] not in statistics)
 
 
 @contextmanager
@@ -121,7 +133,7 @@ def draw_slice(
         extent=(box.lower[i], box.upper[i], box.lower[j], box.upper[j]),
         vmin=low,
         vmax=high,
-        cmap=colour_map or COLOUR_MAPS.get(volume.quantity.partition("_")[0], "viridis"),
+        cmap=colour_map or COLOUR_MAPS.get(volume.quantity.partition("_")[0], SEQUENTIAL),
         interpolation="nearest",
     )
     axes.set_xlabel(f"{across} [mm]")
@@ -154,10 +166,25 @@ def colour_range(values: np.ndarray) -> tuple[float, float]:
     return low, high
 
 
-def draw_displacement(axes: Axes, image: np.ndarray, limit: float) -> Axes:
-    """Draw one displacement component (px) on a diverging scale centred on 0; rows downward, unmeasured pixels grey."""
+def map_range(values: np.ndarray, signed: bool, share: float = 1.0) -> tuple[float, float]:
+    """Return the ends of the colours of maps: 0 and the largest value, or where a share of the pixels lies below.
+
+    Of what may be negative (`signed`) they are as far below 0 as above. NaN is left out; 1 for nothing.
+    """
+    sizes = np.abs(values[np.isfinite(values)])
+    high = (float(np.quantile(sizes, share)) if sizes.size else 0.0) or 1.0
+    return (-high if signed else 0.0), high
+
+
+def map_colours(limits: tuple[float, float]) -> str:
+    """Return the colour map between such ends: a diverging one about 0, a sequential one from 0 up."""
+    return DIVERGING if limits[0] < 0 else SEQUENTIAL
+
+
+def draw_map(axes: Axes, image: np.ndarray, limits: tuple[float, float]) -> Axes:
+    """Draw what pixels measured between such ends (see map_range); rows downward, unmeasured pixels grey."""
     axes.set_facecolor("0.8")
-    axes.imshow(image, vmin=-limit, vmax=limit, cmap=DIVERGING, interpolation="nearest")
+    axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=map_colours(limits), interpolation="nearest")
     axes.set_xlabel("column [px]")
     axes.set_ylabel("row [px]")
     return axes

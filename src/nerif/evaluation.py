@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -18,6 +19,7 @@ from nerif.fields.grid import VoxelField
 from nerif.geometry import Box
 from nerif.measurement import Measurement
 from nerif.metrics import slice_metrics, view_metrics, volume_metrics
+from nerif.notebook import number
 from nerif.observation import Observation
 from nerif.prediction import reproject
 from nerif.reprojection import Reprojection
@@ -64,6 +66,7 @@ def evaluate(
     if truth is not None:
         compared = _truth(Path(truth), box, n_ambient, quantity)
         metrics |= evaluate_volume(field, compared, n_ambient) | _coverage(directory, compared)
+        metrics["quantity"] = quantity
         metrics["truth"] = str(Path(truth).resolve())
     if measurement is not None:
         data, asked = Measurement.read(measurement), directory.settings()
@@ -116,21 +119,24 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
 def rms_text(view: dict[str, Any]) -> str:
     """Return the rms error of a view with its unit."""
     unit = view.get("unit", "px")
-    return f"{view['rms']:.4g}" + (f" {unit}" if unit != "1" else "")
+    return number(view["rms"]) + (f" {unit}" if unit != "1" else "")
 
 
 def score_lines(views: list[dict[str, Any]]) -> list[str]:
-    """Return a line for the training views and one for those held out: the worst scores of each."""
+    """Return a line for the training views and one for those held out, of each technique: the worst scores."""
     lines = []
-    for group, held in (("training view", False), ("held-out view", True)):
-        chosen = [v for v in views if v["held_out"] is held]
+    measured = dict.fromkeys(v["measured"] for v in views)
+    groups = (("training view", False), ("held-out view", True))
+    for (group, held), name in itertools.product(groups, measured):
+        chosen = [v for v in views if v["held_out"] is held and v["measured"] == name]
         if chosen:
             cc = min(v["cc"] for v in chosen)
             rms = rms_text(max(chosen, key=lambda v: v["rms"]))
             noise = max(v.get("rms_over_sigma", float("nan")) for v in chosen)
             beside = "" if noise != noise else f", at most {noise:.2f} sigma"
             plural = "s" if len(chosen) > 1 else ""
-            lines.append(f"{len(chosen)} {group}{plural}: CC at least {cc:.4f}, rms error at most {rms}{beside}")
+            of = f", {name}" if len(measured) > 1 else ""
+            lines.append(f"{len(chosen)} {group}{plural}{of}: CC at least {cc:.4f}, rms error at most {rms}{beside}")
     return lines
 
 

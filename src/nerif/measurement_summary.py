@@ -8,6 +8,7 @@ import torch
 
 from nerif.notebook import PIXELS, number, panel, show_views
 from nerif.observation import Observation
+from nerif.techniques.deflection import Deflection
 
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
@@ -22,12 +23,14 @@ def summary(measurement: Measurement, held_out: int = 0) -> list[tuple[str, str]
     inside = sum(height * width for height, width in (c.image_size for c in cameras))
     held = f", of which {held_out} held out" if held_out else ""
     light = f" at {measurement.wavelength_nm:g} nm" if measurement.wavelength_nm else ""
+    of_index = measurement.quantity == Deflection.quantity
+    ambient = [("Ambient index", f"{measurement.n_ambient:.7g}{light}")] if of_index else []
     return [
         ("Views", f"{len(cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
         *(row for observation in measurement.observations for row in _sizes(measurement, observation)),
         ("Usable pixels", f"{max(int(measurement.usable.sum()), 1) / inside:.1%}"),
         ("Volume", " × ".join(f"{e:g}" for e in measurement.box.edges) + " mm (x, y, z)"),
-        ("Ambient index", f"{measurement.n_ambient:.7g}{light}"),
+        *ambient,
     ]
 
 
@@ -51,12 +54,19 @@ def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str
 
 
 def as_html(measurement: Measurement) -> str:
-    """Return what a notebook shows: the maps of the views, and the summary."""
-    observation, maps = measurement.observations[0], []
-    usable = measurement.usable_for(observation)
-    for i, (height, width) in enumerate(c.image_size for c in measurement.cameras):
+    """Return what a notebook shows: the maps of the views by every technique, and the summary."""
+    shown = [(_picture(measurement, o), o.caption) for o in measurement.observations]
+    return panel("Measurement", measurement.summary(), *shown)
+
+
+def _picture(measurement: Measurement, observation: Observation) -> str:
+    """The maps of the views that measured something by a technique, coarsened."""
+    usable, names, maps = measurement.usable_for(observation), [], []
+    for i, camera in enumerate(measurement.cameras):
+        height, width = camera.image_size
         step = -(-max(height, width) // PIXELS)
         part = i, slice(0, height, step), slice(0, width, step)
-        maps.append(torch.where(usable[part][..., None], observation.values[part], torch.nan).numpy())
-    picture = show_views(measurement.names, maps)
-    return panel("Measurement", measurement.summary(), picture, observation.caption)
+        if bool(usable[i].any()):
+            names.append(camera.name)
+            maps.append(torch.where(usable[part][..., None], observation.values[part], torch.nan).numpy())
+    return show_views(names, maps, observation.components, observation.label, observation.signed)

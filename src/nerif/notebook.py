@@ -15,9 +15,10 @@ from nerif.drawing import (
     Drawable,
     add_colour_bar,
     colour_range,
-    draw_displacement,
+    draw_map,
     draw_slices,
     label_of,
+    map_range,
     shown,
     style,
 )
@@ -57,14 +58,17 @@ def span(values: Float[np.ndarray, ...], unit: str = "", digits: int = 3) -> str
     return f"{number(float(known.min()), digits)} to {number(float(known.max()), digits)}{unit}{masked}"
 
 
-def panel(title: str, rows: Sequence[tuple[str, str]], picture: str, describes: str) -> str:
-    """Return a title, a picture (a data address, described in words) and a table of names and values as HTML."""
+def panel(title: str, rows: Sequence[tuple[str, str]], *pictures: tuple[str, str]) -> str:
+    """Return a title, pictures (data addresses, each described in words) and a table of names and values as HTML."""
     cells = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in rows
     )
-    image = f'<img src="{picture}" alt="{escape(describes)}" style="max-width:100%">'
-    return f"<div><p><b>{escape(title)}</b></p>{image}<table><tbody>{cells}</tbody></table></div>"
+    images = "".join(
+        f'<img src="{picture}" alt="{escape(describes)}" style="display:block;max-width:100%">'
+        for picture, describes in pictures
+    )
+    return f"<div><p><b>{escape(title)}</b></p>{images}<table><tbody>{cells}</tbody></table></div>"
 
 
 def picture(
@@ -93,19 +97,33 @@ def show_slices(volume: Drawable) -> str:
     return picture(draw, 8.5, 2.8)
 
 
-def show_views(names: Sequence[str], maps: Sequence[Float[np.ndarray, "row column 2"]]) -> str:
-    """Return u (above) and v (below) of the views, px, NaN where not measured, as a PNG in a data address."""
+def show_views(
+    names: Sequence[str],
+    maps: Sequence[Float[np.ndarray, "row column c"]],
+    components: Sequence[str],
+    label: str,
+    signed: bool = True,
+) -> str:
+    """Return the maps of the views, a row a component, NaN where not measured, as a PNG in a data address.
+
+    Parameters
+    ----------
+    names : of the views
+    maps : what was measured
+    components : what the channels are called
+    label : of the colour bar, with the unit
+    signed : whether values may be negative
+    """
     chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), VIEWS)).round().astype(int))
-    known = np.concatenate([np.abs(m[np.isfinite(m)]) for m in maps])
-    limit = (float(np.quantile(known, 0.998)) if known.size else 0.0) or 1.0
+    limits = map_range(np.concatenate([m[np.isfinite(m)] for m in maps]), signed, 0.998)
 
     def draw(figure: Figure) -> None:
-        grid = figure.subplots(2, len(chosen), squeeze=False)
+        grid = figure.subplots(len(components), len(chosen), squeeze=False)
         for column, view in enumerate(chosen):
-            for row, component in enumerate("uv"):
-                axes = draw_displacement(grid[row, column], maps[view][..., row], limit)
+            for row, component in enumerate(components):
+                axes = draw_map(grid[row, column], maps[view][..., row], limits)
                 axes.set(xticks=[], yticks=[], xlabel="", ylabel="" if column else component)
             grid[0, column].set_title(names[view], parse_math=False)
-        add_colour_bar(list(grid.ravel()), "displacement [px]")
+        add_colour_bar(list(grid.ravel()), label)
 
-    return picture(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 2.8)
+    return picture(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 0.5 + 1.15 * len(components))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from jaxtyping import Bool, Float
@@ -34,12 +34,43 @@ class Observation:
     sigma: Float[Tensor, "view row column c"] | None = None
 
     @property
+    def components(self) -> tuple[str, ...]:
+        """What the channels are called: by their own names, or by what is measured where there is but one."""
+        return tuple(name or self.technique.measured for name in self.technique.channels)
+
+    @property
+    def label(self) -> str:
+        """What stands at a colour bar, with the unit."""
+        return f"{self.technique.measured} [{self.technique.unit}]"
+
+    @property
+    def signed(self) -> bool:
+        """Whether what is measured may be negative: not where the field may not."""
+        return self.technique.bounds[0] < 0
+
+    @property
     def caption(self) -> str:
         """What pictures of the views show."""
         kind = self.technique
         names = " and ".join(name for name in kind.channels if name)
         unit = "" if kind.unit == "1" else f", in {kind.unit}"
         return f"{kind.measured.capitalize()} {names}".rstrip() + f" of each view{unit}"
+
+    def alone(self, measurement: Measurement) -> Measurement:
+        """Return the measurement by this technique alone, of the views that measured something by it."""
+        if len(measurement.observations) == 1:
+            return measurement
+        kind = self.technique
+        usable = measurement.usable_for(self).flatten(1).any(dim=1).tolist()
+        some = measurement.select([name for name, seen in zip(measurement.names, usable, strict=True) if seen])
+        own = {kind.measured, kind.sigma}
+        return replace(
+            some,
+            cameras=tuple(kind.seen_by(c) for c in some.cameras),
+            displacement=some.displacement if "displacement" in own else None,
+            sigma=some.sigma if "sigma" in own else None,
+            maps={name: values for name, values in some.maps.items() if name in own},
+        )
 
     def measured(self, view: int) -> Bool[Tensor, "row column"]:
         """Which pixels of a view have a value and, where it is known, a sigma within the limits of the technique."""

@@ -32,7 +32,7 @@ from nerif.reconstruction.files import (
 )
 from nerif.reprojection import Reprojection
 from nerif.toml import read_toml, write_toml
-from nerif.volume import Volume
+from nerif.volume import INDEX, Volume, field_of
 from nerif.volume_file import read_volume, read_volumes
 
 __all__ = [
@@ -79,7 +79,7 @@ class Result:
     volumes : by quantity; with an ensemble also index_excess_mean, index_excess_std, ...
     reprojection : measured and predicted views, or None
     measurement : what was measured, or None
-    truth : index excess it was compared with, relative to the ambient of the result, or None
+    truth : field it was compared with, an index relative to the ambient of the result, or None
     missing : what is not there or cannot be read
     """
 
@@ -93,6 +93,11 @@ class Result:
     measurement: Measurement | None = None
     truth: Volume | None = None
     missing: tuple[Missing, ...] = ()
+
+    @property
+    def field(self) -> Volume | None:
+        """The reconstructed field, from which the other volumes follow."""
+        return self.volumes.get(field_of(self.volumes) or "")
 
     @property
     def method(self) -> str:
@@ -311,8 +316,10 @@ class ResultDirectory:
             return None
         places = (Path(path), self.path / Path(path).name, self.path.parent / Path(path).name)
         try:
-            truth = read_volume(next((p for p in places if p.is_file()), places[0]))
-            ambient = volumes["index_excess"].n_ambient if "index_excess" in volumes else None
+            found = field_of(volumes)
+            path = next((p for p in places if p.is_file()), places[0])
+            truth = read_volume(path, None if found in (None, INDEX) else found)
+            ambient = volumes[INDEX].n_ambient if found == INDEX else None
             return truth if ambient is None else truth.relative_to(ambient)
         except InputError as error:
             missing.append(Missing("truth", f"The truth cannot be shown beside the field: {error}"))
@@ -379,6 +386,10 @@ def _checked(found: Any) -> dict[str, Any]:
         table = found.get(name, {known: 0})
         if not isinstance(table, dict) or known not in table:
             raise ValueError(f"'{name}' is not a table with '{known}'")
+    ensemble = found.get("ensemble") or {}
+    for row in (*found.get("views", []), *(ensemble.get("left_out") or [])):  # older files knew displacements only
+        for key, value in (("measured", "displacement"), ("unit", "px"), ("rms", row.get("rms_px"))):
+            row.setdefault(key, value)
     return found
 
 

@@ -27,7 +27,7 @@ from nerif.physics.ray_tracing import background_points
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.registry import forward_model, technique
-from nerif.volume import INDEX, Volume, describe
+from nerif.volume import INDEX, Volume
 from nerif.volume_file import read_volume
 from nerif.volume_sequence import VolumeSequence
 
@@ -215,8 +215,8 @@ class Simulation:
         )  # fmt: skip
         if self.counts:
             measurement = add_quantum_noise(measurement, self.counts, self.seed + frame)
-        grid, quantity = Grid.of_resolution(box, self.truth_voxels), measurement.quantity
-        return measurement, Volume(field.sample(grid), grid, quantity, describe(quantity)[0], {"n_ambient": n_ambient})
+        grid = Grid.of_resolution(box, self.truth_voxels)
+        return measurement, Volume.of(field.sample(grid), grid, measurement.quantity, n_ambient)
 
     def over_time(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 from jaxtyping import Float
@@ -10,7 +11,7 @@ from torch import Tensor
 from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Grid
 
-__all__ = ["INDEX", "QUANTITIES", "STATISTICS", "Volume", "describe", "quantities_of"]
+__all__ = ["INDEX", "QUANTITIES", "STATISTICS", "Volume", "describe", "field_of", "name_of", "quantities_of"]
 
 QUANTITIES = {
     "index_excess": ("1", "refractive index minus that of the ambient"),
@@ -29,6 +30,17 @@ OF_AN_INDEX = (INDEX, "n", "density", "temperature")
 def quantities_of(quantity: str) -> tuple[str, ...]:
     """Return what can be given of a reconstructed field: of an index excess all that follows from it, else itself."""
     return OF_AN_INDEX if quantity == INDEX else (quantity,)
+
+
+def field_of(quantities: Iterable[str]) -> str | None:
+    """Return which of the quantities of one result is the reconstructed field: none of what follows from an index."""
+    known = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and q not in OF_AN_INDEX[1:]]
+    return INDEX if INDEX in known else next(iter(known), None)
+
+
+def name_of(quantity: str) -> str:
+    """Return what a field of a quantity is called: an excess is one of refractive index."""
+    return describe("n" if quantity == INDEX else quantity)[1]
 
 
 STATISTICS = {"mean": "mean", "std": "standard_deviation"}
@@ -72,6 +84,12 @@ class Volume:
                 f"got {tuple(self.values.shape)}"
             )
 
+    @classmethod
+    def of(cls, values: Float[Tensor, "z y x"], grid: Grid, quantity: str, n_ambient: float) -> Volume:
+        """Return a reconstructed field, or what follows from it, with its unit and, of an index, the ambient."""
+        attributes: dict[str, float | str] = {"n_ambient": n_ambient} if quantity in OF_AN_INDEX else {}
+        return cls(values, grid, quantity, describe(quantity)[0], attributes)
+
     @property
     def n_ambient(self) -> float | None:
         """Refractive index around the flow, from which an excess is counted; None where nobody said."""
@@ -102,12 +120,12 @@ class Volume:
 
     def summary(self) -> list[tuple[str, str]]:
         """Return what it holds as names and values with units."""
-        from nerif.drawing import shown
+        from nerif.drawing import LABELS, shown
         from nerif.notebook import span
 
         shape = " × ".join(str(n) for n in self.grid.shape[::-1])
         edges = " × ".join(f"{e:g}" for e in self.grid.box.edges)
-        unit = "" if self.unit == "1" else f" {self.unit}"
+        unit = "" if self.unit == "1" else f" {LABELS.get(self.quantity, ('', self.unit))[1]}"
         name = "n − 1" if self.quantity == "n" else self.quantity.replace("_", " ").capitalize()
         rows = [(name, span(shown(self), unit)), ("Voxels", f"{shape} (x, y, z)"), ("Volume", f"{edges} mm (x, y, z)")]
         if self.n_ambient is not None:
@@ -119,4 +137,4 @@ class Volume:
         from nerif.notebook import panel, show_slices
 
         title = describe(self.quantity)[1].capitalize()
-        return panel(title, self.summary(), show_slices(self), f"{title} in the three middle slices")
+        return panel(title, self.summary(), (show_slices(self), f"{title} in the three middle slices"))

@@ -14,7 +14,7 @@ from nerif.atomic import atomic
 from nerif.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError
 from nerif.geometry import Box, Grid
 from nerif.netcdf import opened, values
-from nerif.volume import QUANTITIES, STATISTICS, Volume, describe
+from nerif.volume import QUANTITIES, STATISTICS, Volume, describe, field_of, name_of
 from nerif.vti import read_vti
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["REFERENCES", "read_volume", "read_volumes", "write_netcdf"]
 
-TITLE = "Field of refractive index (background-oriented schlieren)"
 REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
 
 
@@ -48,8 +47,9 @@ def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
         data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), about)
         attributes |= v.attributes
     dataset = xr.Dataset(data, coords=coordinates)
+    title = f"Field of {name_of(field_of(data) or volumes[0].quantity)}"
     written = f"{datetime.now(UTC).isoformat(timespec='seconds')} written by nerif {__version__}"
-    dataset.attrs = {"Conventions": "CF-1.11", "title": TITLE, "source": f"nerif {__version__}", "history": written}
+    dataset.attrs = {"Conventions": "CF-1.11", "title": title, "source": f"nerif {__version__}", "history": written}
     dataset.attrs |= {"references": REFERENCES, **attributes}
     # the box cannot be told from one voxel centre alone
     dataset.attrs["box_lower_mm"], dataset.attrs["box_upper_mm"] = list(grid.box.lower), list(grid.box.upper)
@@ -69,8 +69,8 @@ def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
     """Read one quantity of a .nc or .vti file as a Volume.
 
-    Without `quantity`, index_excess is taken, or n, or the only variable there is. n becomes the index excess where the
-    file says its n_ambient, and stays n, in double precision, where it does not.
+    Without `quantity`, index_excess is taken, or n, or another reconstructed field, or the only variable. n becomes the
+    index excess where the file says its n_ambient, and stays n, in double precision, where it does not.
 
     Raises
     ------
@@ -80,7 +80,8 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     arrays, grid, attributes = _read(Path(path))
     if quantity is None:
         known = [q for q in ("index_excess", "n") if q in arrays]
-        quantity = known[0] if known else next(iter(arrays)) if len(arrays) == 1 else None
+        only = next(iter(arrays)) if len(arrays) == 1 else field_of(q for q in arrays if q in QUANTITIES)
+        quantity = known[0] if known else only
     if quantity is None or quantity not in arrays:
         raise InputError(
             f"{path}: expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}"

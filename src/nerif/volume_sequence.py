@@ -12,7 +12,7 @@ from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Box, Grid
 from nerif.measurement_sequence import add_frames, require_zarr
 from nerif.netcdf import reading
-from nerif.volume import Volume, describe
+from nerif.volume import Volume, describe, field_of, name_of
 from nerif.volume_file import REFERENCES
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class VolumeSequence:
             coords={"time": ("time", np.array(times, dtype=np.float64), {"units": "s", "axis": "T"}), **axes},
             attrs={
                 "Conventions": "CF-1.11",
-                "title": "Fields of refractive index over time (background-oriented schlieren)",
+                "title": f"Fields of {name_of(field_of(quantities) or quantities[0])} over time",
                 "references": REFERENCES,
                 "n_ambient": n_ambient,
                 "box_lower_mm": list(grid.box.lower),
@@ -122,6 +122,11 @@ class VolumeSequence:
             return np.asarray(self.array(name)[index])
 
     @property
+    def view_rms(self) -> Any:
+        """The array (time, view) of rms differences to what the views measured; its attribute `units` has the unit."""
+        return self.array("rms_px" if "rms_px" in self.group else "rms")
+
+    @property
     def quantities(self) -> tuple[str, ...]:
         """What is there over time and space."""
         volumes = ("time", "z", "y", "x")
@@ -148,4 +153,4 @@ class VolumeSequence:
         if quantity not in self.quantities:
             raise InputError(f"{self.path}: expected one of {', '.join(self.quantities)}, got '{quantity}'")
         values = torch.from_numpy(self.read(quantity, index))
-        return Volume(values, self.grid, quantity, describe(quantity)[0], {"n_ambient": self.n_ambient})
+        return Volume.of(values, self.grid, quantity, self.n_ambient)

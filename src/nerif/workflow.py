@@ -32,6 +32,7 @@ from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.result import REPORT, ResultDirectory, versions
+from nerif.volume import quantities_of
 from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["METHODS", "Run", "reconstruct_into", "write_report", "write_sequence_report"]
@@ -119,8 +120,12 @@ def reconstruct_into(
     run = replace(run, gas=run.gas.for_measurement(measurement))
     if measurement.bad_pixels:
         where = "the measurement" if path is None else path
-        what = "pixels left out whose displacement or sigma is NaN, infinite or impossible"
+        seen = " or ".join(o.technique.measured for o in measurement.observations)
+        what = f"pixels left out whose {seen} or sigma is NaN, infinite or impossible"
         monitor.say(f"{where}: {measurement.bad_pixels} {what}")
+    if measurement.about_views:
+        names = ", ".join(measurement.about_views)
+        monitor.say(f"{names}: known of the views, but the reconstruction makes no use of it yet")
     state = out.state() if resume else None
     start = _start(run, measurement) if run.ensemble or not resume else None
     if not resume:
@@ -132,6 +137,8 @@ def reconstruct_into(
         with monitor.training("training") as told:
             return reconstructor(training, told, state, start if state is None else None)
     settings = _settings(run, path, reconstructor, voxels, keep or {})
+    if "density" not in quantities_of(measurement.quantity):
+        del settings["gas"]
     begin = _begin(out, settings, resume)
     with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
         callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]

@@ -9,11 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from nerif.cli import main
+from nerif.geometry import Box, Grid
+from nerif.report import html
 from nerif.report.packing import relation
 from nerif.report.pages import error_of
-from nerif.result import ResultDirectory
+from nerif.result import Result, ResultDirectory
+from nerif.volume import Volume
 from report.browsing import (
     choose,
     drag,
@@ -192,3 +196,17 @@ def test_without_webgl_it_says_so_and_the_slices_stay(whole, tmp_path):
         assert (np.abs(np.diff(picture(driver, "#slice-z"), axis=0)).max() > 0).any()
     finally:
         driver.quit()
+
+
+def test_a_field_that_is_no_index_is_drawn_as_it_is(browser, tmp_path):
+    grid = Grid(Box((-5.0, -4.0, -3.0), (5.0, 4.0, 3.0)), (8, 10, 12))
+    x, y, z = grid.points().unbind(-1)
+    ball = Volume(0.03 * torch.exp(-(x**2 + y**2 + z**2) / 4), grid, "extinction", "mm-1")
+    html.write(html.render(Result(tmp_path, volumes={"extinction": ball})), tmp_path / "report.html")
+    show(browser, tmp_path / "report.html")
+    assert errors(browser) == []
+    assert text(browser, "#bar-label") == "extinction coefficient [mm⁻¹]"
+    said = re.search(r"coefficient = ([\d.]+) mm⁻¹", text(browser, "#readout"))
+    assert said is not None
+    assert float(said[1]) == pytest.approx(float(ball.values[4, 5, 6]), rel=1e-3)
+    assert (np.ptp(picture(browser, "#space"), axis=-1) > 60).mean() > 0.005  # the isosurface

@@ -73,11 +73,11 @@ def test_functions_give_back_the_axes_they_take(volume, whole):
     figure = Figure()
     for draw, *data in (
         (drawing.draw_slice, volume, "y"),
-        (drawing.draw_displacement, np.zeros((3, 4)), 1.0),
+        (drawing.draw_map, np.zeros((3, 4)), (-1.0, 1.0)),
         (figures.draw_history, result.history, "nerif"),
         (figures.draw_slice_scores, result.metrics["slices"]),
         (figures.draw_view_scores, result.metrics["views"]),
-        (figures.draw_residuals, residuals_over_sigma(result.reprojection)),
+        (figures.draw_residuals, residuals_over_sigma(result.reprojection)["displacement"]),
     ):
         axes = Figure().subplots()
         assert draw(axes, *data) is axes
@@ -120,7 +120,8 @@ def test_names_of_views_become_names_of_files(whole):
     m = result.reprojection.measurement
     odd = ("a/b", "a b", "a$x_$", "é<")
     cameras = tuple(replace(c, name=name) for c, name in zip(m.cameras, odd, strict=True))
-    views = [{"name": name, "held_out": False, "cc": 0.9, "rms_px": 0.1} for name in odd]
+    scores = {"held_out": False, "cc": 0.9, "rms": 0.1, "measured": "displacement", "unit": "px"}
+    views = [{"name": name, **scores} for name in odd]
     renamed = Result(
         whole,
         metrics={"views": views},
@@ -161,7 +162,7 @@ def test_colours_do_not_go_to_a_few_outliers(volume):
     ("quantity", "label"),
     [
         ("n", "n − 1 [1]"),
-        ("density_std", "standard deviation of density [kg m$^{-3}$]"),
+        ("density_std", "standard deviation of density [kg m⁻³]"),
         ("temperature_mean", "mean temperature [K]"),
         ("concentration", "concentration [1]"),
     ],

@@ -131,11 +131,14 @@ def test_finer_volumes_are_averaged_down_in_their_box():
 def test_pictures_of_views_share_their_scales(whole):
     reprojection = ResultDirectory(whole).read().reprojection
     assert reprojection is not None
-    views, limit, apart = view_images(reprojection, [])
+    views, [scale] = view_images(reprojection, [])
     assert [v.held_out for v in views] == [False, False, False, True]
     measured = reprojection.measurement.displacement[reprojection.measurement.usable].abs()
-    assert 0 < limit <= float(measured.max())
-    assert apart < limit
+    assert (scale.measured, scale.unit) == ("displacement", "px")
+    for low, high in (scale.limits, scale.apart):
+        assert low == -high
+    assert 0 < scale.limits[1] <= float(measured.max())
+    assert scale.apart[1] < scale.limits[1]
     assert all(address.startswith("data:image/png") for v in views for row in v.rows.values() for address in row)
 
 
@@ -202,9 +205,8 @@ def test_refusals(tmp_path, capsys, whole):
 
 
 def view(held_out: bool, cc: float, noise: float | None) -> dict:
-    return {"name": "a", "held_out": held_out, "cc": cc, "rms_px": 0.1} | (
-        {} if noise is None else {"rms_over_sigma": noise}
-    )
+    known = {"name": "a", "held_out": held_out, "cc": cc, "rms": 0.1, "measured": "displacement", "unit": "px"}
+    return known if noise is None else {**known, "rms_over_sigma": noise}
 
 
 @pytest.mark.parametrize(
@@ -299,7 +301,7 @@ def test_the_gas_is_doubted_in_a_liquid(tmp_path):
 def test_residuals_are_those_of_every_ray_through_the_box(measurement):
     """Also where the field is exactly 0, as outside a visual hull."""
     nothing = Reprojection(measurement, {"deflection": torch.zeros_like(measurement.displacement)})
-    found = residuals_over_sigma(nothing)
+    found = residuals_over_sigma(nothing)["displacement"]
     seen = measurement.usable & measurement.sees_box
     assert found.size == 2 * int(seen.sum())
     scores = evaluate_views(nothing)
@@ -313,7 +315,7 @@ def test_of_many_pixels_a_regular_lattice_is_taken(measurement):
     assert lattice_step(measurement, 10**6) == 1
     assert lattice_step(measurement, measurement.displacement[..., 0].numel() // 9 + 1) == 3
     seen = (measurement.usable & measurement.sees_box)[:, ::3, ::3]
-    some = residuals_over_sigma(nothing, measurement.displacement[..., 0].numel() // 9 + 1)
+    some = residuals_over_sigma(nothing, measurement.displacement[..., 0].numel() // 9 + 1)["displacement"]
     assert some.size == 2 * int(seen.sum())
     expected = -(measurement.displacement / measurement.sigma)[:, ::3, ::3][seen]
     np.testing.assert_allclose(np.sort(some), np.sort(expected.flatten().numpy()), rtol=1e-5)

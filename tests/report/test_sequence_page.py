@@ -34,8 +34,8 @@ def store_of(path: Path, frames: int, **attributes: object) -> VolumeSequence:
     add_frames(store.group, "status", frames, (), (), "int8", 0)
     add_frames(store.group, "reason", frames, (), (), "str", "")
     add_frames(store.group, "seconds", frames, (), (), "float64")
-    for name in ("cc", "rms_px"):
-        add_frames(store.group, name, frames, (2,), ("view",), "float64")
+    for name, unit in (("cc", "1"), ("rms_px", "px")):
+        add_frames(store.group, name, frames, (2,), ("view",), "float64", units=unit)
     for i in range(frames - 1):
         store.write(i, [Volume(Flame(box, time=store.times[i]).sample(grid), grid)])
         store.array("cc")[i], store.array("rms_px")[i] = np.array([0.99, 0.9]), np.array([0.01, 0.04])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +14,21 @@ import xarray as xr
 
 from nerif.cli import main
 from nerif.conventions import InputError
+from nerif.fields.mlp import Network, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.report.movie import Movie
+from nerif.report.sequence_page import render_sequence
+from nerif.sequence.evaluation import evaluate_sequence
+from nerif.sequence.frames import finished_frame
+from nerif.sequence.plan import SequencePlan, SequenceSettings
+from nerif.sequence.run import outcome_table
+from nerif.sequence.store import SequenceStore
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
-from sequence_films import blank
+from sequence_films import COLD, RIG, blank
 
 
 def same(a: Measurement, b: Measurement) -> bool:
@@ -180,3 +190,31 @@ def test_nothing_of_a_sequence_is_nan_but_what_was_not_measured(five):
     sequence = MeasurementSequence.read(five)
     assert len(sequence) == 5
     assert np.isfinite(sequence.frame(4).displacement.numpy()).all()
+
+
+def test_a_store_of_another_technique_says_what_it_holds(tmp_path):
+    """Emission: its own quantity, its unit of the difference, and a page and figures that speak of it."""
+    film = tmp_path / "film.zarr"
+    words = ["--phantom", "flame", "--times", "0:1e-4:2", "--noise", "0.05", "-o", str(film), *RIG]
+    assert main(["simulate", "--technique", "emission", *words]) == 0
+    sequence = MeasurementSequence.read(film)
+    like = sequence.first_good()
+    plan = SequencePlan(film, tmp_path / "r.zarr", COLD, SequenceSettings(voxels=8).for_measurement(like))
+    grid = Grid.of_resolution(like.box, 8)
+    kept = {"bounds": [0.0, None], **plan.kept}
+    store = SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, COLD.network, kept)
+    field = NeuralField(Network(COLD.network, bounds=(0.0, math.inf)), like.box, 0.02)
+    for i in range(2):
+        store.write_frame(i, finished_frame(plan, field, sequence.frame(i), "cpu"))
+    assert store.quantities == ("emission",)
+    assert store.attributes["title"] == "Fields of radiance per length over time"
+    assert store.view_rms.attrs["units"] == "1"
+    assert torch.equal(store.field(1).sample(grid), store.volume(1, "emission").values)
+    assert " px" not in outcome_table(store)
+    metrics = evaluate_sequence(plan.out, tmp_path / "film.truth.zarr")
+    assert metrics["mean"]["l2"] == pytest.approx(metrics["mean"]["l2_variation"])
+    text = re.sub(r"<(script|style)\b.*?</\1>", "", render_sequence(store), flags=re.DOTALL)
+    assert "Emission tomography" in text
+    assert "Radiance per length" in text
+    assert " px" not in text
+    assert Movie().quantity_of(store) == "emission"

@@ -21,9 +21,9 @@ class Check(Settings):
     """Predict every view by a quick reconstruction from the others, and name the ones that do not fit, and why.
 
     Found are: u and v swapped, a flipped sign, a mirrored, reversed or turned picture, of one view or all; two views
-    exchanged; displacements of a wrong size; flow that leaves the box through a face. What fits equally well either
-    way is not: a flipped sign of everything (so it says whether the flow comes out lighter or denser), a mirrored
-    picture of a symmetric flow.
+    exchanged; values of a wrong size; flow that leaves the box through a face. What fits equally well either way is
+    not: a flipped sign of everything (so it says whether a flow comes out lighter or denser), a mirrored picture of a
+    symmetric flow. Each technique of a measurement is checked by itself.
     """
 
     measurement: tyro.conf.Positional[Path]
@@ -41,10 +41,12 @@ def run(settings: Check) -> Consistency:
     measurement = Measurement.read(settings.measurement)
     with counting_bar("comparing views") as bar:
         result = check_consistency(measurement, settings.voxels, bar)
+    of = "measured      " if len({view.measured for view in result.views}) > 1 else ""
     if result.views:
-        say(f"{'view':<14}{'valid':>8}{'agreement':>11}{'gain':>7}")
+        say(f"{'view':<14}{of}{'valid':>8}{'agreement':>11}{'gain':>7}")
     for view in result.views:
-        say(f"{view.name:<14}{view.valid:>8.1%}{view.agreement:>11.2f}{view.gain:>7.2f}  {view.verdict}")
+        name = f"{view.name:<14}{view.measured if of else '':<{len(of)}}"
+        say(f"{name}{view.valid:>8.1%}{view.agreement:>11.2f}{view.gain:>7.2f}  {view.verdict}")
     for remark in result.remarks:
         say(f"note: {remark}")
     for finding in result.findings:

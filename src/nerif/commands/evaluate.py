@@ -12,6 +12,7 @@ from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.evaluation import FLOW, evaluate, rms_text
+from nerif.volume import INDEX, name_of
 
 __all__ = ["Evaluate", "main", "run"]
 
@@ -23,7 +24,7 @@ class Evaluate(Settings):
     result: Annotated[Path, tyro.conf.Positional]
     """Result directory of nerif reconstruct, or store of nerif sequence (.zarr)."""
     truth: Path | None = None
-    """Volume file (.nc, .vti) of the true index, compared on its own grid; of a sequence NAME.truth.zarr."""
+    """Volume file (.nc, .vti) of the true field, compared on its own grid; of a sequence NAME.truth.zarr."""
     measurement: Path | None = None
     """Measurement to re-project into."""
     hold_out: tuple[str, ...] | None = None
@@ -40,9 +41,12 @@ def run(settings: Evaluate) -> dict[str, Any]:
         if "coverage" in metrics:
             share = metrics["coverage"]
             say(f"truth within 2 standard deviations of the ensemble's mean: {share['share']:.1%} of the voxels,")
-            say(f"  {share['share_in_flow']:.1%} of those where the excess is above {FLOW:.0%} of its largest")
-        say(f"L2            {metrics['l2']:8.3%}   |n_gt - n_rec| / |n_gt - 1|, the paper's")
-        say(f"L2 variation  {metrics['l2_variation']:8.3%}   |n_gt - n_rec| / |n_gt - n_ambient|")
+            say(f"  {share['share_in_flow']:.1%} of those where the field is above {FLOW:.0%} of its largest")
+        if metrics["quantity"] == INDEX:
+            say(f"L2            {metrics['l2']:8.3%}   |n_gt - n_rec| / |n_gt - 1|, the paper's")
+            say(f"L2 variation  {metrics['l2_variation']:8.3%}   |n_gt - n_rec| / |n_gt - n_ambient|")
+        else:
+            say(f"L2            {metrics['l2']:8.3%}   |f_gt - f_rec| / |f_gt| of the {name_of(metrics['quantity'])} f")
         say(f"CC            {metrics['cc']:8.5f}")
         say(f"SSIM          {metrics['ssim']:8.5f}")
         say(f"PSNR          {metrics['psnr']:8.2f} dB")
@@ -50,10 +54,12 @@ def run(settings: Evaluate) -> dict[str, Any]:
         for s in metrics["slices"]:
             say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
     if settings.measurement is not None:
-        say("view                CC    SSIM  PSNR [dB]  rms")
+        several = len({v["measured"] for v in metrics["views"]}) > 1
+        say(f"view          {' ' * 14 * several}      CC    SSIM  PSNR [dB]  rms")
         for v in metrics["views"]:
             held = "  held out" if v["held_out"] else ""
-            say(f"{v['name']:<14} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {rms_text(v)}{held}")
+            name = f"{v['name']}, {v['measured']}" if several else v["name"]
+            say(f"{name:<{14 + 14 * several}} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {rms_text(v)}{held}")
     return metrics
 
 

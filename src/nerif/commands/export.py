@@ -15,7 +15,7 @@ from nerif.exports import FORMATS, export
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings, derive, masked_lines
 from nerif.result import ResultDirectory
-from nerif.volume import Volume
+from nerif.volume import Volume, quantities_of
 
 __all__ = ["Export", "main", "run"]
 
@@ -28,8 +28,9 @@ class Export(Settings):
     """Result directory of nerif reconstruct."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File to write; its ending says the format: .vti, .nc, .npz, .mat or .csv."""
-    quantities: tuple[str, ...] = ("index_excess", "n", "density")
-    """Out of index_excess (1), n (1), density (kg/m3), temperature (K)."""
+    quantities: tuple[str, ...] = ()
+    """Of an index out of index_excess (1), n (1), density (kg/m3), temperature (K); default: all but the last, or the
+    field where it is no index."""
     voxels: int = 100
     """Voxels along the longest edge; near-cubic voxels."""
     shape: tuple[int, int, int] | None = None
@@ -46,21 +47,21 @@ class Export(Settings):
 
 def run(settings: Export) -> None:
     """Write the file."""
-    if not settings.quantities:
-        raise InputError("quantities: expected at least one, got none")
     if settings.out.suffix not in FORMATS:
         raise InputError(f"out: expected a name ending in {', '.join(FORMATS)}, got '{settings.out.name}'")
     check_file(settings.out, settings.force)
-    index, whole, n_ambient = ResultDirectory(settings.result).field()
+    result = ResultDirectory(settings.result)
+    (field, whole, n_ambient), quantity = result.field(), result.quantity()
     box = Box(settings.lower or whole.lower, settings.upper or whole.upper)
     if not whole.holds(box):
         whole_box = f"{whole.lower} to {whole.upper} mm"
         raise InputError(f"lower, upper: expected a part of the box {whole_box}, got {box.lower} to {box.upper}")
     grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
-    excess = Volume(index.sample(grid), grid, attributes={"n_ambient": n_ambient})
-    volumes = [derive(excess, q, settings.gas) for q in settings.quantities]
+    asked = settings.quantities or tuple(q for q in quantities_of(quantity) if q != "temperature")
+    reconstructed = Volume.of(field.sample(grid), grid, quantity, n_ambient)
+    volumes = [derive(reconstructed, q, settings.gas) for q in asked]
     export(settings.out, volumes)
-    say(f"{settings.out}: {', '.join(settings.quantities)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
+    say(f"{settings.out}: {', '.join(asked)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
     for line in masked_lines(volumes):
         say(line)
 

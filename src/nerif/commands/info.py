@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,8 +16,9 @@ from nerif.evaluation import rms_text
 from nerif.measurement import Measurement
 from nerif.measurement_file import known_conventions
 from nerif.netcdf import opened
+from nerif.notebook import number
 from nerif.result import METRICS, ResultDirectory
-from nerif.volume import Volume
+from nerif.volume import INDEX, Volume, name_of
 from nerif.volume_file import read_volume
 
 __all__ = ["Info", "main", "run"]
@@ -71,19 +73,21 @@ def _measurement(path: Path, m: Measurement) -> None:
     for name in m.about_views:
         say(f"  {name:<14} known of the views")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
-    say("  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable        rms")
-    usable = m.usable
+    columns = "".join(f"{f'rms {o.technique.measured}':>18}" for o in m.observations)
+    say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable{columns}")
+    usable, masks = m.usable, [m.usable_for(o) for o in m.observations]
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
         away, pixel = float(c.distance(centre)), float(c.pixel_size(centre))
         plane = c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
-        good = m.observations[0].values[i][m.usable_for(m.observations[0])[i]]
+        good = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
+        sizes = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:18.4f}" for x in good)
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
         say(
             f"  {c.name:<14} {size:>10} {pixel:11.4g} {away:23.1f} {behind:>20} "
-            f"{share:8.1%} {float(good.square().mean().sqrt()):10.4f}"
+            f"{share:8.1%}{sizes}"
         )
 
 
@@ -102,19 +106,21 @@ def _volume(path: Path, v: Volume) -> None:
 def _result(path: Path) -> None:
     directory = ResultDirectory(path)
     _, box, n_ambient = directory.field()
-    say(f"{path}: reconstruction")
+    quantity = directory.quantity()
+    say(f"{path}: reconstruction of {name_of(quantity)}")
     say(f"  box            {_corners(box.lower, box.upper)}")
-    say(f"  n_ambient      {n_ambient:.8g}")
+    if quantity == INDEX:
+        say(f"  n_ambient      {n_ambient:.8g}")
     if not directory.has(METRICS):
         say(f"  {METRICS} is missing; the run may not have ended")
         return
     metrics = directory.metrics()
     for name, value in metrics.items():
-        if not isinstance(value, list):
+        if not isinstance(value, list | dict):
             say(f"  {name:<18} {value}")
     for v in metrics.get("views", []):
         held = "held out" if v["held_out"] else "training"
-        say(f"  view {v['name']:<14} {held}  CC {v['cc']}  rms {rms_text(v)}")
+        say(f"  view {v['name']:<14} {held}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_text(v)}")
 
 
 def main(arguments: list[str]) -> None:

@@ -133,8 +133,7 @@ class Reconstruction:
 
     def volume(self, grid: Grid) -> Volume:
         """Return the field at the voxel centres of a grid."""
-        values, unit = self.field.sample(grid, self.device), describe(self.quantity)[0]
-        return Volume(values, grid, self.quantity, unit, {"n_ambient": self.n_ambient})
+        return Volume.of(self.field.sample(grid, self.device), grid, self.quantity, self.n_ambient)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the three middle slices, why it stopped, how long it took, and the misfit."""
@@ -150,7 +149,7 @@ class Reconstruction:
                 break
         picture = show_slices(volume)
         caption = f"{describe(self.quantity)[1].capitalize()} in the three middle slices"
-        return panel("Reconstruction", rows + volume.summary(), picture, caption)
+        return panel("Reconstruction", rows + volume.summary(), (picture, caption))
 
 
 class Reconstructor(ABC):

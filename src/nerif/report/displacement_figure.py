@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nerif.atomic import atomic
-from nerif.drawing import draw_displacement
+from nerif.drawing import draw_map
 from nerif.measurement import Measurement
 
 __all__ = ["save_displacements", "save_masks"]
@@ -37,7 +37,7 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
             axes = grid[2 * (i // columns) + k, i % columns]
             axes.set_visible(True)
             axes.set_facecolor("0.75")
-            shown = draw_displacement(axes, d[i, : -(-height // step), : -(-width // step), k], limit)
+            shown = draw_map(axes, d[i, : -(-height // step), : -(-width // step), k], (-limit, limit))
             shown.images[-1].set_extent((-0.5, width - 0.5, height - 0.5, -0.5))
             axes.set_title(f"{camera.name}: {component}", fontsize=8)
             axes.tick_params(labelsize=6)

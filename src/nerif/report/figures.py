@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 __all__ = ["draw_history", "draw_residuals", "draw_slice_scores", "draw_view_scores"]
 
 TERMS = {
-    "automatic": "displacement, exact gradient",
-    "numerical": "displacement, central differences",
-    "head": "displacement, gradient head",
+    "automatic": "views, exact gradient",
+    "numerical": "views, central differences",
+    "head": "views, gradient head",
     "consistency": "head against gradient",
     "gauge": "ambient (gauge)",
     "loss": "whole loss",
@@ -72,9 +72,10 @@ def draw_slice_scores(axes: Axes, slices: list[dict[str, Any]]) -> Axes:
 
 
 def draw_view_scores(axes: Axes, views: list[dict[str, Any]]) -> Axes:
-    """Draw the rms error of every view, in units of its noise where known, else in px; held-out views marked."""
+    """Draw the rms error of every view, in units of its noise where known, else as measured; held-out views marked."""
     in_sigma = all(v.get("rms_over_sigma") is not None for v in views)
-    key = "rms_over_sigma" if in_sigma else "rms_px"
+    several = len({v["measured"] for v in views}) > 1
+    key = "rms_over_sigma" if in_sigma else "rms"
     places = range(len(views))
     for place, view in zip(places, views, strict=True):
         value = view.get(key)
@@ -85,9 +86,10 @@ def draw_view_scores(axes: Axes, views: list[dict[str, Any]]) -> Axes:
         axes.bar(place, value, width=0.7, color=colour, hatch="///" if held else None, edgecolor="white", linewidth=0)
     if in_sigma:
         axes.axhline(1, color=COLOURS["grey"], linewidth=0.8, linestyle="--")
-    names = [f"{v['name']}\nheld out" if v["held_out"] else v["name"] for v in views]
+    names = [f"{v['name']}{', ' + v['measured'] if several else ''}" for v in views]
+    names = [f"{name}\nheld out" if v["held_out"] else name for name, v in zip(names, views, strict=True)]
     axes.set_xticks(list(places), names, rotation=90, parse_math=False)
-    axes.set_ylabel("rms error / noise [1]" if in_sigma else "rms error [px]")
+    axes.set_ylabel("rms error / noise [1]" if in_sigma else f"rms error [{views[0]['unit']}]")
     return axes
 
 

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerif import __version__
 from nerif.atomic import atomic
-from nerif.drawing import DIVERGING
+from nerif.drawing import drawn_of, map_colours
 from nerif.notebook import number, picture
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.pages import residuals_over_sigma
-from nerif.report.scene import QUANTITIES, scene_of
-from nerif.report.summary import came_out, headline, measured, trust, trust_figures
+from nerif.report.scene import scene_of
+from nerif.report.summary import came_out, headline, measured, rms_of, trust, trust_figures
 from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
+from nerif.techniques.registry import technique_of
+from nerif.volume import name_of
 
 if TYPE_CHECKING:
     import jinja2
@@ -44,9 +46,10 @@ def render(result: Result) -> str:
     scene, arrays = scene_of(result)
     metrics = result.metrics.get("views")
     metrics = metrics if isinstance(metrics, list) else []
-    views, limit, apart = ([], 0.0, 0.0) if result.reprojection is None else view_images(result.reprojection, metrics)
+    views, scales = ([], []) if result.reprojection is None else view_images(result.reprojection, metrics)
     first = next((v.name for v in views if v.held_out), views[0].name if views else "")
     return render_page(
+        kind=_kind(result),
         title=result.directory.resolve().name,
         source=_source(result),
         finished=result.about.get("finished", ""),
@@ -61,15 +64,14 @@ def render(result: Result) -> str:
         arrays=arrays,
         views=views,
         first_view=first,
-        limit=limit,
-        apart=apart,
+        scales=scales,
         scores=metrics,
         left_out=(result.metrics.get("ensemble") or {}).get("left_out") or [],
         curves=_curves(result),
         assumptions=[
-            (QUANTITIES[q][0], result.volumes[q].notes)
-            for q in ("density", "temperature")
-            if q in result.volumes and "assumption" in result.volumes[q].notes
+            (name_of(q).capitalize(), result.volumes[q].notes)
+            for q in drawn_of(result.volumes)
+            if "assumption" in result.volumes[q].notes
         ],
         ensemble=result.metrics.get("ensemble"),
         coverage=result.metrics.get("coverage"),
@@ -84,7 +86,6 @@ def render_page(scene: dict[str, Any] | None, **parts: Any) -> str:
         version=__version__,
         scene=scene,
         scene_json=_json(scene),
-        diverging=_gradient(DIVERGING),
         citation=CITATION,
         style=(ASSETS / "report.css").read_text(),
         three=(ASSETS / "three.min.js").read_text(),
@@ -100,6 +101,9 @@ def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(ASSETS)
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["number"] = number
+    environment.filters["gradient"] = lambda limits: _gradient(map_colours(limits))
+    environment.filters["ends"] = _ends
+    environment.filters["rms"] = rms_of
     return environment.get_template("report.html.j2")
 
 
@@ -109,9 +113,11 @@ def _curves(result: Result) -> list[tuple[str, str]]:
     if result.history:
         method = str(result.settings.get("method", "nerif"))
         found.append(("How the run went", svg(lambda axes: draw_history(axes, result.history, method))))
-    if result.reprojection is not None and result.reprojection.measurement.sigma is not None:
-        residuals = residuals_over_sigma(result.reprojection)
-        found.append(("Residuals against the noise", svg(lambda axes: draw_residuals(axes, residuals))))
+    if result.reprojection is not None:
+        several = len(result.reprojection.measurement.observations) > 1
+        for name, residuals in residuals_over_sigma(result.reprojection).items():
+            of = f" of {name}" if several else ""
+            found.append((f"Residuals{of} against the noise", svg(partial(draw_residuals, residuals=residuals))))
     if result.metrics.get("slices"):
         slices = result.metrics["slices"]
         found.append(("Against the truth, slice by slice", svg(lambda axes: draw_slice_scores(axes, slices))))
@@ -123,6 +129,15 @@ def svg(draw: Callable[[Axes], object]) -> str:
     return picture(lambda figure: draw(figure.subplots()), 5.6, 3.6, 10, "svg")
 
 
+def _kind(result: Result) -> str:
+    """What kind of tomography it is, by what was measured, or by what was reconstructed where that is not there."""
+    if result.measurement is not None:
+        kinds = result.measurement.techniques
+    else:
+        kinds = () if result.field is None else (technique_of(result.field.quantity),)
+    return " and ".join(kind.tomography for kind in kinds)
+
+
 def _source(result: Result) -> str:
     """Name of the measurement whose views are shown."""
     path = result.metrics.get("measurement", result.settings.get("measurement"))
@@ -132,6 +147,13 @@ def _source(result: Result) -> str:
 def _gradient(name: str) -> str:
     table = [*colour_table(name)[::16], colour_table(name)[-1]]
     return "linear-gradient(to right, " + ", ".join(f"rgb({r} {g} {b})" for r, g, b in table) + ")"
+
+
+def _ends(limits: tuple[float, float], unit: str) -> list[str]:
+    """What stands below a bar of colours: its ends, and 0 between them."""
+    low, high = limits
+    below = [f"−{number(-low, 3)}"] if low < 0 else []
+    return [*below, "0", f"{number(high, 3)} {unit}".rstrip()]
 
 
 def _json(value: Any) -> str:

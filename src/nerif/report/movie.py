@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,9 @@ import numpy as np
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
-from nerif.drawing import COLOUR_MAPS, LABELS, colour_range, shown
+from nerif.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
 from nerif.report.isosurface import default_level, filled
-from nerif.volume import Volume
+from nerif.volume import Volume, field_of
 from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["STYLES", "Movie", "frames_there"]
@@ -30,7 +31,7 @@ class Movie:
     Parameters
     ----------
     style : isosurface or slices (three, through the middle of the box)
-    quantity : shown
+    quantity : shown; nothing for density or, of what is no index, the field
     level : of the isosurface, in the unit shown; None for halfway between the ambient and what is farthest from it
     size : width and height, px
     azimuth, elevation : of the eye, degrees
@@ -38,7 +39,7 @@ class Movie:
     """
 
     style: str = "isosurface"
-    quantity: str = "density"
+    quantity: str = ""
     level: float | None = None
     size: tuple[int, int] = (960, 720)
     azimuth: float = 35.0
@@ -53,14 +54,29 @@ class Movie:
         if not self.frames_per_second > 0:
             raise InputError(f"frames_per_second: expected a positive number, got {self.frames_per_second}")
 
+    def quantity_of(self, store: VolumeSequence) -> str:
+        """Return what is shown of a store.
+
+        Raises
+        ------
+        InputError
+            If it is not there.
+        """
+        default = "density" if "density" in store.quantities else field_of(store.quantities)
+        chosen = self.quantity or default
+        if chosen is None or chosen not in store.quantities:
+            raise InputError(f"quantity: expected one of {', '.join(store.quantities)}, got '{chosen or 'none'}'")
+        return chosen
+
     def pictures(self, store: VolumeSequence, frames: Sequence[int]) -> Iterator[np.ndarray]:
         """Draw the frames one after the other: (row, column, 3) of 8 bit. The colours are those of the whole movie."""
-        some = [store.volume(i, self.quantity) for i in frames[:: max(1, len(frames) // 8)]]
+        quantity = self.quantity_of(store)
+        some = [store.volume(i, quantity) for i in frames[:: max(1, len(frames) // 8)]]
         ends = [colour_range(shown(v)) for v in some]
         limits = min(low for low, _ in ends), max(high for _, high in ends)
         level = self.level if self.level is not None else float(np.median([default_level(v) for v in some]))
         for i in frames:
-            volume = store.volume(i, self.quantity)
+            volume = store.volume(i, quantity)
             yield self._picture(volume, f"t = {store.times[i] * 1e3:.3f} ms", limits, level)
 
     def _picture(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
@@ -70,13 +86,13 @@ class Movie:
         # VTK looks for a display first, warns that there is none, and draws without
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
 
-        label, unit = _plain(self.quantity)
+        label, unit = _plain(volume.quantity)
         name = f"{label} [{unit}]"
         grid = _points(volume, name)
         plotter = pv.Plotter(off_screen=True, window_size=list(self.size))
         try:
             plotter.set_background("white")
-            colour_map = COLOUR_MAPS.get(self.quantity, "viridis")
+            colour_map = COLOUR_MAPS.get(volume.quantity, SEQUENTIAL)
             if self.style == "slices":
                 bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.2g", "n_labels": 4}
                 bar |= {"position_x": 0.86, "position_y": 0.15, "width": 0.06, "height": 0.5}
@@ -143,8 +159,7 @@ class Movie:
             raise InputError(f"out: expected a name ending in {' or '.join(FORMATS)}, got '{path.name}'")
         if not len(frames):
             raise InputError(f"{store.path}: no frame of it is there yet")
-        if self.quantity not in store.quantities:
-            raise InputError(f"quantity: expected one of {', '.join(store.quantities)}, got '{self.quantity}'")
+        self.quantity_of(store)
         with atomic(path) as part, _writer(part, self.frames_per_second) as writer:
             for done, picture in enumerate(self.pictures(store, frames), start=1):
                 writer.append_data(picture)
@@ -202,7 +217,8 @@ def _writer(path: Path, frames_per_second: float) -> Any:
 def _plain(quantity: str) -> tuple[str, str]:
     """Name and unit for a renderer that knows no mathematics."""
     name, unit = LABELS.get(quantity, (quantity, "1"))
-    return name.replace("n$_{ambient}$", "n_ambient"), unit.replace("$^{-3}$", "^-3")
+    plain = str.maketrans("⁻¹²³", "-123")
+    return name.replace("n$_{ambient}$", "n_ambient"), re.sub("[⁻¹²³]+", lambda m: f"^{m[0].translate(plain)}", unit)
 
 
 def _text(position: str) -> dict[str, Any]:

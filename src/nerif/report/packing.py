@@ -1,7 +1,8 @@
 """Volumes packed small enough to travel inside a page: 16 bit, differences along x, bytes apart, deflated, base64.
 
-The page holds the index excess once; n, density and temperature are simple functions of it (`relation`), so that three
-quantities take the room of one. What stands beside it (spread, error) has 12 bits. 65535 stands for a masked voxel.
+The page holds the reconstructed field once; n, density and temperature are simple functions of an index excess
+(`relation`), so that three quantities take the room of one. What stands beside it (spread, error) has 12 bits. 65535
+stands for a masked voxel.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from jaxtyping import Float
 from nerif.geometry import Grid
 from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
-from nerif.volume import Volume
+from nerif.volume import INDEX, Volume, quantities_of
 
 __all__ = ["COARSE", "FINE", "LARGEST", "MASKED", "coarsen", "pack", "relation"]
 
@@ -29,12 +30,16 @@ FINE, COARSE = 65534, 4095
 def relation(quantity: str, attributes: dict[str, float | str]) -> dict[str, Any]:
     """Return how n - 1, density or temperature q follow from the index excess x, by the attributes of the file.
 
+    Any other field x is shown as it is: q = x.
+
         linear: q = (x + offset) factor,      reciprocal: q = factor / (x + offset)
 
     With a `lower` (None for no bound) q is masked unless x + offset > 0, with an `upper` unless lower <= q <= upper.
     """
-    refractivity = float(attributes["n_ambient"]) - 1
-    found = {"kind": "linear", "offset": refractivity, "factor": 1.0, "lower": None, "upper": None}
+    found: dict[str, Any] = {"kind": "linear", "offset": 0.0, "factor": 1.0, "lower": None, "upper": None}
+    if quantity not in quantities_of(INDEX):
+        return found
+    found["offset"] = float(attributes["n_ambient"]) - 1
     if quantity == "n":
         return found
     k = float(attributes["gladstone_dale_m3_kg-1"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +16,11 @@ from nerif.drawing import (
     DIVERGING,
     add_colour_bar,
     colour_range,
-    draw_displacement,
+    draw_map,
     draw_slices,
+    drawn_of,
     label_of,
+    map_range,
     shown,
     style,
 )
@@ -26,7 +29,7 @@ from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.view_images import lattice_step
 from nerif.reprojection import Reprojection
 from nerif.result import Result
-from nerif.volume import Volume
+from nerif.volume import INDEX, Volume
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +40,6 @@ JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature":
 """Widths of one and of two columns, mm, as the publishers' guides for authors give them."""
 
 NOT_IN_FILES = r"[^\w.+-]"
-TO_DRAW = ("n", "density", "temperature", "n_std", "density_std", "temperature_std")
 
 
 def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi: int = 300) -> list[Path]:
@@ -54,15 +56,15 @@ def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi
 
 def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[str, Figure]]:
     """Draw the figures one by one, with their names; `single` and `double` are column widths, mm."""
-    for quantity in TO_DRAW:
+    quantities = drawn_of(result.volumes)
+    for quantity in (*quantities, *(f"{q}_std" for q in quantities)):
         if quantity in result.volumes:
             yield f"slices_{quantity}", slices(result.volumes[quantity], double)
     error = error_of(result)
-    if error is not None:
-        yield "comparison", comparison(result.volumes["index_excess"], error, double)
-    for quantity in ("n", "density", "temperature"):
-        if quantity in result.volumes:
-            yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
+    if error is not None and result.field is not None:
+        yield "comparison", comparison(result.field, error, double)
+    for quantity in quantities:
+        yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
     if result.reprojection is not None:
         taken: set[str] = set()
         for i, name in enumerate(result.reprojection.measurement.names):
@@ -70,10 +72,11 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
             plain = plain if plain not in taken else f"{plain}_{i}"
             taken.add(plain)
             yield f"view_{plain}", view(result.reprojection, i, double)
-        if result.reprojection.measurement.sigma is not None:
+        for measured, residuals in residuals_over_sigma(result.reprojection).items():
             figure = _page(single, 0.7)
-            draw_residuals(figure.subplots(), residuals_over_sigma(result.reprojection))
-            yield "residuals", figure
+            draw_residuals(figure.subplots(), residuals)
+            several = len(result.reprojection.measurement.observations) > 1
+            yield f"residuals_{measured}" if several else "residuals", figure
         yield "rig", rig(result.reprojection, double)
     if result.metrics.get("views"):
         figure = _page(single, 0.8)
@@ -121,43 +124,58 @@ def isosurface(volume: Volume, width: float) -> Figure:
 
 
 def view(reprojection: Reprojection, i: int, width: float) -> Figure:
-    """Measured, re-projected and difference of both components of view `i`."""
+    """Measured, re-projected and difference of every component that view `i` measured."""
     measurement = reprojection.measurement
     height_px, width_px = measurement.cameras[i].image_size
-    usable = measurement.usable[i, :height_px, :width_px, None].numpy()
-    measured = np.where(usable, measurement.displacements[i, :height_px, :width_px].numpy(), np.nan)
-    predicted = reprojection.predicted[i, :height_px, :width_px].numpy()
-    limit = float(np.nanmax(np.abs(measured))) or 1.0
-    figure = _page(width, min(1.2, 0.62 * height_px / width_px + 0.08))
-    grid = figure.subplots(2, 3, sharex=True, sharey=True)
-    for component, line in zip((0, 1), grid, strict=True):
-        images = (measured[..., component], predicted[..., component], (predicted - measured)[..., component])
-        for axes, title, image in zip(line, ("measured", "re-projected", "difference"), images, strict=True):
-            draw_displacement(axes, image, limit)
-            axes.set_title(f"{title} {'uv'[component]}")
-            axes.label_outer()
-        add_colour_bar(list(line), f"{'uv'[component]} [px]")
+    inside = i, slice(0, height_px), slice(0, width_px)
+    usable = [(o, measurement.usable_for(o)[inside][..., None].numpy()) for o in measurement.observations]
+    seen = [(o, mask) for o, mask in usable if mask.any() or len(usable) == 1]
+    lines = sum(len(o.components) for o, _ in seen)
+    figure = _page(width, min(1.2, 0.31 * lines * height_px / width_px + 0.08))
+    grid = iter(figure.subplots(lines, 3, sharex=True, sharey=True, squeeze=False))
+    for o, mask in seen:
+        measured = np.where(mask, o.values[inside].numpy(), np.nan)
+        predicted = reprojection.maps[o.technique.name][inside].numpy()
+        limits = map_range(measured, o.signed)
+        apart = limits if o.signed else map_range(predicted - measured, True)  # which has both signs, so other colours
+        for c, (component, line) in enumerate(zip(o.components, grid, strict=False)):
+            draw_map(line[0], measured[..., c], limits)
+            draw_map(line[1], predicted[..., c], limits)
+            draw_map(line[2], (predicted - measured)[..., c], apart)
+            for axes, title in zip(line, ("measured", "re-projected", "difference"), strict=True):
+                axes.set_title(f"{title} {component}" if len(o.components) > 1 else title)
+                axes.label_outer()
+            label = f"{component} [{o.technique.unit}]"
+            if o.signed:
+                add_colour_bar(list(line), label)
+            else:
+                add_colour_bar(list(line[:2]), label)
+                add_colour_bar([line[2]], "difference [1]")
     held = ", held out" if measurement.names[i] in reprojection.held_out else ""
     figure.suptitle(f"view {measurement.names[i]}{held}", parse_math=False)
     return figure
 
 
-def residuals_over_sigma(reprojection: Reprojection, most: int = 1 << 20) -> np.ndarray:
-    """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box.
+def residuals_over_sigma(reprojection: Reprojection, most: int = 1 << 20) -> dict[str, np.ndarray]:
+    """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box, by what was measured.
 
-    Of more than `most` pixels, those of a regular lattice are taken.
+    Of more than `most` pixels, those of a regular lattice are taken; what was measured without sigma is left out.
     """
     m = reprojection.measurement
-    assert m.sigma is not None
-    step, usable, found = lattice_step(m, most), m.usable, []
-    for i, camera in enumerate(m.cameras):
-        rows, columns = (slice(0, n, step) for n in camera.image_size)
-        pixels = camera.pixel_grid()[::step, ::step]
-        crosses = camera.rays(pixels.reshape(-1, 2)).clip(m.box).crosses.reshape(pixels.shape[:2])
-        seen = usable[i, rows, columns] & crosses
-        residual = reprojection.predicted[i, rows, columns] - m.displacements[i, rows, columns]
-        found.append((residual[seen] / m.sigma[i, rows, columns][seen]).flatten())
-    return torch.cat(found).numpy()
+    step, found = lattice_step(m, most), {}
+    for o in m.observations:
+        if o.sigma is None:
+            continue
+        usable, parts = m.usable_for(o), []
+        for i, camera in enumerate(m.cameras):
+            rows, columns = (slice(0, n, step) for n in camera.image_size)
+            pixels = camera.pixel_grid()[::step, ::step]
+            crosses = camera.rays(pixels.reshape(-1, 2), sensitivity=False).clip(m.box).crosses
+            seen = usable[i, rows, columns] & crosses.reshape(pixels.shape[:2])
+            residual = reprojection.maps[o.technique.name][i, rows, columns] - o.values[i, rows, columns]
+            parts.append((residual[seen] / o.sigma[i, rows, columns][seen]).flatten())
+        found[o.technique.measured] = torch.cat(parts).numpy()
+    return found
 
 
 def rig(reprojection: Reprojection, width: float) -> Figure:
@@ -169,20 +187,20 @@ def rig(reprojection: Reprojection, width: float) -> Figure:
     return figure
 
 
-def comparison(excess: Volume, error: Volume, width: float) -> Figure:
+def comparison(field: Volume, error: Volume, width: float) -> Figure:
     """Middle slices of reconstruction, truth and error."""
-    from dataclasses import replace
-
-    truth = replace(excess, values=excess.values - error.values)
+    truth = replace(field, values=field.values - error.values)
     limits = colour_range(shown(truth))
     reach = float(error.values.abs().max()) or 1.0
-    ex, ey, ez = excess.grid.box.edges
+    ex, ey, ez = field.grid.box.edges
     figure = _page(width, max(0.3, 2.7 * max(ey, ez) / (2 * ex + ey)) + 0.08)
     grid = figure.subplots(3, 3, gridspec_kw={"width_ratios": [ex, ex, ey]})
-    rows = (("reconstruction", excess, limits), ("truth", truth, limits), ("error", error, (-reach, reach)))
+    label = label_of(field.quantity)
+    of_error = "error of n [1]" if field.quantity == INDEX else f"error of {label}"
+    rows = (("reconstruction", field, limits), ("truth", truth, limits), ("error", error, (-reach, reach)))
     for (name, volume, scale), line in zip(rows, grid, strict=True):
         draw_slices(line, volume, scale, DIVERGING if name == "error" else None, name)
-        add_colour_bar(list(line), "error of n [1]" if name == "error" else label_of("index_excess"))
+        add_colour_bar(list(line), of_error if name == "error" else label)
     return figure
 
 
@@ -190,13 +208,13 @@ def error_of(result: Result) -> Volume | None:
     """Reconstruction minus truth on the grid of the reconstruction; None without a truth that covers it."""
     from nerif.fields.grid import VoxelField
 
-    excess, truth = result.volumes.get("index_excess"), result.truth
-    if excess is None or truth is None:
+    field, truth = result.field, result.truth
+    if field is None or truth is None:
         return None
-    if excess.grid == truth.grid:
-        return Volume(excess.values - truth.values, excess.grid)
-    if not truth.grid.box.holds(excess.grid.box):
+    if field.grid == truth.grid:
+        return replace(field, values=field.values - truth.values, attributes={})
+    if not truth.grid.box.holds(field.grid.box):
         return None
-    field = VoxelField.through(truth.values, truth.grid)
+    true = VoxelField.through(truth.values, truth.grid)
     with torch.no_grad():
-        return Volume(excess.values - field.sample(excess.grid), excess.grid)
+        return replace(field, values=field.values - true.sample(field.grid), attributes={})

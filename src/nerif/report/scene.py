@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.drawing import COLOUR_MAPS, DIVERGING, colour_range, shown
+from nerif.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, colour_range, drawn_of, shown
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive
 from nerif.report import packing
@@ -17,33 +17,27 @@ from nerif.report.pages import error_of
 from nerif.report.rig_figure import picture_corners
 from nerif.report.view_images import colour_table
 from nerif.result import Result
-from nerif.volume import Volume
+from nerif.volume import INDEX, Volume, field_of, name_of, quantities_of
 from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["QUANTITIES", "scene_of", "scene_over_time"]
+__all__ = ["scene_of", "scene_over_time"]
 
 LARGEST = 48  # voxels of a sequence along the longest edge: its page holds dozens of volumes
-QUANTITIES = {
-    "n": ("Refractive index", "n − 1", ""),
-    "density": ("Density", "density", "kg m⁻³"),
-    "temperature": ("Temperature", "temperature", "K"),
-}
-"""Button, label of the colour bar, and unit."""
 
 
 def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     """Return what the page of a result draws from: grid, quantities, cameras; and the packed arrays by name."""
-    excess = result.volumes.get("index_excess")
-    if excess is None or "n_ambient" not in excess.attributes:
+    whole = result.field
+    if whole is None or (whole.quantity == INDEX and whole.n_ambient is None):
         return None, {}
-    small = packing.coarsen(excess)
+    small = packing.coarsen(whole)
     sources: dict[str, Volume] = {"value": small}
     error = error_of(result)
     if error is not None:
         sources["error"] = packing.coarsen(error)
     for statistic in ("mean", "std"):
-        if f"index_excess_{statistic}" in result.volumes:
-            sources[statistic] = packing.coarsen(result.volumes[f"index_excess_{statistic}"])
+        if f"{whole.quantity}_{statistic}" in result.volumes:
+            sources[statistic] = packing.coarsen(result.volumes[f"{whole.quantity}_{statistic}"])
         for quantity in ("density", "temperature"):
             volume = result.volumes.get(f"{quantity}_{statistic}")
             if volume is not None and _own(quantity, volume):
@@ -54,26 +48,29 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     }
     quantities = {
         name: _quantity(name, result.volumes[name], default_level(result.volumes[name]))
-        for name in QUANTITIES
-        if name in result.volumes
+        for name in drawn_of(result.volumes)
     }
     if not quantities:
         return None, {}
     scene = {
-        **_scene(small.grid, excess.grid, quantities, _variants(sources), (DIVERGING, "cividis")),
+        **_scene(small.grid, whole.grid, quantities, _variants(sources), (DIVERGING, "cividis")),
         "arrays": {name: {"low": p["low"], "step": p["step"]} for name, p in packed.items()},
         "cameras": _cameras(result),
+        "backgrounds": result.measurement is not None and any(c.background for c in result.measurement.cameras),
     }
     return scene, {name: p["text"] for name, p in packed.items()}
 
 
 def scene_over_time(store: VolumeSequence, chosen: list[int]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return what the page of a sequence draws from, of the frames chosen; and the packed volumes by name."""
-    small = [packing.coarsen(store.volume(i, "index_excess"), LARGEST) for i in chosen]
+    field = field_of(store.quantities)
+    assert field is not None, "there is a field to show"
+    small = [packing.coarsen(store.volume(i, field), LARGEST) for i in chosen]
     packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
     gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
     quantities = {}
-    for name in QUANTITIES if gas is not None else ("n",):
+    follows = drawn_of(quantities_of(field))
+    for name in follows if gas is not None else follows[:1]:
         some = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
         ends = [colour_range(shown(v)) for v in some]
         quantities[name] = {
@@ -92,11 +89,16 @@ def scene_over_time(store: VolumeSequence, chosen: list[int]) -> tuple[dict[str,
 
 
 def _quantity(name: str, volume: Volume, level: float) -> dict[str, Any]:
-    """How a quantity is called and coloured, and how it follows from the index excess; `level` of its isosurface."""
-    button, label, unit = QUANTITIES[name]
-    relation = packing.relation(name, volume.attributes)
-    colours = COLOUR_MAPS.get(name, "viridis")
-    return {"button": button, "label": label, "unit": unit, "relation": relation, "colours": colours, "level": level}
+    """How a quantity is called and coloured, and follows from the reconstructed field; `level` of its isosurface."""
+    label, unit = LABELS.get(name, (name, volume.unit))
+    return {
+        "button": name_of(name).capitalize(),
+        "label": label,
+        "unit": "" if unit == "1" else unit,
+        "relation": packing.relation(name, volume.attributes),
+        "colours": COLOUR_MAPS.get(name, SEQUENTIAL),
+        "level": level,
+    }
 
 
 def _scene(

@@ -13,6 +13,8 @@ from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import frames_there
 from nerif.report.scene import scene_over_time
 from nerif.report.summary import Statement
+from nerif.techniques.registry import technique, technique_of
+from nerif.volume import field_of
 from nerif.volume_sequence import VolumeSequence
 
 if TYPE_CHECKING:
@@ -29,18 +31,22 @@ def render_sequence(store: VolumeSequence) -> str:
     Raises
     ------
     InputError
-        If no frame of it is there, or it holds no index excess.
+        If no frame of it is there, or it holds no reconstructed field.
     """
     there = frames_there(store)
     if not there:
         raise InputError(f"{store.path}: no frame of it is done yet; run nerif sequence again")
-    if "index_excess" not in store.quantities:
+    found = field_of(store.quantities)
+    if found is None:
         raise InputError(f"{store.path}: expected index_excess among its quantities, got {', '.join(store.quantities)}")
     chosen = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST)).round().astype(int))]
     scene, arrays = scene_over_time(store, chosen)
     statements = _statements(store)
     measured = store.attributes.get("measurement")
+    techniques = [technique(name) for name in store.attributes.get("techniques", ())]
+    kinds = techniques or [technique_of(found)]
     return render_page(
+        kind=" and ".join(kind.tomography for kind in kinds),
         title=store.path.resolve().name,
         source=Path(str(measured)).name if measured else "",
         headline=_headline(store, there),
@@ -98,13 +104,14 @@ def _frames(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
 def _fit(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
     if "cc" not in store.group:
         return [("Truth", "volumes as they are")]
-    cc, rms = (np.asarray(store.array(name)[:])[there] for name in ("cc", "rms_px"))
+    cc, rms = (np.asarray(array[:])[there] for array in (store.array("cc"), store.view_rms))
+    unit = "" if store.view_rms.attrs["units"] == "1" else f" {store.view_rms.attrs['units']}"
     held = np.array([v in store.attributes.get("hold_out", ()) for v in store.attributes["views"]])
     rows = []
     for name, which in (("Training views", ~held), ("Held-out views", held)):
         if which.any():
             least, most = float(np.nanmin(cc[:, which])), float(np.nanmax(rms[:, which]))
-            rows.append((name, f"CC at least {number(least, 4)}, rms error at most {number(most, 3)} px"))
+            rows.append((name, f"CC at least {number(least, 4)}, rms error at most {number(most, 3)}{unit}"))
     seconds = np.asarray(store.array("seconds")[:])[there]
     rows.append(("Time for a frame", f"{number(float(np.median(seconds)), 3)} s (median)"))
     return rows
@@ -116,14 +123,14 @@ def _curves(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
         return []
     times = np.array(store.times)[there] * 1e3
     names, held = store.attributes["views"], store.attributes.get("hold_out", ())
-    rms, seconds = (np.asarray(store.array(name)[:])[there] for name in ("rms_px", "seconds"))
+    rms, seconds = (np.asarray(array[:])[there] for array in (store.view_rms, store.array("seconds")))
 
     def draw_rms(axes: Axes) -> None:
         for i, name in enumerate(names):
             out = name in held
             axes.plot(times, rms[:, i], lw=1.2, ls="--" if out else "-", label=f"{name} (held out)" if out else name)
         axes.set_xlabel("time [ms]")
-        axes.set_ylabel("rms difference from the measurement [px]")
+        axes.set_ylabel(f"rms difference from the measurement [{store.view_rms.attrs['units']}]")
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=7, ncols=2)
 

@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from nerif.drawing import shown
+from nerif.drawing import LABELS, drawn_of, shown
 from nerif.notebook import number, percent, span
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
 from nerif.report.packing import relation
 from nerif.result import METRICS, VOLUME, Result
+from nerif.techniques.deflection import Deflection
+from nerif.volume import INDEX, field_of, name_of
 
-__all__ = ["Statement", "came_out", "headline", "measured", "trust", "trust_figures"]
+__all__ = ["Statement", "came_out", "headline", "measured", "rms_of", "trust", "trust_figures"]
 
 VITAL = (FIELD, METRICS, VOLUME)
 """Without these nothing can be said of a result; without the others less can be shown."""
@@ -51,15 +53,12 @@ def measured(result: Result) -> list[tuple[str, str]]:
 def came_out(result: Result) -> list[tuple[str, str]]:
     """Return what was reconstructed: ranges of the quantities, and what they rest on."""
     rows = [("Method", result.method)]
-    for quantity, name, unit in (
-        ("n", "n − 1", ""),
-        ("density", "Density", " kg m⁻³"),
-        ("temperature", "Temperature", " K"),
-    ):
-        volume = result.volumes.get(quantity)
-        if volume is None:
-            continue
-        rows.append((name, span(shown(volume), unit, 4 if quantity == "temperature" else 3)))
+    for quantity in drawn_of(result.volumes):
+        volume = result.volumes[quantity]
+        name, unit = LABELS.get(quantity, (quantity, volume.unit))
+        unit = "" if unit == "1" else f" {unit}"
+        digits = 4 if quantity == "temperature" else 3
+        rows.append((name if quantity == "n" else name.capitalize(), span(shown(volume), unit, digits)))
     ambient = _ambient_temperature(result)
     if ambient is not None:
         rows.append(("Ambient, implied", f"{ambient:.1f} K"))
@@ -86,26 +85,35 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
     """Return the figures by which to trust it: held-out and training views, outcome, truth, ensemble."""
     held, seen = _views(result, True), _views(result, False)
     rows = []
-    for name, views in (("Held-out view" + ("s" if len(held) > 1 else ""), held), ("Training views", seen)):
+    for title, views in (("Held-out view", held), ("Training views", seen)):
+        of = dict.fromkeys(v["measured"] for v in views)
+        for measured in of:
+            own = [v for v in views if v["measured"] == measured]
+            name = f"{title}{'s' if views is held and len(own) > 1 else ''}{f', {measured}' if len(of) > 1 else ''}"
+            noise = _largest(own, "rms_over_sigma")
+            beside = "" if noise is None else f" = {noise:.2f} σ"
+            rms = rms_of(max(own, key=lambda v: v.get("rms") or 0.0))
+            worst = "" if len(own) == 1 else "at least "
+            rows.append((name, f"CC {worst}{number(_smallest(own, 'cc'), 5)}, rms error {rms}{beside}"))
         if not views:
-            rows.append((name, "none" if seen else "not known"))
-            continue
-        rms = _largest(views, "rms_px")
-        noise = _largest(views, "rms_over_sigma")
-        beside = "" if noise is None else f" = {noise:.2f} σ"
-        worst = "" if len(views) == 1 else "at least "
-        rows.append((name, f"CC {worst}{number(_smallest(views, 'cc'), 5)}, rms error {number(rms, 3)} px{beside}"))
+            rows.append((title, "none" if seen else "not known"))
     if "outcome" in result.metrics:
         rows.append(("Outcome", str(result.metrics["outcome"]).replace("_", " ")))
     m = result.metrics
     if m.get("l2") is not None and m.get("l2_variation") is not None:
-        errors = f"L2 {m['l2']:.2%}, of the variation {m['l2_variation']:.2%}"
+        errors = f"L2 {m['l2']:.2%}"
+        if field_of(result.volumes) in (None, INDEX):  # the paper's L2 counts the ambient in
+            errors += f", of the variation {m['l2_variation']:.2%}"
         rows.append(("Against the truth", f"{errors}; CC {number(m.get('cc'), 5)}, SSIM {number(m.get('ssim'), 4)}"))
     ensemble = result.metrics.get("ensemble")
-    if isinstance(ensemble, dict) and "density_std" in result.volumes:
-        std = result.volumes["density_std"].values.double().numpy()
-        rms = float(np.sqrt(np.nanmean(std**2)))
-        rows.append((f"Ensemble of {ensemble.get('members')}", f"σ of density rms {number(rms, 2)} kg m⁻³"))
+    found = field_of(result.volumes)
+    spread = result.volumes.get("density_std", result.volumes.get(f"{found}_std"))
+    if isinstance(ensemble, dict) and spread is not None:
+        base = spread.quantity.removesuffix("_std")
+        size = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
+        name, unit = LABELS.get(base, (base, spread.unit))
+        text = f"σ of {name} rms {number(size, 2)}{'' if unit == '1' else f' {unit}'}"
+        rows.append((f"Ensemble of {ensemble.get('members')}", text))
     coverage = result.metrics.get("coverage")
     if isinstance(coverage, dict):
         flow = coverage.get("share_in_flow")
@@ -134,6 +142,18 @@ def headline(statements: list[Statement]) -> Statement:
             "bad": "Not to be relied on as it stands; see below.",
         }[worst],
     )
+
+
+def rms_of(view: dict[str, Any]) -> str:
+    """Return the rms error of a view with its unit."""
+    unit = view.get("unit", "1")
+    return number(view.get("rms"), 3) + ("" if unit == "1" else f" {unit}")
+
+
+def _place(view: dict[str, Any], views: list[dict[str, Any]]) -> str:
+    """Name of a view and, where several things were measured, of what is meant."""
+    several = len({v["measured"] for v in views}) > 1
+    return f"{view['name']}, {view['measured']}" if several else str(view["name"])
 
 
 def _views(result: Result, held_out: bool) -> list[dict[str, Any]]:
@@ -183,7 +203,7 @@ def _of_held_out(result: Result) -> list[Statement]:
     if not known:
         return [Statement("warning", "The held-out views have no pixels to compare.")]
     worst = min(known, key=lambda v: v["cc"])
-    cc, noise, name = worst["cc"], _largest(known, "rms_over_sigma"), worst["name"]
+    cc, noise, name = worst["cc"], _largest(known, "rms_over_sigma"), _place(worst, known)
     among = f"; the worst of {len(known)}" if len(known) > 1 else ""
     if cc >= HELD_OUT_CC:
         beyond = "" if noise is None or noise <= 2 else f", though the error is {noise:.1f} times the noise"
@@ -203,16 +223,17 @@ def _of_residual(result: Result) -> list[Statement]:
     known = [v for v in seen if v.get("rms_over_sigma") is not None]
     if not known:
         text = "The noise of the measurement is not known, so there is no telling whether the residual is noise."
-        return [Statement("note", f"{text} nerif displacement writes sigma.")]
+        remedy = "nerif displacement writes sigma." if seen[0]["measured"] == Deflection.measured else "Give its sigma."
+        return [Statement("note", f"{text} {remedy}")]
     lowest, highest = (f(known, key=lambda v: v["rms_over_sigma"]) for f in (min, max))
     low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
     found = []
     if high > NOISE_BAND[1]:
-        text = f"The residual of training view {highest['name']} is {high:.1f} times the stated noise: not explained."
+        text = f"The residual of training view {_place(highest, known)} is {high:.1f} times the stated noise"
         remedy = "Look at the length of the run, open faces, the calibration (nerif check), whether sigma is too small."
-        found.append(Statement("warning" if high <= 3 else "bad", f"{text} {remedy}"))
+        found.append(Statement("warning" if high <= 3 else "bad", f"{text}: not explained. {remedy}"))
     if low < NOISE_BAND[0]:
-        text = f"The residual of training view {lowest['name']} is {low:.2f} of the stated noise"
+        text = f"The residual of training view {_place(lowest, known)} is {low:.2f} of the stated noise"
         found.append(Statement("warning", f"{text}: the field follows noise, or sigma is too large."))
     if not found:
         text = "What the field leaves unexplained in the training views"
@@ -225,7 +246,9 @@ def _of_truth(result: Result) -> list[Statement]:
     if cc is None or variation is None:
         return []
     level = "good" if cc >= TRUTH_CC[0] else "warning" if cc >= TRUTH_CC[1] else "bad"
-    text = f"Against the truth: CC {cc:.4f}, error {variation:.1%} of the variation of n."
+    found = field_of(result.volumes) or INDEX
+    of = "n" if found == INDEX else name_of(found)
+    text = f"Against the truth: CC {cc:.4f}, error {variation:.1%} of the variation of {of}."
     return [Statement(level, text)]
 
 

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerif.drawing import DIVERGING
+from nerif.drawing import map_colours, map_range
 from nerif.measurement import Measurement
+from nerif.observation import Observation
 from nerif.reprojection import Reprojection
 
-__all__ = ["ViewImages", "colour_table", "lattice_step", "view_images"]
+__all__ = ["Scale", "ViewImages", "colour_table", "lattice_step", "view_images"]
 
 LARGEST = 320  # px along an edge of a picture in the page
 ALL_PICTURES = 4_000_000  # px of all pictures of a page: 5 MB of it
@@ -23,22 +24,40 @@ FOR_LIMITS = 1 << 20  # px from which the ends of the colours are found
 
 
 @dataclass(frozen=True)
+class Scale:
+    """Colours of what one technique measured, the same in all views.
+
+    Parameters
+    ----------
+    measured : what was measured
+    unit : of it, nothing for a pure number
+    limits : ends of the colours of measured and re-projected
+    apart : ends of the colours of the difference
+    """
+
+    measured: str
+    unit: str
+    limits: tuple[float, float]
+    apart: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class ViewImages:
-    """The six pictures of a view, as data addresses.
+    """The pictures of a view, as data addresses.
 
     Parameters
     ----------
     name : of the view
     held_out : the reconstruction has not seen it
-    scores : cc, ssim, rms_px, rms_over_sigma as far as known
-    rows : for u and v: addresses of measured, re-projected, difference
+    scores : cc, ssim, rms, rms_over_sigma as far as known, of each technique
+    rows : by component, such as u and v: addresses of measured, re-projected, difference
     size : height and width of the view, px
     shrunk : how many rows and columns one pixel of the pictures stands for
     """
 
     name: str
     held_out: bool
-    scores: dict[str, Any]
+    scores: list[dict[str, Any]]
     rows: dict[str, tuple[str, str, str]]
     size: tuple[int, int]
     shrunk: tuple[int, int]
@@ -53,51 +72,66 @@ def colour_table(name: str) -> list[tuple[int, int, int]]:
 
 def lattice_step(measurement: Measurement, most: int) -> int:
     """Return the step, px, of the regular lattice on which a measurement has at most about `most` pixels."""
-    views, height, width, _ = measurement.displacements.shape
+    views, height, width = measurement.shape
     return max(1, math.ceil(math.sqrt(views * height * width / most)))
 
 
-def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tuple[list[ViewImages], float, float]:
-    """Return the pictures of all views, the limit (px) of measured and re-projected, and that of the differences.
+def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tuple[list[ViewImages], list[Scale]]:
+    """Return the pictures of all views, and the colours of each technique.
 
-    Limits hold for all views: the 99.8th percentile of what was measured, the 99.5th of the difference; of more than a
-    million pixels, on a regular lattice.
+    Colours are those of all views: up to the 99.8th percentile of what was measured, the 99.5th of the difference; of
+    more than a million pixels, on a regular lattice.
     """
     m = reprojection.measurement
-    scores = {v.get("name"): v for v in metrics}
-    usable = m.usable
-    step = lattice_step(m, FOR_LIMITS)
+    rows: list[dict[str, tuple[str, str, str]]] = [{} for _ in m.cameras]
+    count = 3 * len(m.cameras) * sum(len(o.components) for o in m.observations)
+    largest = min(LARGEST, math.isqrt(ALL_PICTURES // count))
+    shrinks = [(-(-c.image_size[0] // largest), -(-c.image_size[1] // largest)) for c in m.cameras]
+    scales = []
+    for o in m.observations:
+        usable, predicted = m.usable_for(o), reprojection.maps[o.technique.name]
+        scale = _scale(reprojection, o)
+        scales.append(scale)
+        for i, camera in enumerate(m.cameras):
+            inside = i, slice(0, camera.image_size[0]), slice(0, camera.image_size[1])
+            valid = usable[inside][..., None].numpy()
+            if len(m.observations) > 1 and not valid.any():
+                continue
+            measured, seen = np.where(valid, o.values[inside].numpy(), np.nan), predicted[inside].numpy()
+            for c, component in enumerate(o.components):
+                images = (measured[..., c], seen[..., c], seen[..., c] - measured[..., c])
+                ends = (scale.limits, scale.limits, scale.apart)
+                first, second, third = (_picture(_shrink(x, shrinks[i]), e) for x, e in zip(images, ends, strict=True))
+                rows[i][component] = first, second, third
+    found = [
+        ViewImages(
+            camera.name,
+            camera.name in reprojection.held_out,
+            [v for v in metrics if v.get("name") == camera.name],
+            rows[i],
+            camera.image_size,
+            shrinks[i],
+        )
+        for i, camera in enumerate(m.cameras)
+    ]
+    return found, scales
+
+
+def _scale(reprojection: Reprojection, observation: Observation) -> Scale:
+    """The colours of one technique."""
+    m, kind = reprojection.measurement, observation.technique
+    usable, step = m.usable_for(observation), lattice_step(m, FOR_LIMITS)
     some = usable[:, ::step, ::step]
     if not bool(some.any()):
         step, some = 1, usable
-    d, predicted = m.displacements[:, ::step, ::step][some], reprojection.predicted[:, ::step, ::step][some]
-    limit = float(np.quantile(d.abs().flatten().numpy(), 0.998)) or 1.0
-    apart = float(np.quantile((predicted - d).abs().flatten().numpy(), 0.995)) or 1.0
-    largest = min(LARGEST, math.isqrt(ALL_PICTURES // (6 * len(m.cameras))))
-    found = []
-    for i, camera in enumerate(m.cameras):
-        height, width = camera.image_size
-        shrink = (-(-height // largest), -(-width // largest))
-        valid = usable[i, :height, :width, None].numpy()
-        measured = np.where(valid, m.displacements[i, :height, :width].numpy(), np.nan)
-        seen = reprojection.predicted[i, :height, :width].numpy()
-        rows = {}
-        for c, component in enumerate("uv"):
-            images = (measured[..., c], seen[..., c], seen[..., c] - measured[..., c])
-            limits = (limit, limit, apart)
-            small = [_shrink(image, shrink) for image in images]
-            rows[component] = tuple(_picture(x, reach) for x, reach in zip(small, limits, strict=True))
-        found.append(
-            ViewImages(
-                camera.name,
-                camera.name in reprojection.held_out,
-                scores.get(camera.name, {}),
-                rows,  # type: ignore[arg-type]
-                (height, width),
-                shrink,
-            )
-        )
-    return found, limit, apart
+    values = observation.values[:, ::step, ::step][some]
+    apart = reprojection.maps[kind.name][:, ::step, ::step][some] - values
+    return Scale(
+        kind.measured,
+        "" if kind.unit == "1" else kind.unit,
+        map_range(values.numpy(), observation.signed, 0.998),
+        map_range(apart.numpy(), True, 0.995),
+    )
 
 
 def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Float[np.ndarray, "r c"]:
@@ -106,13 +140,14 @@ def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Fl
     return image[:height, :width].reshape(height // down, down, width // across, across).mean(axis=(1, 3))
 
 
-def _picture(image: Float[np.ndarray, "row column"], limit: float) -> str:
-    """A PNG of 255 colours from -limit to limit, and grey where there is nothing."""
+def _picture(image: Float[np.ndarray, "row column"], limits: tuple[float, float]) -> str:
+    """A PNG of 255 colours between the limits, and grey where there is nothing."""
     from PIL import Image
 
-    scaled = np.clip((np.nan_to_num(image) / limit + 1) / 2, 0, 1) * 254
+    low, high = limits
+    scaled = np.clip((np.nan_to_num(image) - low) / (high - low), 0, 1) * 254
     codes = np.where(np.isfinite(image), np.round(scaled), 255).astype(np.uint8)
-    table = colour_table(DIVERGING)
+    table = colour_table(map_colours(limits))
     palette = [c for i in range(255) for c in table[round(i * 255 / 254)]] + [190, 190, 190]
     picture = Image.fromarray(codes)
     picture.putpalette(palette)

@@ -11,6 +11,8 @@ from nerif.conventions import InputError
 from nerif.metrics import volume_errors
 from nerif.result import write_json
 from nerif.sequence.store import DONE, SequenceStore
+from nerif.techniques.registry import technique
+from nerif.volume import INDEX
 from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["evaluate_sequence"]
@@ -26,7 +28,7 @@ def evaluate_sequence(
     Parameters
     ----------
     result : store of nerif sequence
-    truth : volumes of index_excess at the same instants, over any ambient
+    truth : volumes of the field at the same instants, an index excess over any ambient
     on_frame : told how many frames are compared, out of how many
 
     Raises
@@ -37,12 +39,16 @@ def evaluate_sequence(
     store, true = SequenceStore(Path(result)), VolumeSequence(truth)
     if len(store) != len(true) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, true.times, strict=True)):
         raise InputError(f"{truth}: expected the instants of {result}, {len(store)} frames, got others")
+    quantity = technique(store.attributes.get("techniques", ["deflection"])[0]).quantity
     frames: list[dict[str, Any]] = []
     done = [i for i, status in enumerate(store.status) if status == DONE]
     for i in done:
-        expected = true.volume(i, "index_excess").relative_to(store.n_ambient).values.numpy()
+        expected = true.volume(i, quantity)
+        if quantity == INDEX:
+            expected = expected.relative_to(store.n_ambient)
         found = store.field(i).sample(true.grid).numpy()
-        frames.append({"frame": i, "time_s": store.times[i], **volume_errors(expected, found, store.n_ambient)})
+        errors = volume_errors(expected.values.numpy(), found, store.n_ambient if quantity == INDEX else 1.0)
+        frames.append({"frame": i, "time_s": store.times[i], **errors})
         on_frame(len(frames), len(done))
     if not frames:
         raise InputError(f"{result}: no frame of it is done yet; run nerif sequence again")

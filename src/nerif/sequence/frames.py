@@ -29,7 +29,7 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
 from nerif.techniques.registry import forward_model
-from nerif.volume import Volume, describe
+from nerif.volume import Volume
 
 __all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame", "reconstruct_frames"]
 
@@ -109,8 +109,7 @@ def _frame(
 def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return what is written of a field: its volumes, and how it compares with what was measured."""
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
-    quantity, attributes = measurement.quantity, {"n_ambient": measurement.n_ambient}
-    found = Volume(field.sample(grid, device), grid, quantity, describe(quantity)[0], {**attributes})
+    found = Volume.of(field.sample(grid, device), grid, measurement.quantity, measurement.n_ambient)
     volumes = [derive(found, wanted, plan.settings.gas) for wanted in plan.settings.quantities]
     cc, rms = _against_measured(plan.cold.model, field, measurement, device)
     return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)

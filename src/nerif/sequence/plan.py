@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from nerif.conventions import InputError
+from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
-from nerif.volume import QUANTITIES
+from nerif.volume import QUANTITIES, quantities_of
 
 __all__ = ["Event", "SequencePlan", "SequenceSettings"]
 
@@ -42,10 +43,26 @@ class SequenceSettings:
     """Views kept out of the reconstruction, and compared with it."""
     voxels: int = 100
     """Voxels of the volumes along the longest edge of the box."""
-    quantities: tuple[str, ...] = ("index_excess", "density")
-    """Written of every frame: index_excess, n, density, temperature."""
+    quantities: tuple[str, ...] = ()
+    """Written of every frame: of an index index_excess, n, density, temperature; none for the field, and density."""
     gas: GasSettings = field(default_factory=GasSettings)
     """What density and temperature are computed for."""
+
+    def for_measurement(self, measurement: Measurement) -> SequenceSettings:
+        """Return the settings with what follows from a measurement: quantities that are not given, and the gas.
+
+        Raises
+        ------
+        InputError
+            If a quantity does not follow from what was measured.
+        """
+        known = quantities_of(measurement.quantity)
+        for quantity in self.quantities:
+            if quantity not in known:
+                names = " and ".join(kind.name for kind in measurement.techniques)
+                raise InputError(f"quantities: expected some of {', '.join(known)} for {names}, got '{quantity}'")
+        written = self.quantities or tuple(q for q in known if q in (measurement.quantity, "density"))
+        return replace(self, quantities=written, gas=self.gas.for_measurement(measurement))
 
     def __post_init__(self) -> None:
         for name in ("hold_out", "quantities"):

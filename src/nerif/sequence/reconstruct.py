@@ -72,7 +72,7 @@ def reconstruct_sequence(
     sequence = MeasurementSequence.read(measurement)
     like = sequence.first_good()
     like.without(settings.hold_out)
-    settings = replace(settings, gas=settings.gas.for_measurement(like))
+    settings = settings.for_measurement(like)
     plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)
     store = _store(plan, sequence, force)
     if retry:

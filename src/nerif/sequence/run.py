@@ -156,13 +156,13 @@ def outcome_table(store: SequenceStore) -> str:
     """Return what was done, what failed and why, as lines of text."""
     status, reasons = store.status, store.reasons
     seconds = np.asarray(store.array("seconds")[:])
-    rms = np.asarray(store.array("rms_px")[:])
+    rms, unit = np.asarray(store.view_rms[:]), store.view_rms.attrs["units"]
     done = status == DONE
     lines = [f"{int(done.sum())} of {len(status)} frames done"]
     if done.any():
         lines[0] += (
             f", {float(np.median(seconds[done])):.1f} s a frame (median), "
-            f"rms difference to the measured {float(np.nanmean(rms[done])):.4f} px"
+            f"rms difference to the measured {float(np.nanmean(rms[done])):.4g}{'' if unit == '1' else f' {unit}'}"
         )
     if (status == FAILED).any():
         lines.append(f"{int((status == FAILED).sum())} failed:")

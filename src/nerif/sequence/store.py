@@ -43,7 +43,7 @@ class Frame:
     ----------
     field : with its weights
     volumes : what is written of it
-    cc, rms_px : measured against re-projected displacement, by the name of the view
+    cc, rms : what was measured against what is re-projected, by the name of the view
     seconds : spent on the frame
     steps : of training
     attempts : how many it took
@@ -52,7 +52,7 @@ class Frame:
     field: NeuralField
     volumes: Sequence[Volume]
     cc: dict[str, float]
-    rms_px: dict[str, float]
+    rms: dict[str, float]
     seconds: float
     steps: int
     attempts: int = 1
@@ -96,7 +96,9 @@ class SequenceStore(VolumeSequence):
         """
         like, frames = sequence.first_good(), len(sequence)
         shutil.rmtree(_checkpoints(path), ignore_errors=True)
-        about = {"kind": KIND, "network": vars(network), "views": list(like.names), **attributes}
+        compared = like.techniques[0]
+        names = [kind.name for kind in like.techniques]
+        about = {"kind": KIND, "network": vars(network), "views": list(like.names), "techniques": names, **attributes}
         with atomic(path) as part:
             group = VolumeSequence.create(part, sequence.times, grid, quantities, like.n_ambient, about).group
             views, parameters = len(like.names), sum(p.numel() for p in _network(about).parameters())
@@ -106,7 +108,9 @@ class SequenceStore(VolumeSequence):
 
             nan, seen = float("nan"), ((views,), ("view",), "float64")
             add_frames(group, "cc", frames, *seen, units="1", long_name="correlation with what the view measured")
-            add_frames(group, "rms_px", frames, *seen, units="px", long_name="rms difference to what the view measured")
+            meaning = f"rms difference to the {compared.measured} that the view measured"
+            rms = "rms_px" if compared.unit == "px" else "rms"
+            add_frames(group, rms, frames, *seen, units=compared.unit, long_name=meaning)
             add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
             add("index_scale", "float64", nan, "field of one unit of network output")
             add("offset", "float64", nan, "network output that counts as ambient")
@@ -142,9 +146,8 @@ class SequenceStore(VolumeSequence):
         self.array("weights")[index] = torch.cat(weights).numpy()
         self.array("index_scale")[index] = frame.field.scale
         self.array("offset")[index] = frame.field.offset
-        for name in ("cc", "rms_px"):
-            found = getattr(frame, name)
-            self.array(name)[index] = np.array([found.get(view, np.nan) for view in self.attributes["views"]])
+        for array, found in ((self.array("cc"), frame.cc), (self.view_rms, frame.rms)):
+            array[index] = np.array([found.get(view, np.nan) for view in self.attributes["views"]])
         for name in ("seconds", "steps", "attempts"):
             self.array(name)[index] = getattr(frame, name)
         self.array("reason")[index] = ""

@@ -32,8 +32,10 @@ class Absorption(LineIntegral):
     """Absorbance -ln(I / I0), the integral of the extinction coefficient."""
 
     name = "absorption"
+    tomography = "absorption tomography"
     measured, sigma = "absorbance", "absorbance_sigma"
     quantity = "extinction"
+    misscaled = "another reference picture, or another wavelength"
     additive = True
     bounds = (0.0, math.inf)
 

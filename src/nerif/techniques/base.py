@@ -90,6 +90,8 @@ class ForwardModel(ABC):
 
     name: ClassVar[str]
     """Of the technique, as attribute `technique` of a measurement file has it."""
+    tomography: ClassVar[str] = "tomography"
+    """What reconstructing a volume by it is called."""
     measured: ClassVar[str]
     """What a pixel measures: the variable of the file."""
     sigma: ClassVar[str]
@@ -98,6 +100,8 @@ class ForwardModel(ABC):
     """Names of the components of what a pixel measures."""
     unit: ClassVar[str]
     """Of what a pixel measures."""
+    misscaled: ClassVar[str] = "another scale"
+    """What may make all values of one view too large or too small."""
     limits: ClassVar[tuple[float, float]]
     """Least sigma, and largest value and sigma, that can have been measured."""
     quantity: ClassVar[str]

@@ -35,9 +35,11 @@ class Deflection(ForwardModel):
     """
 
     name = "deflection"
+    tomography = "background-oriented schlieren tomography"
     measured, sigma = "displacement", "sigma"
     channels = ("u", "v")
     unit = "px"
+    misscaled = "binning, or another lever arm"
     limits = (1e-6, 1e5)
     quantity = "index_excess"
     gauge = True

@@ -28,8 +28,10 @@ class Emission(LineIntegral):
     """Radiance, the integral of what is given off along the ray."""
 
     name = "emission"
+    tomography = "emission tomography"
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
+    misscaled = "another gain or exposure"
     additive = True
     gains = True
     bounds = (0.0, math.inf)

@@ -31,8 +31,10 @@ class Interferometry(LineIntegral):
     """
 
     name = "interferometry"
+    tomography = "interferometric tomography"
     measured, sigma = "fringes", "fringes_sigma"
     quantity = "index_excess"
+    misscaled = "another wavelength, or a double pass"
 
     wavelength_nm: float = 532.0
 
