@@ -30,6 +30,7 @@ __all__ = ["LineScan"]
 ENDS = 3  # readings at either end of an angle that are beside the medium
 EMPTY = 0.02  # of the largest reading, below which an end is beside the medium
 LARGEST_BEND, BENDS = 0.3, 301  # tried
+DIGITS = 1e-4  # of the largest reading, to which no scan is better
 EVEN = 1e-3  # of a step: how far positions may be from evenly spaced
 
 
@@ -141,7 +142,8 @@ class LineScan:
         measurement = measurement_of(
             {Absorption: values}, cameras, Box((-half, -half, -thickness), (half, half, thickness)), 1.0
         )
-        sigma = torch.sqrt(self.noise**2 + (relative_sigma * values.clamp_min(0)) ** 2)
+        least = max(self.noise, DIGITS * float(np.abs(self.readings).max()))
+        sigma = torch.sqrt(least**2 + (relative_sigma * values.clamp_min(0)) ** 2)
         return measurement.observed({Absorption.name: values}, {Absorption.name: sigma})
 
     def _camera(self, angle: float, axis: float) -> Camera:

@@ -28,9 +28,13 @@ def adopt(field: NeuralField, start: Field) -> bool:
         return False
     if start.network.shape != field.network.shape or start.box != field.box:
         return False
-    if start.network.limits != UNBOUNDED or field.network.limits != UNBOUNDED:
-        return False  # a change of scale is not one of the last layer alone
+    bounded = (start.network.limits, field.network.limits) != (UNBOUNDED, UNBOUNDED)
+    if bounded and _limits(start) != _limits(field):
+        return False
     field.network.load_state_dict(start.network.state_dict())
+    if bounded:  # bounds bend what comes near them in units of the scale, so the scale goes over as well
+        field.scale, field.offset = start.scale, start.offset
+        return True
     ratio = start.scale / field.scale
     with torch.no_grad():
         for output in field.network.outputs:
@@ -41,6 +45,11 @@ def adopt(field: NeuralField, start: Field) -> bool:
         assert isinstance(value, nn.Linear)
         value.bias.sub_(start.offset * ratio)
     return True
+
+
+def _limits(field: NeuralField) -> tuple[float, ...]:
+    """Bounds of a field in its own unit, as far as single precision tells them apart."""
+    return tuple(float(f"{limit * field.scale:.6g}") for limit in field.network.limits)
 
 
 def fit_network(
