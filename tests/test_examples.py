@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -28,6 +29,17 @@ def test_own_data(tmp_path, monkeypatch):
     assert float(left_half.mean()) > 0
 
 
+def test_particles(tmp_path, monkeypatch, capsys):
+    words = ["--pixels", "64", "--depth", "16", "--displacement", "2", "--window", "12"]
+    monkeypatch.setattr(sys, "argv", ["particles.py", str(tmp_path), *words])
+    runpy.run_path(str(EXAMPLES / "particles.py"), run_name="__main__")
+    quality, error = map(float, re.findall(r"Q ([\d.]+), rms error ([\d.]+)", capsys.readouterr().out)[0])
+    assert quality > 0.75
+    assert error < 0.15
+    assert Measurement.read(tmp_path / "after.nc").names == ("left below", "right below", "left above", "right above")
+    assert (tmp_path / "particles.png").is_file()
+
+
 @pytest.mark.slow
 def test_from_images(tmp_path):
     """Pictures alone, to a field that correlates with the truth by 0.98 or more."""
@@ -40,4 +52,4 @@ def test_from_images(tmp_path):
 
 
 def test_examples_are_all_tested():
-    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py", "from_images.py"}
+    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py", "from_images.py", "particles.py"}

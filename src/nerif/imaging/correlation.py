@@ -135,12 +135,13 @@ def _windows(slab: np.ndarray, starts: list[np.ndarray], size: int) -> np.ndarra
     """The windows (n, size, ...) of a slab as thick as they are."""
     others = tuple(range(1, slab.ndim))
     views = np.lib.stride_tricks.sliding_window_view(slab, (size,) * len(others), axis=others)
-    chosen = np.moveaxis(views[(slice(None), *np.ix_(*starts))], 0, len(others))
+    index: tuple[slice | np.ndarray, ...] = (slice(None), *np.ix_(*starts))
+    chosen = np.moveaxis(views[index], 0, len(others))
     return chosen.reshape(-1, *(size,) * slab.ndim)
 
 
 def _peak(surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where (u, v) or (x, y, z) the highest point of each surface lies from its middle, by Gaussians through 3 points."""
+    """Where (u, v) or (x, y, z) the top of each surface lies from its middle, by Gaussian fits through three points."""
     n, size, dimensions = len(surface), surface.shape[1], surface.ndim - 1
     inner = surface[(slice(None), *(slice(1, -1),) * dimensions)]
     best = np.unravel_index(inner.reshape(n, -1).argmax(axis=1), inner.shape[1:])

@@ -33,7 +33,7 @@ class Particles:
     ----------
     positions : (n, 3) mm, world frame
     brightness : (n,) what each gives off: the integral over its emission, mm^2
-    box : Box that they were drawn in, mm
+    box : in which the light is, mm
     """
 
     positions: Float[Tensor, "n 3"]
@@ -67,6 +67,12 @@ class Particles:
         logarithm = variation * torch.randn(count, generator=generator, dtype=torch.float64)
         brightness = torch.exp(logarithm - variation**2 / 2)
         return cls(unit.new_tensor(box.lower) + unit * unit.new_tensor(box.edges), brightness, box)
+
+    def moved(self, positions: Float[Tensor, "n 3"]) -> Particles:
+        """Return the particles at other positions (mm); those beyond the box, in which the light is, are gone."""
+        lower, upper = positions.new_tensor(self.box.lower), positions.new_tensor(self.box.upper)
+        lit = ((positions >= lower) & (positions <= upper)).all(dim=1)
+        return Particles(positions[lit], self.brightness[lit], self.box)
 
     def volume(self, grid: Grid, diameter: float = DIAMETER) -> Volume:
         """Return the ideal volume: every particle a Gaussian, averaged over the voxels.

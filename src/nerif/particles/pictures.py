@@ -1,72 +1,93 @@
-"""Pictures of particles: Gaussian images of a given diameter in px, integrated over the pixels, with shot noise."""
+"""Pictures of particles: Gaussian images of a given diameter in px, integrated over the pixels, with shot noise.
+
+    L(p) = sum_i b_i / a_i integral over pixel p of G(p' - p_i) dp'
+
+b_i is the brightness of a particle, p_i its image and a_i the area (mm^2) that a pixel has where it is.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import AMBIENT_INDEX, InputError
-from nerif.geometry import Box, Camera, Ring
-from nerif.measurement import Measurement
+from nerif.geometry import Camera
+from nerif.measurement import Measurement, measurement_of
 from nerif.particles.cloud import DIAMETER, Particles, spread
 from nerif.techniques.emission import Emission
 
-__all__ = ["four_cameras", "picture", "pictures"]
+__all__ = ["picture", "pictures"]
 
-STEP = 1e-4  # of the distance to the camera, over which the scale of a picture is taken
+STEP = 1e-3  # mm, over which the scale of a picture is taken
 
 
-def four_cameras(pixels: int = 200, depth: int = 40, angle: float = 30.0) -> tuple[tuple[Camera, ...], Box]:
-    """Return four cameras at the corners of a square, and the box that all of them see whole, 0.1 mm a pixel.
-
-    Cameras look from azimuth -angle and angle, above and below, along -x at a box that is thin along x.
+def pictures(
+    particles: Particles,
+    cameras: Sequence[Camera],
+    counts: float = 1000.0,
+    diameter: float = DIAMETER,
+    seed: int = 0,
+) -> Measurement:
+    """Return what cameras see of particles: a measurement of emission, in the box of the particles.
 
     Parameters
     ----------
-    pixels : of an edge of each picture
-    depth : of the box, in pixels at its centre
-    angle : between the optical axes and the x-axis, in azimuth and in elevation both, degrees
+    counts : detected quanta of a particle of mean brightness in one picture, whose shot noise there is; 0 for none
+    diameter : of a particle image, four standard deviations, px
+    seed : of the noise
 
     Raises
     ------
     InputError
-        If the pictures are too small for the box, or the angle is none.
+        If a number cannot be one, or a camera cannot see the box.
     """
-    if not 0 < angle < 80:
-        raise InputError(f"angle: expected between 0 and 80 degrees, got {angle}")
-    raise NotImplementedError
+    if not 0 <= counts < math.inf:
+        raise InputError(f"counts: expected 0 or more, got {counts}")
+    generator = torch.Generator().manual_seed(seed)
+    height, width = (max(c.image_size[i] for c in cameras) for i in (0, 1))
+    radiance = torch.full((len(cameras), height, width), float("nan"))
+    sigma = torch.full_like(radiance, float("nan"))
+    for i, camera in enumerate(cameras):
+        h, w = camera.image_size
+        clean = picture(particles, camera, diameter)
+        if counts:
+            unit = float(clean.sum()) / (counts * len(particles))  # radiance of one quantum
+            found = torch.poisson(clean / unit, generator)
+            clean, noise = unit * found, unit * found.clamp_min(1).sqrt()
+            sigma[i, :h, :w] = noise.float()
+        radiance[i, :h, :w] = clean.float()
+    measurement = measurement_of({Emission: radiance[..., None]}, cameras, particles.box, AMBIENT_INDEX)
+    if not counts:
+        return measurement
+    return measurement.observed({Emission.name: radiance[..., None]}, {Emission.name: sigma[..., None]})
 
 
-def picture(
-    particles: Particles, camera: Camera, diameter: float = DIAMETER
-) -> tuple[Float[Tensor, "row column"], Float[Tensor, " n"]]:
-    """Return the radiance of particles in the pixels of a camera, and the square millimetres of a pixel at each.
-
-        L(p) = sum_i b_i / area_i  integral over p of G(p' - p_i) dp'
+def picture(particles: Particles, camera: Camera, diameter: float = DIAMETER) -> Float[Tensor, "row column"]:
+    """Return the radiance of particles in the pixels of a camera, without noise.
 
     Parameters
     ----------
     diameter : of a particle image, four standard deviations, px
     """
-    p = camera.project(particles.positions)
-    scale = px_per_mm(camera, particles.positions, p)
-    places = p.flip(-1)
-    return spread(places, particles.brightness * scale, diameter / 4, camera.image_size), 1 / scale
+    places = camera.project(particles.positions)
+    amounts = particles.brightness * _px_per_mm2(camera, particles.positions, places)
+    return spread(places.flip(-1), amounts, diameter / 4, camera.image_size)
 
 
-def px_per_mm(camera: Camera, positions, pixels):
-    """Pixels that a square millimetre across the line of sight covers."""
-    rays = camera.rays(pixels, sensitivity=False)
-    d = rays.direction
-    other = torch.eye(3, dtype=d.dtype)[d.abs().argmin(dim=1)]
-    first = torch.linalg.cross(d, other)
-    first = first / first.norm(dim=1, keepdim=True)
-    second = torch.linalg.cross(d, first)
-    step = STEP
-    j = [(camera.project(positions + step * e) - camera.project(positions - step * e)) / (2 * step) for e in (first, second)]
-    return (j[0][:, 0] * j[1][:, 1] - j[0][:, 1] * j[1][:, 0]).abs()
+def _px_per_mm2(
+    camera: Camera, points: Float[Tensor, "n 3"], places: Float[Tensor, "n 2"]
+) -> Float[Tensor, " n"]:  # fmt: skip
+    """Pixels that a square millimetre across the line of sight covers, at points whose images are given."""
+    direction = camera.rays(places, sensitivity=False).direction
+    least = torch.nn.functional.one_hot(direction.abs().argmin(dim=1), 3).to(direction)
+    across = torch.linalg.cross(direction, least)
+    across = across / across.norm(dim=1, keepdim=True)
+    (a, b), (c, d) = (
+        ((camera.project(points + STEP * e) - camera.project(points - STEP * e)) / (2 * STEP)).unbind(-1)
+        for e in (across, torch.linalg.cross(direction, across))
+    )
+    return (a * d - b * c).abs()

@@ -3,7 +3,7 @@
     u(x) = Gamma / (4 pi) sum_i t_i x (x - y_i) / r_i^3 q(r_i / core),      r_i = |x - y_i|
     q(s) = erf(s / sqrt 2) - sqrt(2 / pi) s exp(-s^2 / 2)
 
-t_i are the pieces, in mm, of a circle of vorticity at y_i, each blurred by a Gaussian: the law of Biot and Savart, summed.
+t_i (mm) are the pieces at y_i of a circle of vorticity, each blurred by a Gaussian: the law of Biot and Savart.
 Each term is a curl, so that the divergence is 0, and far away the velocity falls as 1 / r^3.
 
 Source: Leonard, Vortex methods for flow simulation, J. Comput. Phys. 37 (1980) 289; the Gaussian core of Winckelmans &
@@ -13,19 +13,22 @@ Leonard, J. Comput. Phys. 109 (1993) 247.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError
+from nerif.geometry import Box
 from nerif.particles.cloud import Particles
 
 __all__ = ["VortexRing"]
 
 PIECES = 128  # of the circle
-CHUNK = 1 << 14  # points at a time
+THINNEST = 0.05  # of the radius: thinner cores would need more pieces
+CHUNK = 2048  # points at a time
+SEARCHED = 201  # points, of which one is the fastest
 NEAR = 1e-2  # core radii, within which q(s) / s^3 is its limit
 
 
@@ -50,8 +53,23 @@ class VortexRing:
         for name in ("radius", "core"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected a length above 0 mm, got {getattr(self, name)}")
-        if self.core < self.radius / PIECES * 2 * math.pi:
-            raise InputError(f"core: expected at least a twentieth of the radius, {self.radius} mm, got {self.core}")
+        if self.core < THINNEST * self.radius:
+            raise InputError(f"core: expected at least {THINNEST} of the radius, {self.radius} mm, got {self.core}")
+
+    @classmethod
+    def within(cls, box: Box, speed: float) -> VortexRing:
+        """Return a ring in the middle of a box: radius 0.3 of its edge along z, core 0.3 of the radius.
+
+        Parameters
+        ----------
+        speed : where it is fastest, mm/s
+        """
+        radius = 0.3 * box.edges[2]
+        unit = cls(radius, 0.3 * radius, 1.0)
+        across = torch.zeros(SEARCHED, 3, dtype=torch.float64)
+        across[:, 0] = torch.linspace(0, 2 * radius, SEARCHED)
+        fastest = float(unit.velocity(across).norm(dim=1).max())  # in the plane of the ring
+        return cls(radius, 0.3 * radius, speed / fastest, box.centre)
 
     def velocity(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Return the velocity, mm/s, at points, mm."""
@@ -62,7 +80,7 @@ class VortexRing:
         along = torch.stack([-angle.sin(), angle.cos(), zero], dim=1) * (2 * math.pi * self.radius / PIECES)
         where = points.new_tensor(self.centre) + self.radius * outward
         parts = []
-        for part in points.split(CHUNK // PIECES * 16):
+        for part in points.split(CHUNK):
             apart = part[:, None] - where
             s = apart.norm(dim=-1) / self.core
             inside = torch.erf(s / math.sqrt(2)) - math.sqrt(2 / math.pi) * s * torch.exp(-(s**2) / 2)
@@ -72,7 +90,12 @@ class VortexRing:
         return torch.cat(parts) * (self.circulation / (4 * math.pi * self.core**3))
 
     def advect(self, particles: Particles, seconds: float, steps: int = 8) -> Particles:
-        """Return where particles are after a time, by so many Runge-Kutta steps of fourth order; a negative time goes back.
+        """Return where particles are after a time; those that leave their box, in which the light is, are gone.
+
+        Parameters
+        ----------
+        seconds : the time
+        steps : of the Runge-Kutta method of fourth order
 
         Raises
         ------
@@ -88,4 +111,4 @@ class VortexRing:
             k3 = self.velocity(x + 0.5 * h * k2)
             k4 = self.velocity(x + h * k3)
             x = x + (h / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
-        return replace(particles, positions=x)
+        return particles.moved(x)

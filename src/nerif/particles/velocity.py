@@ -41,7 +41,12 @@ class Velocity:
         return self.displacement.isfinite().all(dim=-1)
 
     def rms_error(self, truth: Float[Tensor, "z y x 3"]) -> float:
-        """Return the rms, over components of the vectors found, of the difference from a true velocity (mm/s), in mm."""
+        """Return the rms error of the displacement, mm, over components of the vectors found.
+
+        Parameters
+        ----------
+        truth : velocity at the points, mm/s
+        """
         difference = (self.displacement - truth.to(self.displacement) * self.seconds)[self.found]
         return float(difference.square().mean().sqrt())
 
@@ -75,8 +80,8 @@ def velocity_between(first: Volume, second: Volume, seconds: float, window: int 
     spacing = torch.tensor(grid.spacing, dtype=torch.float64)
     if not float(spacing.max()) < 1.05 * float(spacing.min()):
         raise InputError(f"grid: expected cubic voxels, got edges of {grid.spacing} mm")
-    arrays = (volume.values.float().cpu().numpy() for volume in (first, second))
-    vectors = correlate(*arrays, window, passes, central=True)
+    start, end = (volume.values.float().cpu().numpy() for volume in (first, second))
+    vectors = correlate(start, end, window, passes, central=True)
     movement = torch.from_numpy(vectors.movement).double()
     movement[~torch.from_numpy(vectors.found)] = torch.nan
     axes = torch.meshgrid(*(torch.from_numpy(a) for a in vectors.axes), indexing="ij")
