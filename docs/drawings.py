@@ -208,7 +208,7 @@ def axes_and_pixels() -> Figure:
     pixel = [[5.0, 2.0]]
     through = pixel_points(camera, pixel, plane)[0]
     rays = camera.rays(torch.tensor(pixel, dtype=torch.float64)).clip(box)
-    end = (rays.origin + rays.background[:, None] * rays.direction).numpy()[0]
+    end = rays.end_points.numpy()[0]
     enter, leave = rays.at(torch.stack([rays.near, rays.far], dim=-1)).numpy()[0]
     around = [[4.5, 1.5], [5.5, 1.5], [5.5, 2.5], [4.5, 2.5]]
     axes.add_patch(Polygon(view(pixel_points(camera, around, plane)), fc=PURPLE, ec=PURPLE, alpha=0.75, zorder=7.2))

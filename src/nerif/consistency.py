@@ -129,25 +129,29 @@ def check_consistency(
 
 
 def binned(measurement: Measurement, longest: int) -> Measurement:
-    """Return the measurement with pixels averaged in squares, so that no picture is longer than about `longest` px."""
-    size = max(max(c.image_size) for c in measurement.cameras)
-    bins = max(1, -(-size // longest))
+    """Return the measurement with pixels averaged in squares, so that no picture is longer than about `longest` px.
+
+    Pictures of a few rows keep one, as high as their squares would be or as they are.
+    """
+    most = -(-max(max(c.image_size) for c in measurement.cameras) // longest)
+    down, across = (max(1, min(most, *(c.image_size[i] for c in measurement.cameras))) for i in (0, 1))
+    scale = torch.tensor([across, down], dtype=measurement.cameras[0].intrinsics.dtype)
     cameras = []
     for camera in measurement.cameras:
-        k = camera.intrinsics / bins
-        k[:2, 2] = (camera.intrinsics[:2, 2] + 0.5) / bins - 0.5
-        k[2, 2] = 1
-        height, width = (max(1, n // bins) for n in camera.image_size)
-        cameras.append(replace(camera, intrinsics=k, image_size=(height, width)))
-    rows, columns = (n // bins for n in measurement.displacements.shape[1:3])
-    inside = (slice(0, rows * bins), slice(0, columns * bins))
+        k = camera.intrinsics.clone()
+        k[:2, :2] /= scale[:, None]
+        k[:2, 2] = (k[:2, 2] + 0.5) / scale - 0.5
+        height, width = camera.image_size
+        cameras.append(replace(camera, intrinsics=k, image_size=(height // down, width // across)))
+    rows, columns = (n // bins for n, bins in zip(measurement.displacements.shape[1:3], (down, across), strict=True))
+    inside = (slice(0, rows * down), slice(0, columns * across))
     maps = []
     for d, usable in zip(measurement.displacements, measurement.usable, strict=True):
-        good = usable[inside].reshape(rows, bins, columns, bins)
-        parts = torch.where(good[..., None], d[inside].reshape(rows, bins, columns, bins, 2), 0.0)
+        good = usable[inside].reshape(rows, down, columns, across)
+        parts = torch.where(good[..., None], d[inside].reshape(rows, down, columns, across, 2), 0.0)
         count = good.sum(dim=(1, 3))[..., None]
-        mean = parts.sum(dim=(1, 3)) / count.clamp_min(1) / bins
-        maps.append(torch.where(count * 2 >= bins * bins, mean, torch.nan))
+        mean = parts.sum(dim=(1, 3)) / count.clamp_min(1) / scale.to(d)
+        maps.append(torch.where(count * 2 >= down * across, mean, torch.nan))
     return replace(
         measurement,
         cameras=tuple(cameras),
@@ -310,7 +314,8 @@ def _looks(measurement: Measurement, small: Measurement, valid: Sequence[float])
         d = small.displacements[i, :rows, :columns]
         rim = torch.ones(rows, columns, dtype=torch.bool)
         edge = max(1, min(rows, columns) // 12)
-        rim[edge:-edge, edge:-edge] = False
+        down = slice(edge, -edge) if rows > 2 * edge else slice(None)  # a line has two ends and no rim
+        rim[down, edge:-edge] = False
         rim &= torch.isfinite(d).all(dim=-1)
         inner = d[torch.isfinite(d).all(dim=-1)]
         if int(rim.sum()) < 20:

@@ -26,7 +26,7 @@ from nerif.toml import write_toml
 from nerif.volume import Volume
 from nerif.volume_file import write_netcdf
 
-__all__ = ["Experiment", "background_poses", "background_scale", "place", "target_poses", "world_axes"]
+__all__ = ["Experiment", "background_poses", "background_scale", "place", "side_of_one", "target_poses", "world_axes"]
 
 SIDES = {
     (1, 0): ("z-", "x+", "y-"),
@@ -35,6 +35,8 @@ SIDES = {
     (0, -1): ("x+", "z+", "y-"),
 }
 """World axes along the axes of an upright target that faces the x or y direction of the world named by the key."""
+
+ORIGIN = torch.zeros(3, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Experiment:
 
     def write(
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,
-        focal_length: float, truth_voxels: int = 100, on_picture: Callable[[], None] = lambda: None,
+        pixel_pitch: float, truth_voxels: int = 100, on_picture: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         """Render all pictures into VIEW/{target,background,reference,flow}/, with settings to calibrate, and the truth.
 
@@ -79,7 +81,7 @@ class Experiment:
         cameras : of the rig
         phantom, box : field of index excess, and the box that holds it
         n_ambient : refractive index around it
-        focal_length : of the lenses, mm: with f_number it gives their aperture
+        pixel_pitch : of the sensors, mm: with f_number it gives the aperture of the lenses
         truth_voxels : of the truth, along the longest edge of the box
         on_picture : called after each picture (`pictures` of them in all)
 
@@ -92,8 +94,8 @@ class Experiment:
             raise InputError(f"truth_voxels: expected at least 1, got {truth_voxels}")
         self._write_truth(folder / "truth", cameras, phantom, box, n_ambient, truth_voxels)
         self._write_settings(folder / "calibrate.toml", cameras)
-        lens = Lens(diameter=focal_length / self.f_number) if self.f_number > 0 else None
         for i, camera in enumerate(cameras):
+            lens = Lens.stopped_down(camera, pixel_pitch, self.f_number) if self.f_number > 0 else None
             self._background_pictures(folder / camera.name, camera, i, phantom, box, n_ambient, lens, on_picture)
         if self.poses:
             self.write_targets(folder, cameras, on_picture)
@@ -115,6 +117,10 @@ class Experiment:
             "background_scale": background_scale(cameras),
             "target": asdict(self.target_for(cameras)),
         }
+        if not cameras[0].projection.shows_depth:
+            settings["projection"] = cameras[0].projection.name
+            settings["side"] = side_of_one(cameras)
+            settings["background_distance"] = -cameras[0].plane.offset
         write_toml(path, settings)
 
     def write_targets(
@@ -137,7 +143,7 @@ class Experiment:
         """Return the target, of a size that fits the pictures if none is given."""
         pitch = self.pitch
         if pitch == 0:
-            seen = (c.centre.norm() / c.intrinsics[0, 0] * torch.tensor(c.image_size) for c in cameras)
+            seen = (float(c.pixel_size(ORIGIN)) * torch.tensor(c.image_size) for c in cameras)
             pitch = 0.75 * min(min(float(s[1]) / (self.columns + 1), float(s[0]) / (self.rows + 1)) for s in seen)
         return CalibrationTarget(self.target, self.columns, self.rows, pitch)
 
@@ -180,10 +186,9 @@ class Experiment:
 
 def background_scale(cameras: Sequence[Camera]) -> float:
     """Return how much larger the target on the backgrounds has to be to look as large as at the origin."""
-    middle = [
-        torch.tensor([[(c.image_size[1] - 1) / 2, (c.image_size[0] - 1) / 2]], dtype=torch.float64) for c in cameras
-    ]
-    ratios = [float(c.rays(m).ends.distance[0] / c.centre.norm()) for c, m in zip(cameras, middle, strict=True)]
+    middle = [torch.tensor([[(n - 1) / 2 for n in c.image_size[::-1]]], dtype=torch.float64) for c in cameras]
+    ends = [c.rays(m).end_points[0] for c, m in zip(cameras, middle, strict=True)]
+    ratios = [float(c.pixel_size(end) / c.pixel_size(ORIGIN)) for c, end in zip(cameras, ends, strict=True)]
     return round(min(ratios), 1)
 
 
@@ -192,10 +197,17 @@ def world_axes(cameras: Sequence[Camera]) -> tuple[str, str, str]:
     return SIDES[_side(cameras)]
 
 
+def side_of_one(cameras: Sequence[Camera]) -> tuple[str, str]:
+    """Return a view that stands to one side of the first target pose, and on which side of the world that is."""
+    across = (_side(cameras)[0] == 0, _side(cameras)[1] == 0)  # x or y
+    places = [-c.sight(ORIGIN)[:2] @ torch.tensor(across, dtype=torch.float64) for c in cameras]
+    i = max(range(len(cameras)), key=lambda k: abs(float(places[k])))
+    return cameras[i].name, f"{'x' if across[0] else 'y'}{'+' if float(places[i]) > 0 else '-'}"
+
+
 def _side(cameras: Sequence[Camera]) -> tuple[int, int]:
     """The horizontal axis of the world that points most towards the middle camera."""
-    middle = cameras[len(cameras) // 2].centre
-    x, y = float(middle[0]), float(middle[1])
+    x, y, _ = (-cameras[len(cameras) // 2].sight(ORIGIN)).tolist()
     if abs(x) > abs(y):
         return (1 if x > 0 else -1, 0)
     return (0, 1 if y > 0 else -1)
@@ -204,22 +216,22 @@ def _side(cameras: Sequence[Camera]) -> tuple[int, int]:
 def target_poses(cameras: Sequence[Camera], target: CalibrationTarget, count: int, seed: int) -> list[Pose]:
     """Return poses (target to world) around the origin, turned towards the cameras; the first one stands straight.
 
-    The others face a point between two neighbouring cameras, tilted by up to 35 degrees and moved by up to a tenth of
-    the target's size, so that each is seen by several cameras.
+    The others face between two neighbouring cameras, tilted by up to 35 degrees and moved by up to a tenth of the
+    target's size, so that each is seen by several cameras.
     """
     from scipy.spatial.transform import Rotation
 
     if count < 4:
         raise InputError(f"poses: expected 4 target poses or more, got {count}")
     rng = np.random.default_rng(seed)
-    centres = np.stack([c.centre.numpy() for c in cameras])
+    towards_camera = np.stack([-c.sight(ORIGIN).numpy() for c in cameras])
     side = _side(cameras)
     poses = [Pose(_facing(np.array([*side, 0.0])), np.zeros(3))]
     for k in range(count - 1):
-        at = (k + rng.random()) / (count - 1) * (len(centres) - 1)
-        i = min(int(at), max(len(centres) - 2, 0))
-        j = min(i + 1, len(centres) - 1)
-        towards = (1 - (at - i)) * centres[i] + (at - i) * centres[j]
+        at = (k + rng.random()) / (count - 1) * (len(cameras) - 1)
+        i = min(int(at), max(len(cameras) - 2, 0))
+        j = min(i + 1, len(cameras) - 1)
+        towards = (1 - (at - i)) * towards_camera[i] + (at - i) * towards_camera[j]
         tilt = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
         shift = 0.1 * max(target.size) * rng.uniform(-1, 1, 3)
         poses.append(Pose(_facing(towards / np.linalg.norm(towards)) @ tilt, shift))
@@ -246,8 +258,8 @@ def background_poses(camera: Camera, target: CalibrationTarget, count: int) -> l
 
 def place(target: CalibrationTarget, pose: Pose, camera: Camera) -> Texture:
     """Return a target in space as something to render, drawn finely enough for a camera."""
-    depth = float(camera.rotation[2].numpy() @ pose.translation + float(camera.translation[2]))
-    fine = depth / float(camera.intrinsics[0, 0]) / 3  # as the points of a pixel: finer edges would alias
+    at = torch.from_numpy(pose.translation)
+    fine = float(camera.pixel_size(at)) / 3  # as the points of a pixel: finer edges would alias
     values, texel = torch.from_numpy(target.raster(fine)), target.raster_pixel(fine)
     right, down = (torch.from_numpy(pose.rotation[:, k].copy()) for k in range(2))
     height, width = values.shape
@@ -265,5 +277,5 @@ def _facing(towards: np.ndarray) -> np.ndarray:
 
 def _faces(pose: Pose, camera: Camera) -> bool:
     """Whether a camera sees the front of a target at less than 55 degrees."""
-    line = camera.centre.numpy() - pose.translation
-    return bool(-pose.rotation[:, 2] @ line / np.linalg.norm(line) > np.cos(np.radians(55)))
+    sight = camera.sight(torch.from_numpy(pose.translation)).numpy()
+    return bool(pose.rotation[:, 2] @ sight > np.cos(np.radians(55)))

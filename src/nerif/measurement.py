@@ -124,7 +124,8 @@ class Measurement:
                 continue
             normal = camera.background.normal.to(torch.float64)
             plane = corners @ normal - camera.background.offset
-            behind = plane * float(camera.centre.to(torch.float64) @ normal - camera.background.offset)
+            sight = camera.sight((camera.background.offset * normal).to(camera.rotation))
+            behind = -plane * float(sight.to(normal) @ normal)
             seen = rays[rays.crosses]
             if len(seen) and (float(behind.min()) <= 0 or not bool(seen.unobstructed.all())):
                 raise InputError(

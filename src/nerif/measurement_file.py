@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
-from nerif.geometry import Box, Camera, Plane
+from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, projection_named
 from nerif.netcdf import values
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.deflection import Deflection
@@ -127,13 +127,16 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     if measurement.displacement is not None:
         dataset = dataset.assign_coords(component=list(COMPONENTS))
     names = [kind.name for kind in measurement.techniques]
-    plain = names == [Deflection.name] and not measurement.about_views
+    pinholes = all(c.projection == PERSPECTIVE for c in cameras)
+    plain = names == [Deflection.name] and not measurement.about_views and pinholes
     dataset.attrs = {
         "Conventions": PLAIN if plain else CONVENTIONS,
         **({} if plain else {"technique": " ".join(names)}),
         "n_ambient": measurement.n_ambient,
         "ambient_faces": " ".join(measurement.ambient_faces),
     }
+    if not pinholes:
+        dataset["projection"] = (("view",), np.array([c.projection.name for c in cameras], dtype=object))
     if measurement.wavelength_nm is not None:
         dataset.attrs["wavelength_nm"] = measurement.wavelength_nm
     return dataset
@@ -248,6 +251,10 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
     nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64)
     normals, offsets = (_array(dataset, n, True) if n in dataset else nowhere for n in BACKGROUND)
+    kinds = dataset["projection"].values if "projection" in dataset else np.array([PERSPECTIVE.name] * views)
+    if kinds.shape != (views,):
+        got = dataset["projection"].dims
+        raise InputError(f"variable 'projection': expected one name a view, got dimensions {got}")
     cameras = []
     for i, name in enumerate(names):
         height, width = sizes[i].tolist()
@@ -260,6 +267,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 background=_plane(normals[i], offsets[i], name),
                 distortion=distortion[i],
                 name=name,
+                projection=projection_named(str(kinds[i]), f"projection of view '{name}'"),
             )
         )
     return tuple(cameras)

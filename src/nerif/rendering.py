@@ -67,7 +67,8 @@ class Lens:
 
     Parameters
     ----------
-    diameter : of the aperture (focal length / f-number), mm; 0 is a pinhole
+    diameter : of the aperture (focal length / f-number) or, of a telecentric lens, of the cone of rays to a point in
+        focus where it passes z_cam = 0; mm; 0 is a pinhole
     focus : depth of the plane in focus along the optical axis, mm; None is the background's
     points : number of points on the disc
     """
@@ -82,6 +83,20 @@ class Lens:
                 f"lens: expected diameter >= 0 mm, focus > 0 mm and points >= 1, got {self.diameter}, {self.focus}, "
                 f"{self.points}"
             )
+
+    @classmethod
+    def stopped_down(cls, camera: Camera, pixel_pitch: float, f_number: float) -> Lens:
+        """Return the lens of a camera, focused on its background.
+
+        Parameters
+        ----------
+        camera : whose picture gives the magnification
+        pixel_pitch : of its sensor, mm
+        f_number : focal length over aperture; of a telecentric lens that on the sensor's side
+        """
+        depth = _depth(camera, camera.plane)
+        on_axis = camera.centre + depth * camera.rotation[2]
+        return cls(diameter=depth * pixel_pitch / float(camera.pixel_size(on_axis)) / f_number)
 
     def offsets(self) -> Float[Tensor, "n 2"]:
         """Points spread evenly over the disc (sunflower spiral), mm; one for a pinhole."""
@@ -187,9 +202,7 @@ def render(
     lens = lens or Lens()
     height, width = camera.image_size
     shift = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
-    focus = lens.focus or float(texture.plane.offset - camera.centre @ texture.plane.normal) / float(
-        camera.rotation[2] @ texture.plane.normal
-    )
+    focus = lens.focus or _depth(camera, texture.plane)
     light = torch.zeros(height, width, dtype=torch.float64)
     offsets = lens.offsets()
     for offset in offsets:
@@ -209,12 +222,17 @@ def render(
     return light / (len(offsets) * samples**2)
 
 
+def _depth(camera: Camera, plane: Plane) -> float:
+    """Where the optical axis meets a plane, mm from z_cam = 0."""
+    return float(plane.offset - camera.centre @ plane.normal) / float(camera.rotation[2] @ plane.normal)
+
+
 def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], plane: Plane, offset: Float[Tensor, 2], focus: float) -> Rays:
     """Rays from a point of the lens through where each pixel is in focus, on to the plane."""
     straight = camera.rays(pixels)
     depth = straight.direction @ camera.rotation[2]
     point = straight.origin + (focus / depth)[:, None] * straight.direction
-    origin = (camera.centre + offset @ camera.rotation[:2]).expand_as(point)
+    origin = straight.origin + offset @ camera.rotation[:2]
     direction = point - origin
     direction = direction / direction.norm(dim=-1, keepdim=True)
     reach = (plane.offset - origin @ plane.normal) / (direction @ plane.normal)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,7 +24,6 @@ from nerif.measurement import Measurement, measurement_of
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.ray_tracing import background_points
-from nerif.techniques.absorption import Absorption, absorbance
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.registry import forward_model, technique
@@ -33,7 +31,7 @@ from nerif.volume import INDEX, Volume, describe
 from nerif.volume_file import read_volume
 from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["Simulation", "add_noise", "add_photon_noise", "simulate", "view_displacement"]
+__all__ = ["Simulation", "add_noise", "add_quantum_noise", "simulate", "view_displacement"]
 
 MOVING = ("flame", "2", "3", "4", "5", "6", "7")
 PEAK_VOXELS = 64  # along the longest edge, on which the largest value of a phantom is looked for
@@ -92,27 +90,23 @@ def add_noise(measurement: Measurement, level: float, seed: int = 0) -> Measurem
     return measurement.observed(noisy, sigmas)
 
 
-def add_photon_noise(measurement: Measurement, counts: float, seed: int = 0) -> Measurement:
-    """Replace absorbances by those of so many detected quanta a pixel without the medium, and record their sigma.
+def add_quantum_noise(measurement: Measurement, counts: float, seed: int = 0) -> Measurement:
+    """Replace what was measured by what so many detected quanta make of it, and record its sigma.
 
     Parameters
     ----------
-    counts : quanta; the reference picture is the mean of many, so without noise of its own
+    counts : quanta a pixel without the medium (absorption), or where it is brightest (emission)
     seed : of the noise
 
     Raises
     ------
     InputError
-        If something else was measured.
+        If the noise of a technique is not that of quanta.
     """
-    if measurement.techniques != (Absorption,):
-        raise InputError(f"counts: expected absorption, got {' and '.join(k.name for k in measurement.techniques)}")
-    values = measurement.observations[0].values
-    generator = torch.Generator().manual_seed(seed)
-    passed = torch.poisson(counts * torch.exp(-values.nan_to_num()), generator)
-    found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_pictures=math.inf)
-    maps = {Absorption.name: torch.from_numpy(found).float()}
-    return measurement.observed(maps, {Absorption.name: torch.from_numpy(sigma).float()})
+    generator, noisy, sigmas = torch.Generator().manual_seed(seed), {}, {}
+    for o in measurement.observations:
+        noisy[o.technique.name], sigmas[o.technique.name] = o.technique.detected(o.values, counts, generator)
+    return measurement.observed(noisy, {**sigmas})
 
 
 def simulate(
@@ -174,7 +168,7 @@ class Simulation:
     noise: float = 0.0
     """Standard deviation of the noise as a share of the rms over rays that cross the box."""
     counts: float = 0.0
-    """Of absorption: detected quanta a pixel without the medium, whose noise there is then instead; 0 for none."""
+    """Detected quanta, whose noise there is then instead: without the medium (absorption) or where it is brightest."""
     seed: int = 0
     """Of phantom and noise."""
     time: float = 0.0
@@ -220,7 +214,7 @@ class Simulation:
             self.ambient_faces, on_view, kinds,
         )  # fmt: skip
         if self.counts:
-            measurement = add_photon_noise(measurement, self.counts, self.seed + frame)
+            measurement = add_quantum_noise(measurement, self.counts, self.seed + frame)
         grid, quantity = Grid.of_resolution(box, self.truth_voxels), measurement.quantity
         return measurement, Volume(field.sample(grid), grid, quantity, describe(quantity)[0], {"n_ambient": n_ambient})
 

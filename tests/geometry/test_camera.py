@@ -1,4 +1,4 @@
-"""The camera in general position: distorted, turned, with an oblique background."""
+"""The camera of either projection in general position: distorted, turned, with an oblique background."""
 
 from __future__ import annotations
 
@@ -9,24 +9,32 @@ import pytest
 import torch
 
 from nerif.conventions import InputError
-from nerif.geometry import Camera, Plane
+from nerif.geometry import PROJECTIONS, Box, Camera, Plane, projection_named
 
 F64 = torch.float64
 
 
-@pytest.fixture
-def camera(rotation_about) -> Camera:
+K = {
+    "perspective": [[1800.0, 0.7, 95.3], [0.0, 1750.0, 61.7], [0.0, 0.0, 1.0]],
+    "telecentric": [[0.81, 3e-4, 95.3], [0.0, 0.79, 61.7], [0.0, 0.0, 1.0]],
+}
+DISTORTION = {"perspective": [-0.21, 0.09, 1.2e-3, -0.8e-3, 0.02], "telecentric": [-4e-7, 2e-12, 3e-6, -2e-6, 1e-17]}
+
+
+@pytest.fixture(params=sorted(PROJECTIONS))
+def camera(request, rotation_about) -> Camera:
     rotation = rotation_about((0.4, 1.0, -0.3), 0.7)
     centre = torch.tensor([-300.0, 120.0, -500.0], dtype=F64)
     forward = rotation[2]
     tilted = rotation_about((1.0, 0.2, 0.4), 0.4) @ forward
     return Camera(
-        intrinsics=torch.tensor([[1800.0, 0.0, 95.3], [0.0, 1750.0, 61.7], [0.0, 0.0, 1.0]], dtype=F64),
+        intrinsics=torch.tensor(K[request.param], dtype=F64),
         rotation=rotation,
         translation=-rotation @ centre,
         image_size=(130, 200),
         background=Plane(tilted, float(tilted @ (centre + 1100 * forward))),
-        distortion=torch.tensor([-0.21, 0.09, 1.2e-3, -0.8e-3, 0.02], dtype=F64),
+        distortion=torch.tensor(DISTORTION[request.param], dtype=F64),
+        projection=PROJECTIONS[request.param],
     )
 
 
@@ -62,16 +70,86 @@ def test_sensitivity_against_finite_differences_of_project(camera, pixels):
         assert float((slope - rays.ends.sensitivity[..., axis]).abs().max()) < 1e-8
 
 
-def test_projection_against_opencv_s_formula_written_out(camera):
+def test_projection_against_the_formulae_written_out(camera):
     point = torch.tensor([10.0, -14.0, 22.0], dtype=F64)
     x, y, z = (camera.rotation @ point + camera.translation).tolist()
-    x, y = x / z, y / z
+    x, y = {"perspective": (x / z, y / z), "telecentric": (x, y)}[camera.projection.name]
     k1, k2, p1, p2, k3 = camera.distortion.tolist()
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    u = 1800 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 95.3
-    v = 1750 * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 61.7
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    k = camera.intrinsics
+    assert abs(xd - x) > 1e-3 * abs(x)  # the distortion counts
+    u, v = float(k[0, 0]) * xd + float(k[0, 1]) * yd + 95.3, float(k[1, 1]) * yd + 61.7
     assert camera.project(point).tolist() == pytest.approx([u, v], abs=1e-9)
+
+
+def around(camera: Camera) -> Box:
+    """A box 600 mm before the middle of the camera's frame."""
+    x, y, z = (camera.centre + 600 * camera.rotation[2]).tolist()
+    return Box((x - 5, y - 4, z - 3), (x + 5, y + 4, z + 3))
+
+
+def test_rays_of_a_telecentric_camera_have_no_beginning_and_one_direction(camera, pixels):
+    rays = camera.rays(pixels)
+    local = camera.local(rays.origin)
+    if camera.projection.shows_depth:
+        assert rays.begin == 0
+        assert float(local.abs().max()) < 1e-9  # all from the optical centre
+    else:
+        assert rays.begin == -math.inf
+        assert float(local[:, 2].abs().max()) < 1e-9
+        assert float((rays.direction - camera.rotation[2]).abs().max()) < 1e-15
+        box = around(camera)
+        inside = replace(camera, translation=camera.translation - torch.tensor([0.0, 0.0, 600.0], dtype=F64))
+        at = [c.rays(torch.tensor([[95.3, 61.7]], dtype=F64)).clip(box) for c in (camera, inside)]
+        assert float(at[1].near) < 0 < float(at[1].far)  # the plane z_cam = 0 cuts the box, and not the rays
+        for s in ("near", "far"):
+            assert torch.allclose(*(r.at(getattr(r, s)[:, None]) for r in at), atol=1e-9)
+
+
+def test_a_box_behind_a_camera_is_seen_only_where_there_is_no_behind(camera):
+    box = around(camera)
+    beyond = replace(camera, translation=camera.translation - torch.tensor([0.0, 0.0, 2000.0], dtype=F64))
+    crosses = beyond.rays(beyond.pixel_grid().reshape(-1, 2)).clip(box).crosses
+    assert bool(crosses.any()) != camera.projection.shows_depth
+
+
+def test_turning_the_whole_rig_changes_nothing(camera, pixels, rotation_about):
+    turn = rotation_about((1.0, -0.4, 0.2), 1.1)
+    plane = camera.plane
+    turned = replace(
+        camera, rotation=camera.rotation @ turn.T, background=Plane(turn @ plane.normal, plane.offset)
+    )  # fmt: skip
+    one, other = camera.rays(pixels), turned.rays(pixels)
+    assert torch.allclose(one.end_points @ turn.T, other.end_points, atol=1e-9)
+    assert torch.allclose(one.direction @ turn.T, other.direction, atol=1e-12)
+    assert torch.allclose(one.ends.distance, other.ends.distance, atol=1e-9)
+    assert torch.allclose(one.ends.sensitivity @ turn.T, other.ends.sensitivity, atol=1e-9)
+
+
+def test_sight_distance_and_pixel_size_of_points(camera):
+    points = torch.tensor(around(camera).centre, dtype=F64) + torch.tensor([[5.0, -4.0, 2.0], [3.0, 30.0, -8.0]])
+    middle = torch.tensor([[95.3, 61.7]], dtype=F64)
+    along = camera.rays(camera.project(points)).direction
+    assert torch.allclose(camera.sight(points), along, atol=1e-12)
+    away = (points - camera.centre).norm(dim=-1)
+    far = away if camera.projection.shows_depth else torch.full_like(away, math.inf)
+    assert torch.allclose(camera.distance(points), far)
+    on_axis = camera.rays(middle).end_points
+    size = camera.pixel_size(on_axis)
+    moved = camera.project(on_axis + size * camera.rotation[0]) - middle
+    assert moved[0].tolist() == pytest.approx([1.0, 0.0], abs=0.01)
+
+
+def test_one_row_pictures(camera):
+    row = camera.view(row=60, column=0, height=1, width=200)
+    grid = row.pixel_grid()
+    assert grid.shape == (1, 200, 2)
+    rays, whole = row.rays(grid[0]), camera.rays(camera.pixel_grid()[60])
+    assert torch.allclose(rays.end_points, whole.end_points, atol=1e-9)
+    assert float((row.project(rays.end_points) - grid[0]).abs().max()) < 1e-9
 
 
 def test_crop_sees_the_same_rays(camera, pixels):
@@ -99,7 +177,8 @@ def test_mirrored_axis_swapped_axis_and_stretch_are_no_rotation(camera):
 def test_intrinsics_that_cannot_be_right(camera):
     negative = camera.intrinsics.clone()
     negative[1, 1] *= -1
-    with pytest.raises(InputError, match="positive focal lengths"):
+    words = {"perspective": "positive focal lengths in px", "telecentric": "positive scales in px/mm"}
+    with pytest.raises(InputError, match=words[camera.projection.name]):
         replace(camera, intrinsics=negative)
     with pytest.raises(InputError, match="transposed"):
         replace(camera, intrinsics=camera.intrinsics.T)
@@ -107,6 +186,8 @@ def test_intrinsics_that_cannot_be_right(camera):
         replace(camera, translation=camera.translation * math.nan)
     with pytest.raises(InputError, match="image_size"):
         replace(camera, image_size=(0, 10))
+    with pytest.raises(InputError, match="view 'a': projection: expected one of perspective, telecentric, got 'fish'"):
+        projection_named("fish", "view 'a': projection")
 
 
 def test_distortion_that_folds_the_image_is_refused(camera, pixels):

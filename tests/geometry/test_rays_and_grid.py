@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerif.conventions import FACES, InputError, parse_faces
-from nerif.geometry import Box, Grid, Rays, Ring, paper_rig
+from nerif.geometry import TELECENTRIC, Box, Grid, Rays, Ring, paper_rig
 
 F64 = torch.float64
 BOX = Box((-1.0, -2.0, -3.0), (2.0, 4.0, 6.0))
@@ -105,6 +105,32 @@ def test_ring_settings():
     for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
         with pytest.raises(InputError, match=name):
             Ring(**{name: -1})
+
+
+def test_a_telecentric_ring_sees_as_much_as_its_lens_magnifies():
+    plain, parallel = Ring(image_size=(20, 30)), Ring(image_size=(20, 30), projection="telecentric")
+    origin, above = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=F64)
+    for one, other in zip(plain.cameras(), parallel.cameras(), strict=True):  # as large at the origin
+        assert torch.allclose(one.project(origin), other.project(origin), atol=1e-9)
+        assert torch.allclose(one.project(above), other.project(above), atol=1e-9)
+        assert torch.allclose(one.rotation, other.rotation)
+    for camera in Ring(projection="telecentric", magnification=0.2, pixel_pitch=0.01).cameras():
+        assert camera.projection == TELECENTRIC
+        assert float(camera.intrinsics[0, 0]) == pytest.approx(20.0)  # px/mm
+        assert float(camera.pixel_size(above + 30.0)) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"projection": "fisheye"}, "projection: expected one of perspective, telecentric, got 'fisheye'"),
+        ({"magnification": 0.1}, "magnification: expected a positive number, with projection = telecentric"),
+        ({"magnification": -0.1, "projection": "telecentric"}, "magnification: expected a positive number"),
+    ],
+)
+def test_lenses_that_cannot_be(settings, words):
+    with pytest.raises(InputError, match=words):
+        Ring(**settings)
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from calibration_pictures import detection, target_pictures
 from nerif.conventions import InputError
-from nerif.experiment import background_poses, target_poses, world_axes
+from nerif.experiment import target_poses, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.bundle import Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration import CalibrationSettings, calibrate
@@ -49,29 +50,8 @@ CAMERAS = rig()
 SETTINGS = CalibrationSettings(world="0", axes=world_axes(CAMERAS))
 
 
-def detection(camera: Camera, pose: Pose, noise: float, rng: np.random.Generator) -> Detection:
-    pixels = camera.project(torch.from_numpy(TARGET.points @ pose.rotation.T + pose.translation)).numpy()
-    height, width = camera.image_size
-    inside = np.flatnonzero((pixels > 0).all(axis=1) & (pixels < (width - 1, height - 1)).all(axis=1))
-    return Detection(inside, pixels[inside] + noise * rng.standard_normal((len(inside), 2)), TARGET.points[inside])
-
-
 def pictures(noise: float = 0.0, poses: int = 12, backgrounds: int = 3) -> list[ViewPictures]:
-    rng = np.random.default_rng(7)
-    free = target_poses(CAMERAS, TARGET, poses, seed=1)
-    views = []
-    for camera in CAMERAS:
-        facing = {}
-        for j, pose in enumerate(free):
-            line = camera.centre.numpy() - pose.translation
-            if -pose.rotation[:, 2] @ line / np.linalg.norm(line) > 0.55:
-                facing[str(j)] = detection(camera, pose, noise, rng)
-        laid = {
-            str(j): detection(camera, pose, noise, rng)
-            for j, pose in enumerate(background_poses(camera, TARGET, backgrounds) if backgrounds else [])
-        }
-        views.append(ViewPictures(camera.name, camera.image_size, facing, laid))
-    return views
+    return target_pictures(CAMERAS, TARGET, noise, poses, backgrounds)
 
 
 def test_exact_points_give_the_rig_back():
@@ -225,7 +205,7 @@ def small() -> tuple[Bundle, list[Observation]]:
         Observation(i, j, d)
         for i, camera in enumerate(CAMERAS[1:3])
         for j, pose in enumerate(poses)
-        for d in [detection(camera, pose, 0.0, rng)]
+        for d in [detection(camera, TARGET, pose, 0.0, rng)]
     ]
     k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, 0, 0, 0, 0, 0] for c in CAMERAS[1:3]], dtype=float)
     cameras = tuple(Pose(c.rotation.numpy(), c.translation.numpy() + 1.0) for c in CAMERAS[1:3])

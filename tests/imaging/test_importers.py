@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import cv2
@@ -14,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerif.conventions import InputError
-from nerif.geometry import Camera, Plane
+from nerif.geometry import TELECENTRIC, Camera, Plane
 from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
 
@@ -37,6 +38,12 @@ def make(name: str, seed: int) -> Camera:
 
 
 ONE, TWO = make("one", 1), make("two", 2)
+PARALLEL = dataclasses.replace(
+    make("parallel", 3),
+    intrinsics=torch.tensor([[4.1, 0, 101.25], [0, 4.0, 77.5], [0, 0, 1]], dtype=torch.float64),
+    distortion=torch.tensor([-2e-5, 1e-8, 1e-5, -2e-5, 1e-12], dtype=torch.float64),
+    projection=TELECENTRIC,
+)
 
 
 def same(got: CalibratedCamera, camera: Camera) -> bool:
@@ -59,9 +66,10 @@ def arrays(camera: Camera) -> dict[str, np.ndarray]:
 
 def test_own_file_keeps_every_bit(tmp_path):
     path = tmp_path / "c.toml"
-    cameras = [CalibratedCamera.from_camera(ONE), CalibratedCamera.from_camera(TWO)]
+    cameras = [CalibratedCamera.from_camera(c) for c in (ONE, TWO, PARALLEL)]
     write_cameras(path, cameras, {"rms_px": 0.02})
-    for got, camera in zip(import_cameras(path), (ONE, TWO), strict=True):
+    for got, camera in zip(import_cameras(path), (ONE, TWO, PARALLEL), strict=True):
+        assert got.projection == got.camera().projection == camera.projection
         for name in ("intrinsics", "rotation", "translation", "distortion"):
             assert torch.equal(getattr(got, name), getattr(camera, name))
         assert got.image_size == camera.image_size
@@ -77,6 +85,7 @@ def test_own_file_keeps_every_bit(tmp_path):
         (("rotation", "rotatoin"), "camera 'one': unknown key 'rotatoin'; the nearest known one is 'rotation'"),
         (('name = "one"', ""), "camera 'camera 0': 'name' is missing"),
         (("offset = -900.0", 'offset = "far"'), "background: offset: expected a number"),
+        (('name = "one"', 'name = "one"\nprojection = "fisheye"'), "'one': projection: expected one of perspective"),
         (('format = "nerif-calibration-1"', 'format = "other"'), "expected format = 'nerif-calibration-1'"),
         (("[[camera]]", "[[camera"), "not a TOML file"),
     ],
@@ -169,6 +178,27 @@ def test_csv(tmp_path, delimiter):
     path.write_text("name,fx\na,1\n")
     with pytest.raises(InputError, match="column 'fy' is missing"):
         import_cameras(path)
+
+
+def test_telecentric_cameras_of_tables(tmp_path):
+    """In units of the file: px per unit, and distortion of lengths in it."""
+    ten = PARALLEL.intrinsics * torch.tensor([[10.0], [10.0], [1.0]], dtype=torch.float64)
+    ten[:2, 2] /= 10
+    distortion = PARALLEL.distortion * 10.0 ** torch.tensor([2.0, 4.0, 1.0, 1.0, 6.0], dtype=torch.float64)
+    in_cm = dataclasses.replace(PARALLEL, intrinsics=ten, distortion=distortion, translation=PARALLEL.translation / 10)
+    a = arrays(in_cm)
+    plain = {"K": a["K"].tolist(), "R": a["R"].tolist(), "t": a["t"].tolist(), "distortion": a["D"].tolist()}
+    toml, table = tmp_path / "p.toml", tmp_path / "p.csv"
+    toml.write_text(tomli_w.dumps({"parallel": {**plain, "projection": "telecentric"}}))
+    row = {**table_of(in_cm), "offset": -90, "projection": "telecentric"}
+    table.write_text(",".join(row) + "\n" + ",".join(str(v) for v in row.values()) + "\n")
+    for path in (toml, table):
+        (got,) = import_cameras(path, ImportSettings(scale_mm=10.0))
+        assert got.projection == TELECENTRIC
+        assert same(got, PARALLEL)
+        path.write_text(path.read_text().replace("telecentric", "fisheye"))
+        with pytest.raises(InputError, match=r"'?parallel'?: projection: expected one of perspective, telecentric"):
+            import_cameras(path)
 
 
 # -- OpenCV --------------------------------------------------------------------------------------------------------
@@ -286,6 +316,7 @@ def test_nerf_angle_of_view(tmp_path):
         ({"camera_model": "OPENCV"}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
         ({"camera_model": "EQUIRECTANGULAR"}, {}, "EQUIRECTANGULAR"),
         ({"is_fisheye": True}, {}, "is_fisheye"),
+        ({"camera_model": "ORTHOPHOTO"}, {}, "ORTHOPHOTO"),
         ({"k4": 0.01}, {}, "at most 5 distortion coefficients"),
     ],
 )

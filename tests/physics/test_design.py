@@ -14,19 +14,22 @@ from nerif.conventions import InputError
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
 from nerif.physics.design import DesignSettings, expect
+from nerif.rendering import Lens, _rays
 from nerif.simulation import view_displacement
 
 RING = Ring(views=5, image_size=(160, 200))
+PARALLEL = replace(RING, projection="telecentric", magnification=0.08)
 SETTINGS = DesignSettings()
 
 
-def test_expected_displacement_is_that_of_a_ball():
+@pytest.mark.parametrize("ring", [RING, PARALLEL], ids=lambda r: r.projection)
+def test_expected_displacement_is_that_of_a_ball(ring):
     ball = GaussianBalls(
         torch.zeros(1, 3, dtype=torch.float64), torch.tensor([4.0], dtype=torch.float64),
         torch.tensor([-2e-4], dtype=torch.float64),
     )  # fmt: skip
-    d = view_displacement(ball, RING.cameras()[0], Box.cube(50.0), 1.00027)
-    expected = expect(RING, replace(SETTINGS, index_contrast=2e-4))
+    d = view_displacement(ball, ring.cameras()[0], Box.cube(50.0), 1.00027)
+    expected = expect(ring, replace(SETTINGS, index_contrast=2e-4))
     assert float(d.norm(dim=-1).max()) == pytest.approx(expected.displacement, rel=0.01)
 
 
@@ -41,6 +44,30 @@ def test_lengths_are_those_of_similar_triangles():
     assert e.resolution == pytest.approx(np.sqrt(e.cone**2 + e.window**2 + e.diffraction**2))
     assert e.smallest_contrast * e.displacement == pytest.approx(SETTINGS.index_contrast * SETTINGS.displacement_noise)
     assert e.dot == pytest.approx(3 * e.pixel_at_background)
+
+
+def test_lengths_of_a_telecentric_lens_are_those_of_its_magnification():
+    e = expect(PARALLEL, SETTINGS)
+    assert e.pixel_at_flow == pytest.approx(0.02 / 0.08)
+    assert e.pixel_at_background == e.pixel_at_flow
+    assert e.field_of_view == pytest.approx((200 * 0.25, 160 * 0.25))
+    assert e.sensitivity == pytest.approx(500 / 0.25 / 1000)
+    assert e.cone == pytest.approx(500 * 0.08 / 16)  # of the f-number on the sensor's side
+    assert e.diffraction == pytest.approx(2.44 * 532e-6 * 16 / 0.08)
+    further = expect(replace(PARALLEL, background_distance=1000.0), SETTINGS)
+    assert further.displacement == pytest.approx(2 * e.displacement)
+
+
+@pytest.mark.parametrize("ring", [RING, PARALLEL], ids=lambda r: r.projection)
+def test_the_cone_is_the_one_that_is_rendered(ring):
+    camera = ring.cameras()[0]
+    lens = Lens.stopped_down(camera, ring.pixel_pitch, SETTINGS.f_number)
+    middle, depth = torch.tensor([[99.5, 79.5]], dtype=torch.float64), 1200.0
+    rim = torch.tensor([lens.diameter / 2, 0.0], dtype=torch.float64)
+    edges = [_rays(camera, middle, camera.plane, offset, depth) for offset in (rim, -rim)]
+    assert torch.allclose(edges[0].end_points, edges[1].end_points, atol=1e-9)  # in focus on the background
+    at_flow = [r.origin - r.origin[:, :1] / r.direction[:, :1] * r.direction for r in edges]  # on the plane x = 0
+    assert float((at_flow[0] - at_flow[1]).norm()) == pytest.approx(expect(ring, SETTINGS).cone)
 
 
 def test_trade_offs_go_the_right_way():
@@ -88,5 +115,8 @@ def test_the_command_prints_and_draws(tmp_path, capsys):
     assert contrast == pytest.approx(2.29e-4, rel=0.02)
     assert iio.imread(out).std() > 10
     assert main(["design", "-o", str(out)]) == 2
+    assert main(["design", "--projection", "telecentric"]) == 0
+    assert "pixel on the background               0.280 mm" in capsys.readouterr().out
+    assert main(["design", "--magnification", "0.1"]) == 2
     assert main(["design", "--temperature", "-3"]) == 2
     assert main(["design", "-o", str(tmp_path / "x.txt")]) == 2

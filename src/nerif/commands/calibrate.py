@@ -94,13 +94,15 @@ def _calibrate(settings: Calibrate) -> Calibration:
     views, count = find_views(settings.source, settings.views), itertools.count(1)
     with counting_bar("looking for targets", target_pictures(views)) as bar:
         return calibrate_views(
-            views, settings.target, settings.method, settings.background_scale, say, lambda: bar(next(count))
-        )
+            views, settings.target, settings.method, settings.background_scale,
+            settings.taken_over.background_distance, say, lambda: bar(next(count)),
+        )  # fmt: skip
 
 
 def _tell(calibration: Calibration) -> None:
+    scale = f"f [{calibration.projection.unit}]"
     say(
-        f"{'camera':<12}{'pictures':>9}{'rms [px]':>10}{'f [px]':>10}{'+-':>8}{'rotation +-':>13}{'position +-':>13}"
+        f"{'camera':<12}{'pictures':>9}{'rms [px]':>10}{scale:>10}{'+-':>8}{'rotation +-':>13}{'position +-':>13}"
         f"{'background rms':>16}"
     )
     for i, name in enumerate(calibration.names):
@@ -108,7 +110,7 @@ def _tell(calibration: Calibration) -> None:
         plane = calibration.backgrounds[i]
         used = f"{sum(e.used for e in own)}/{len(own)}"
         say(
-            f"{name:<12}{used:>9}{calibration.rms(name):>10.3f}{calibration.intrinsics[i, 0]:>10.1f}"
+            f"{name:<12}{used:>9}{calibration.rms(name):>10.3f}{calibration.intrinsics[i, 0]:>10.5g}"
             f"{calibration.sigma_focal[i]:>8.2%}{calibration.sigma_rotation[i]:>9.4f} deg"
             f"{calibration.sigma_translation[i]:>10.3f} mm" + (f"{plane.rms:>13.3f} mm" if plane else f"{'none':>16}")
         )

@@ -71,18 +71,18 @@ def _measurement(path: Path, m: Measurement) -> None:
     for name in m.about_views:
         say(f"  {name:<14} known of the views")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
-    say("  view            size [px]      f [px]   centre to camera [mm]   to background [mm]   usable        rms")
+    say("  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable        rms")
     usable = m.usable
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
-        away = float((c.centre - centre).norm())
+        away, pixel = float(c.distance(centre)), float(c.pixel_size(centre))
         plane = c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
         good = m.observations[0].values[i][m.usable_for(m.observations[0])[i]]
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
         say(
-            f"  {c.name:<14} {size:>10} {float(c.intrinsics[0, 0]):11.1f} {away:23.1f} {behind:>20} "
+            f"  {c.name:<14} {size:>10} {pixel:11.4g} {away:23.1f} {behind:>20} "
             f"{share:8.1%} {float(good.square().mean().sqrt()):10.4f}"
         )
 

@@ -56,7 +56,7 @@ def run(settings: Render) -> None:
     count = itertools.count(1)
     with counting_bar("rendering", pictures.pictures(len(cameras))) as bar:
         pictures.write(
-            settings.out, cameras, phantom, box, settings.n_ambient, settings.ring.focal_length, settings.truth_voxels,
+            settings.out, cameras, phantom, box, settings.n_ambient, settings.ring.pixel_pitch, settings.truth_voxels,
             lambda: bar(next(count)),
         )  # fmt: skip
     target = pictures.target_for(cameras)

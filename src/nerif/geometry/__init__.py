@@ -2,7 +2,11 @@
 
 from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box, Grid
+from nerif.geometry.projection import PERSPECTIVE, PROJECTIONS, TELECENTRIC, Projection, projection_named
 from nerif.geometry.rays import BackgroundPoints, Rays
 from nerif.geometry.rig import Ring, paper_rig
 
-__all__ = ["BackgroundPoints", "Box", "Camera", "Grid", "Plane", "Rays", "Ring", "paper_rig"]
+__all__ = [
+    "PERSPECTIVE", "PROJECTIONS", "TELECENTRIC", "BackgroundPoints", "Box", "Camera", "Grid", "Plane", "Projection",
+    "Rays", "Ring", "paper_rig", "projection_named",
+]  # fmt: skip

@@ -1,6 +1,6 @@
-"""The camera: an OpenCV pinhole with five distortion coefficients, looking at a background plane.
+"""The camera: OpenCV's, perspective or telecentric, with five distortion coefficients, looking at a background plane.
 
-x_cam = R x_world + t,   (x, y) = (X/Z, Y/Z) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
+x_cam = R x_world + t,   (x, y) = projection(x_cam) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points
+from nerif.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
+from nerif.geometry.distortion import distort, undistort
+from nerif.geometry.projection import PERSPECTIVE, Projection
 from nerif.geometry.rays import BackgroundPoints, Rays
 
 __all__ = ["Camera", "Plane"]
 
-LEAST_FOCAL = 1.0  # px
 LARGEST_IMAGE = 100_000  # px
 
 
@@ -40,13 +41,14 @@ class Camera:
 
     Parameters
     ----------
-    intrinsics : (3, 3) K, px
+    intrinsics : (3, 3) K, px; fx and fy of a telecentric camera in px/mm
     rotation : (3, 3) world to camera
     translation : (3,) world to camera, mm
     image_size : (height, width), px
     background : Plane of any orientation, world frame, mm; None for a technique that needs none
-    distortion : (5,) OpenCV's k1, k2, p1, p2, k3
+    distortion : (5,) OpenCV's k1, k2, p1, p2, k3; of a telecentric camera of (x, y) in mm
     name : what the view is called
+    projection : perspective or telecentric
 
     Raises
     ------
@@ -61,6 +63,7 @@ class Camera:
     background: Plane | None
     distortion: Float[Tensor, 5]
     name: str = "camera"
+    projection: Projection = PERSPECTIVE
 
     def __post_init__(self) -> None:
         plane = self.background
@@ -89,10 +92,10 @@ class Camera:
                 f"got |R R^T - 1| = {error:.2g}, det = {determinant:.3g}; check for a swapped or mirrored axis"
             )
         k = self.intrinsics
-        if not (float(k[0, 0]) >= LEAST_FOCAL and float(k[1, 1]) >= LEAST_FOCAL):
+        if not min(float(k[0, 0]), float(k[1, 1])) >= self.projection.least_scale:
             raise InputError(
-                f"intrinsics of view '{self.name}': expected positive focal lengths in px, "
-                f"got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}"
+                f"intrinsics of view '{self.name}': expected positive {self.projection.scale}s in "
+                f"{self.projection.unit}, got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}"
             )
         if abs(float(k[2, 2]) - 1) > 1e-9 or float(k[2, :2].abs().max()) > 0 or float(k[1, 0]) != 0:
             raise InputError(
@@ -107,8 +110,24 @@ class Camera:
 
     @property
     def centre(self) -> Float[Tensor, 3]:
-        """Optical centre, mm, world frame."""
+        """Origin of the camera's frame, mm, world frame: the optical centre of a perspective camera."""
         return -self.rotation.T @ self.translation
+
+    def local(self, points: Points) -> Points:
+        """World points (mm) in the camera's frame, mm."""
+        return points @ self.rotation.T + self.translation
+
+    def sight(self, points: Points) -> Points:
+        """Unit directions in which the camera sees world points (mm), away from it, world frame."""
+        return self.projection.sight(self.local(points)) @ self.rotation
+
+    def distance(self, points: Points) -> Values:
+        """How far the camera is from world points (mm), mm: infinitely far where its lines of sight are parallel."""
+        return self.projection.distance(self.local(points))
+
+    def pixel_size(self, points: Points) -> Values:
+        """Width of a pixel, mm, at world points (mm), across the optical axis."""
+        return 1 / (self.intrinsics[0, 0] * self.projection.magnification(self.local(points)))
 
     @property
     def plane(self) -> Plane:
@@ -144,14 +163,20 @@ class Camera:
         k = self.intrinsics
         y = (pixels[..., 1] - k[1, 2]) / k[1, 1]
         x = (pixels[..., 0] - k[0, 2] - k[0, 1] * y) / k[0, 0]
-        ideal = self._undistort(torch.stack([x, y], dim=-1))
-        direction = torch.cat([ideal, torch.ones_like(ideal[..., :1])], dim=-1) @ self.rotation
+        ideal = undistort(torch.stack([x, y], dim=-1), self.distortion)
+        if ideal is None:
+            raise InputError(
+                f"distortion of view '{self.name}': expected coefficients that can be inverted over the image, "
+                f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)"
+            )
+        start, heading = self.projection.lines(ideal)
+        direction = heading @ self.rotation
         direction = direction / direction.norm(dim=-1, keepdim=True)
-        origin = self.centre.expand_as(direction)
+        origin = (self.centre + start @ self.rotation).expand_as(direction)
         zero = torch.zeros_like(pixels[..., 0])
         number = torch.full(zero.shape, view, dtype=torch.int16)
         ends = self._background_points(origin, direction, sensitivity)
-        return Rays(origin, direction, zero, zero, pixels, number, ends)
+        return Rays(origin, direction, zero, zero, pixels, number, ends, self.projection.begin)
 
     def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
         """Where rays meet the background, and S there."""
@@ -171,52 +196,12 @@ class Camera:
 
     def _project_jacobian(self, points: Points) -> tuple[Pixels, Float[Tensor, "*batch 2 3"]]:
         """Pixels and d pixel / d X (px/mm)."""
-        local = points @ self.rotation.T + self.translation
-        depth = local[..., 2:]
-        ideal = local[..., :2] / depth
-        distorted, inner = self._distort(ideal)
-        k = self.intrinsics[:2, :2]
-        pixels = distorted @ k.T + self.intrinsics[:2, 2]
-        # k inner (R[:2] - ideal R[2]) / depth, one row of it after the other: small matrix products are slow in a batch
-        (xx, xy), (yx, yy) = (row.unbind(-1) for row in inner.unbind(-2))
-        rows = []
-        u, v = (k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy), (k[1, 1] * yx, k[1, 1] * yy)
-        for along_x, along_y in (u, v):
-            rows += [along_x, along_y, -(along_x * ideal[..., 0] + along_y * ideal[..., 1])]
-        jacobian = (torch.stack(rows, dim=-1) / depth).unflatten(-1, (2, 3)) @ self.rotation
-        return pixels, jacobian
-
-    def _distort(self, ideal: Pixels) -> tuple[Pixels, Float[Tensor, "*batch 2 2"]]:
-        """OpenCV's distortion of ideal image coordinates, and its Jacobian."""
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = ideal.unbind(-1)
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d r2, times 2
-        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-        jacobian = torch.stack([torch.stack([xx, cross], -1), torch.stack([cross, yy], -1)], -2)
-        return torch.stack([xd, yd], -1), jacobian
-
-    def _undistort(self, distorted: Pixels) -> Pixels:
-        """Invert the distortion by Newton's method (at most 20 steps)."""
-        if not (distorted.numel() and bool(self.distortion.any())):
-            return distorted
-        ideal = distorted
-        for _ in range(20):
-            value, jacobian = self._distort(ideal)
-            residual = distorted - value
-            if float(residual.abs().amax()) < 1e-14:
-                break
-            (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
-            x, y = residual.unbind(-1)
-            ideal = ideal + torch.stack([d * x - b * y, a * y - c * x], dim=-1) / (a * d - b * c)[..., None]
-        if not float((distorted - self._distort(ideal)[0]).abs().amax()) < 1e-9:
-            raise InputError(
-                f"distortion of view '{self.name}': expected coefficients that can be inverted over the image, "
-                f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)"
-            )
-        return ideal
+        local = self.local(points)
+        image, slope = self.projection.image(local), self.projection.slope
+        x, y, (xx, cross, yy) = distort(image[..., 0], image[..., 1], self.distortion)
+        k = self.intrinsics
+        pixels = torch.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], dim=-1)
+        # row by row: small matrix products are slow in a batch
+        u = slope(k[0, 0] * xx + k[0, 1] * cross, k[0, 0] * cross + k[0, 1] * yy, image, local)
+        v = slope(k[1, 1] * cross, k[1, 1] * yy, image, local)
+        return pixels, torch.stack([*u, *v], dim=-1).unflatten(-1, (2, 3)) @ self.rotation

@@ -11,6 +11,7 @@ import torch
 from nerif.conventions import InputError
 from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box
+from nerif.geometry.projection import Projection, projection_named
 
 __all__ = ["Ring", "paper_rig"]
 
@@ -27,8 +28,12 @@ class Ring:
     """Azimuths of further cameras, degrees (to be held out, say)."""
     elevation: float = 0.0
     """Of the optical axes above the horizontal, degrees."""
+    projection: str = "perspective"
+    """perspective, or telecentric: along parallel rays."""
     focal_length: float = 50.0
     """Focal length, mm."""
+    magnification: float | None = None
+    """Size of the image over that of the object, of telecentric lenses; focal_length / distance if not given."""
     pixel_pitch: float = 0.02
     """Pixel pitch of the sensor, mm."""
     image_size: tuple[int, int] = (200, 200)
@@ -45,8 +50,25 @@ class Ring:
         for name in ("arc", "extra_angles", "elevation"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
                 raise InputError(f"{name}: expected degrees, got {getattr(self, name)}")
+        perspective = self.kind.shows_depth
+        if self.magnification is not None and (perspective or not 0 < self.magnification < math.inf):
+            raise InputError(
+                f"magnification: expected a positive number, with projection = telecentric, got {self.magnification} "
+                f"with {self.projection}"
+            )
         if min(self.image_size) < 1:
             raise InputError(f"image_size: expected (height, width) > 0 px, got {self.image_size}")
+
+    @property
+    def kind(self) -> Projection:
+        """The projection of the cameras."""
+        return projection_named(self.projection)
+
+    @property
+    def scale(self) -> float:
+        """Entries fx = fy of K: px, or px/mm of telecentric cameras."""
+        magnification = self.magnification or self.focal_length / self.distance
+        return (self.focal_length if self.kind.shows_depth else magnification) / self.pixel_pitch
 
     @property
     def angles(self) -> tuple[float, ...]:
@@ -71,8 +93,8 @@ class Ring:
         right = right / right.norm()
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
         height, width = self.image_size
-        f = self.focal_length / self.pixel_pitch
-        intrinsics = torch.tensor([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+        f, cx, cy = self.scale, (width - 1) / 2, (height - 1) / 2
+        intrinsics = torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64)
         return Camera(
             intrinsics=intrinsics,
             rotation=rotation,
@@ -81,6 +103,7 @@ class Ring:
             background=Plane(outward, -self.background_distance),
             distortion=torch.zeros(5, dtype=torch.float64),
             name=name,
+            projection=self.kind,
         )
 
 

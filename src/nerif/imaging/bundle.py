@@ -8,7 +8,9 @@ a turn: the principal point near the middle of the picture, distortion near none
 The normal equations are put together block by block and solved exactly in each step of Levenberg and Marquardt's
 method, which settles what a narrow lens can hardly tell apart too.
 
-Source: Triggs et al., Bundle adjustment - a modern synthesis, 2000; projection and its derivatives by OpenCV.
+What no picture shows, such as the depth of a telecentric camera, stays where it is, with a standard deviation of 0.
+
+Source: Triggs et al., Bundle adjustment - a modern synthesis, 2000.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from nerif.geometry import PERSPECTIVE, Projection
+from nerif.geometry.distortion import POWERS, distort
 from nerif.imaging.targets import Detection
 
 __all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust"]
@@ -26,7 +30,9 @@ __all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust"]
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 HUBER = 5  # times the noise of a point: where the loss turns linear
 PRINCIPAL = 0.03  # of the picture's width: how far the principal point may well be from its middle
-DISTORTION = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS: how large they may well be
+DISTORTION = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS: how large they may well be, by (x, y) in units of
+UNIT = 5  # times half the width of a telecentric picture, mm: of a perspective one, that is 23 degrees wide
+UNSEEN = 1e-13  # share of the largest eigenvalue of the curvature: directions below it change no picture
 INTRINSIC, POSE = 9, 6  # parameters: fx, fy, cx, cy and five of distortion; rotation vector, translation
 
 
@@ -96,12 +102,13 @@ class Bundle:
 
     Parameters
     ----------
-    intrinsics : (camera, 9) fx, fy, cx, cy (px), k1, k2, p1, p2, k3
+    intrinsics : (camera, 9) fx, fy, cx, cy (px; fx, fy of telecentric cameras px/mm), k1, k2, p1, p2, k3
     cameras : world to camera
     poses : target to world
     fixed : the pose that is the world
     free : (9,) which intrinsics are adjusted
     sizes : (height, width) of every camera's pictures, px
+    projection : of all cameras
     """
 
     intrinsics: Float[np.ndarray, "camera 9"]
@@ -110,12 +117,39 @@ class Bundle:
     fixed: int
     free: tuple[bool, ...]
     sizes: tuple[tuple[int, int], ...]
+    projection: Projection = PERSPECTIVE
 
     def project(self, seen: Observation) -> Float[np.ndarray, "n 2"]:
         """Where the points of an observation should be, px."""
-        return _project(
-            self.intrinsics[seen.camera], self.cameras[seen.camera], self.poses[seen.pose], seen.detection.points
-        )[0]
+        k, pose = self.intrinsics[seen.camera], self.cameras[seen.camera] @ self.poses[seen.pose]
+        image = self.projection.image(pose.moved(seen.detection.points))
+        x, y, _ = distort(image[:, 0], image[:, 1], k[4:])
+        return np.stack([k[0] * x + k[2], k[1] * y + k[3]], axis=1)
+
+    def derivatives(self, seen: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives (2 n, p) of u, v of each point by intrinsics, pose of the camera and pose of the target."""
+        import cv2
+
+        k, points = self.intrinsics[seen.camera], seen.detection.points
+        a, b = self.poses[seen.pose].vector, self.cameras[seen.camera].vector
+        r, t, drda, drdta, drdb, drdtb, dtda, dtdta, dtdb, dtdtb = cv2.composeRT(a[:3], a[3:], b[:3], b[3:])
+        rotation, turn = cv2.Rodrigues(r)
+        local = points @ rotation.T + t.ravel()
+        image, slope = self.projection.image(local), self.projection.slope
+        x, y = image.T
+        xd, yd, (xx, cross, yy) = distort(x, y, k[4:])
+        by_place = np.stack([
+            np.stack(slope(k[0] * xx, k[0] * cross, image, local), axis=-1),
+            np.stack(slope(k[1] * cross, k[1] * yy, image, local), axis=-1),
+        ], axis=1)  # fmt: skip
+        by_turn = by_place @ np.tensordot(points, turn.reshape(3, 3, 3), axes=(1, 2)).transpose(0, 2, 1)
+        by_joint = np.concatenate([by_turn, by_place], axis=-1).reshape(-1, POSE)
+        r2, zero, one = x * x + y * y, np.zeros_like(x), np.ones_like(x)
+        u = (xd, zero, one, zero, *(k[0] * c for c in (x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3)))
+        v = (zero, yd, zero, one, *(k[1] * c for c in (y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3)))
+        by_intrinsics = np.stack([np.stack(u, axis=-1), np.stack(v, axis=-1)], axis=1).reshape(-1, INTRINSIC)
+        by_camera = by_joint @ np.block([[drdb, drdtb], [dtdb, dtdtb]])
+        return by_intrinsics, by_camera, by_joint @ np.block([[drda, drdta], [dtda, dtdta]])
 
     def residual(self, seen: Observation) -> Float[np.ndarray, "n 2"]:
         """Found less expected, px."""
@@ -124,22 +158,6 @@ class Bundle:
     def rms(self, seen: Observation) -> float:
         """Root mean square of the distances of an observation's points from where they should be, px."""
         return float(np.sqrt((self.residual(seen) ** 2).sum(axis=1).mean()))
-
-
-def _project(
-    intrinsics: np.ndarray, camera: Pose, pose: Pose, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """Pixels, their derivatives by the joint pose and the intrinsics, and those of the joint pose by both poses."""
-    import cv2
-
-    a, b = pose.vector, camera.vector
-    r, t, drda, drdta, drdb, drdtb, dtda, dtdta, dtdb, dtdtb = cv2.composeRT(a[:3], a[3:], b[:3], b[3:])
-    fx, fy, cx, cy = intrinsics[:4]
-    k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    pixels, jacobian = cv2.projectPoints(points, r, t, k, intrinsics[4:])
-    by_pose = np.block([[drda, drdta], [dtda, dtdta]])
-    by_camera = np.block([[drdb, drdtb], [dtdb, dtdtb]])
-    return pixels.reshape(-1, 2), jacobian[:, : POSE + INTRINSIC], (by_pose, by_camera)
 
 
 def adjust(
@@ -163,7 +181,7 @@ def adjust(
     x, damping, calm = layout.pack(bundle), 1e-3, 0
     cost, curvature, slope = layout.normal_equations(x)
     for _ in range(iterations):
-        scale = np.sqrt(np.diag(curvature))  # of one size whatever the unit of a parameter
+        scale = _scale(curvature)
         damped = curvature / scale[:, None] / scale + damping * np.eye(len(x))
         there = x - cho_solve(cho_factor(damped), slope / scale) / scale
         new = layout.cost(there)
@@ -177,10 +195,17 @@ def adjust(
             break
     count = sum(2 * len(o.detection.points) for o in observations)
     left = sum(float((layout.unpack(x).residual(o) ** 2).sum()) for o in observations)
-    scale = np.sqrt(np.diag(curvature))
-    covariance = np.linalg.inv(curvature / scale[:, None] / scale) / scale[:, None] / scale
+    scale = _scale(curvature)
+    inverse = np.linalg.pinv(curvature / scale[:, None] / scale, rcond=UNSEEN, hermitian=True)
+    covariance = inverse / scale[:, None] / scale
     variance = left / max(count - len(x), 1)
     return layout.unpack(x), layout.per_camera(np.sqrt(np.maximum(np.diag(covariance), 0) * variance))
+
+
+def _scale(curvature: np.ndarray) -> np.ndarray:
+    """What makes parameters of one size whatever their unit."""
+    diagonal = np.diag(curvature)
+    return np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
 
 
 class _Layout:
@@ -216,27 +241,28 @@ class _Layout:
     def cost(self, x: np.ndarray) -> float:
         """The sum that is minimised, px^2."""
         bundle = self.unpack(x)
-        knee, total = HUBER * self.noise, float((self._prior(bundle) ** 2).sum())
-        for o in self.observations:
-            length = np.linalg.norm(bundle.residual(o), axis=1)
-            total += float(np.where(length < knee, length**2, 2 * knee * length - knee**2).sum())
-        return total
+        loss = sum(self._loss(np.linalg.norm(bundle.residual(o), axis=1)) for o in self.observations)
+        return loss + float((self._prior(bundle) ** 2).sum())
+
+    def _loss(self, length: np.ndarray) -> float:
+        """Huber's loss of residuals, px^2."""
+        knee = HUBER * self.noise
+        return float(np.where(length < knee, length**2, 2 * knee * length - knee**2).sum())
 
     def normal_equations(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """The cost, J^T W J and J^T W r, with Huber's weights W and J the derivatives of r = expected - found."""
         bundle = self.unpack(x)
-        curvature, slope = np.zeros((self.size, self.size)), np.zeros(self.size)
+        curvature, slope, cost = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
         for o in self.observations:
-            pixels, by, (by_pose, by_camera) = _project(
-                bundle.intrinsics[o.camera], bundle.cameras[o.camera], bundle.poses[o.pose], o.detection.points
-            )
-            residual = pixels - o.detection.pixels
+            by_intrinsics, by_camera, by_pose = bundle.derivatives(o)
+            residual = -bundle.residual(o)
             length = np.linalg.norm(residual, axis=1)
+            cost += self._loss(length)
             weight = np.repeat(np.sqrt(np.minimum(1, HUBER * self.noise / np.maximum(length, 1e-12))), 2)
-            blocks = [by[:, POSE:][:, self.free], by[:, :POSE] @ by_camera]
+            blocks = [by_intrinsics[:, self.free], by_camera]
             at = np.arange(o.camera * self.block, (o.camera + 1) * self.block)
             if o.pose in self.pose_at:
-                blocks.append(by[:, :POSE] @ by_pose)
+                blocks.append(by_pose)
                 at = np.concatenate([at, self.pose_at[o.pose] + np.arange(POSE)])
             jacobian = np.concatenate(blocks, axis=1) * weight[:, None]
             curvature[np.ix_(at, at)] += jacobian.T @ jacobian
@@ -248,7 +274,7 @@ class _Layout:
             jacobian, at = whole[:, self.free], i * self.block + np.arange(len(self.free))
             curvature[np.ix_(at, at)] += jacobian.T @ jacobian
             slope[at] += jacobian.T @ prior[i]
-        return self.cost(x), curvature, slope
+        return cost + float((prior**2).sum()), curvature, slope
 
     def _prior(self, bundle: Bundle) -> np.ndarray:
         """Distance from the middle of the picture and from no distortion, in units that make `noise` one sigma."""
@@ -257,7 +283,12 @@ class _Layout:
         return off * self._prior_slopes()
 
     def _prior_slopes(self) -> np.ndarray:
-        return self.noise / np.array([(PRINCIPAL * w, PRINCIPAL * w, *DISTORTION) for _, w in self.bundle.sizes])
+        widths = np.array([w for _, w in self.bundle.sizes], dtype=np.float64)[:, None]
+        unit = np.ones_like(widths)
+        if not self.bundle.projection.shows_depth:
+            unit = UNIT * widths / 2 / self.bundle.intrinsics[:, :1]
+        likely = np.concatenate([PRINCIPAL * widths.repeat(2, axis=1), DISTORTION / unit ** np.array(POWERS)], axis=1)
+        return np.asarray(self.noise / likely)
 
     def per_camera(self, x: np.ndarray) -> np.ndarray:
         """Entries that belong to cameras, with 0 for intrinsics that are not adjusted."""

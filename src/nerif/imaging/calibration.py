@@ -14,15 +14,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from nerif.conventions import InputError
+from nerif.conventions import FACES, InputError
+from nerif.geometry import Projection, projection_named
 from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust
 from nerif.imaging.calibration_result import Calibration
 from nerif.imaging.first_guess import first_guess
 from nerif.imaging.targets import CalibrationTarget, ViewPictures
+from nerif.imaging.telecentric_guess import mirrored
 from nerif.imaging.views import View, find_targets
 
 __all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_pictures"]
 
+ON_A_SIDE = 0.1  # of a unit vector towards a camera: what it has to be more on one side than its mirror image
 GUESSED_NOISE, LEAST_NOISE = 0.1, 1e-4  # px, of a point: before it is known, and what nothing is better than
 
 
@@ -30,6 +33,8 @@ GUESSED_NOISE, LEAST_NOISE = 0.1, 1e-4  # px, of a point: before it is known, an
 class CalibrationSettings:
     """How cameras are calibrated."""
 
+    projection: str = "perspective"
+    """Of all cameras: perspective, or telecentric."""
     distortion: tuple[str, ...] = ("k1", "k2", "p1", "p2")
     """Coefficients to find, out of k1 k2 p1 p2 k3; the others are 0."""
     world: str = ""
@@ -40,6 +45,9 @@ class CalibrationSettings:
     """Middle of the target in that pose, in world coordinates, mm."""
     max_error: float = 1.0
     """Largest rms reprojection error to accept, px."""
+    side: tuple[str, str] | None = None
+    """Of telecentric cameras: one view and the side of the world that it stands on, such as cam1 x+. The pictures of
+    flat targets fit a rig and its mirror image alike."""
 
     def __post_init__(self) -> None:
         for name in self.distortion:
@@ -47,11 +55,27 @@ class CalibrationSettings:
                 raise InputError(f"distortion: expected coefficients out of {' '.join(COEFFICIENTS)}, got '{name}'")
         if not self.max_error > 0:
             raise InputError(f"max_error: expected a positive number of px, got {self.max_error}")
+        if not self.kind.shows_depth and (self.side is None or self.side[1] not in FACES):
+            raise InputError(
+                f"side: expected a view and the side of the world that it stands on ({' '.join(FACES)}), such as "
+                "cam1 x+, since pictures of flat targets fit a telecentric rig and its mirror image alike; got "
+                f"{self.side}"
+            )
         if not np.isclose(np.linalg.det(self.rotation), 1):
             raise InputError(
                 f"axes: expected three different axes of the target that make a right-handed world, such as x+ z+ y-, "
                 f"got {' '.join(self.axes)}"
             )
+
+    def check_names(self, names: Sequence[str]) -> None:
+        """Refuse a view that is not among those of these names."""
+        if self.side is not None and self.side[0] not in names:
+            raise InputError(f"side: expected one of {', '.join(names)}, got '{self.side[0]}'")
+
+    @property
+    def kind(self) -> Projection:
+        """The projection of the cameras."""
+        return projection_named(self.projection)
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
@@ -66,6 +90,7 @@ def calibrate_views(
     target: CalibrationTarget,
     settings: CalibrationSettings = CalibrationSettings(),
     background_scale: float = 1.0,
+    background_distance: float | None = None,
     say: Callable[[str], None] = lambda text: None,
     on_picture: Callable[[], None] = lambda: None,
 ) -> Calibration:
@@ -77,6 +102,7 @@ def calibrate_views(
     target : free in space, in the pictures VIEW/target
     settings : of the calibration
     background_scale : the target laid on the backgrounds is the same one printed this many times larger
+    background_distance : as `calibrate`
     say : told of pictures that are of no use
     on_picture : called after each picture (`target_pictures` of them in all)
 
@@ -86,8 +112,10 @@ def calibrate_views(
         If pictures are missing, or as `calibrate`.
     """
     laid = target.scaled(background_scale)
+    settings.check_names([view.name for view in views])
     target_pictures(views)  # what is missing is said before the long work
-    return calibrate([find_targets(view, target, say, on_picture, laid) for view in views], settings)
+    found = [find_targets(view, target, say, on_picture, laid) for view in views]
+    return calibrate(found, settings, background_distance)
 
 
 def target_pictures(views: Sequence[View]) -> int:
@@ -95,8 +123,18 @@ def target_pictures(views: Sequence[View]) -> int:
     return sum(len(view.open(s)) for view in views for s in ("target", "background") if s in ("target", *view.sources))
 
 
-def calibrate(views: Sequence[ViewPictures], settings: CalibrationSettings = CalibrationSettings()) -> Calibration:
+def calibrate(
+    views: Sequence[ViewPictures],
+    settings: CalibrationSettings = CalibrationSettings(),
+    background_distance: float | None = None,
+) -> Calibration:
     """Calibrate all cameras from what was found in their pictures.
+
+    Parameters
+    ----------
+    views : what was found. Pictures of the target on the background say where it is unless the camera is telecentric
+    settings : of the calibration
+    background_distance : of backgrounds without such pictures: across the optical axis, so far behind the origin, mm
 
     Raises
     ------
@@ -106,15 +144,19 @@ def calibrate(views: Sequence[ViewPictures], settings: CalibrationSettings = Cal
     """
     if not views:
         raise InputError("calibrate: no view was found; expected one folder of target pictures a camera")
-    bundle, observations = first_guess(views, settings.distortion, settings.world)
+    names = [v.name for v in views]
+    settings.check_names(names)
+    if not settings.kind.shows_depth:
+        views = [replace(v, background={}) for v in views]
+    bundle, observations = first_guess(views, settings.distortion, settings.world, settings.kind)
     bundle, _ = adjust(bundle, observations, GUESSED_NOISE)
     keep = _fitting(bundle, observations)
     kept = [o for o, k in zip(observations, keep, strict=True) if k]
     _check_poses(views, kept)
     noise = float(np.median([bundle.rms(o) for o in kept])) / np.sqrt(2)
     bundle, sigma = adjust(bundle, kept, max(noise, LEAST_NOISE))
-    bundle = _to_world(bundle, settings)
-    result = Calibration.of([v.name for v in views], bundle, sigma, observations, keep)
+    bundle = _to_world(_on_the_right_side(bundle, settings, names), settings)
+    result = Calibration.of(names, bundle, sigma, observations, keep, background_distance)
     result.check(settings.max_error)
     return result
 
@@ -138,8 +180,26 @@ def _check_poses(views: Sequence[ViewPictures], kept: Sequence[Observation]) -> 
             )
 
 
+def _on_the_right_side(bundle: Bundle, settings: CalibrationSettings, names: Sequence[str]) -> Bundle:
+    """The bundle, or its mirror image if only that has the view that `side` names on its side."""
+    if settings.side is None or bundle.projection.shows_depth:
+        return bundle
+    name, face = settings.side
+    axis, sign = settings.rotation["xyz".index(face[0])], 1 if face[1] == "+" else -1
+    other = mirrored(bundle)
+    here, there = (-sign * float(axis @ b.cameras[names.index(name)].rotation[2]) for b in (bundle, other))
+    if abs(here - there) < ON_A_SIDE:
+        raise InputError(
+            f"side: view '{name}' stands as much on the side {face} in the mirror image of the rig, so this does not "
+            "tell the two apart; name another view or axis"
+        )
+    return bundle if here > there else other
+
+
 def _to_world(bundle: Bundle, settings: CalibrationSettings) -> Bundle:
-    """From the frame of the fixed target to the world that was asked for."""
+    """From the frame of the fixed target to the world that was asked for; a depth that does not show is 0 there."""
     move = Pose(settings.rotation, np.array(settings.origin))
-    cameras = tuple(c @ move.inverse for c in bundle.cameras)
-    return replace(bundle, cameras=cameras, poses=tuple(move @ p for p in bundle.poses))
+    cameras = [c @ move.inverse for c in bundle.cameras]
+    if not bundle.projection.shows_depth:
+        cameras = [replace(c, translation=c.translation * (1, 1, 0)) for c in cameras]
+    return replace(bundle, cameras=tuple(cameras), poses=tuple(move @ p for p in bundle.poses))

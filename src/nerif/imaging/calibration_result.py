@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from nerif.conventions import InputError
-from nerif.geometry import Plane
+from nerif.geometry import PERSPECTIVE, Plane, Projection
 from nerif.imaging.bundle import Bundle, Observation, Pose
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 
@@ -52,6 +52,12 @@ class FittedPlane:
         rms = float(np.sqrt((((points - middle) @ normal) ** 2).mean()))
         return cls((float(normal[0]), float(normal[1]), float(normal[2])), float(normal @ middle), rms)
 
+    @classmethod
+    def across(cls, camera: Pose, distance: float) -> FittedPlane:
+        """Return the plane across the optical axis of a camera (world to camera) so far (mm) behind the origin."""
+        x, y, z = (-camera.rotation[2]).tolist()
+        return cls((x, y, z), -distance, 0.0)
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -60,13 +66,15 @@ class Calibration:
     Parameters
     ----------
     names, sizes : of the cameras and their pictures (height, width)
-    intrinsics : (camera, 9) fx, fy, cx, cy (px), k1, k2, p1, p2, k3
+    intrinsics : (camera, 9) as those of a Bundle
     poses : world to camera, mm
     backgrounds : plane of each camera, or None
     errors : one a picture
-    sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm
-    sigma_focal : (camera,) share of the focal length
+    sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm; the latter of
+        telecentric cameras across the optical axis
+    sigma_focal : (camera,) share of the focal length or scale
     residuals : (camera) arrays (n, 4) of u, v and the residual in u, v, px: to be drawn
+    projection : of all cameras
     """
 
     names: tuple[str, ...]
@@ -79,11 +87,12 @@ class Calibration:
     sigma_translation: Float[np.ndarray, " camera"]
     sigma_focal: Float[np.ndarray, " camera"]
     residuals: tuple[np.ndarray, ...]
+    projection: Projection = PERSPECTIVE
 
     @classmethod
     def of(
         cls, names: Sequence[str], bundle: Bundle, sigma: Float[np.ndarray, "camera 15"],
-        observations: Sequence[Observation], used: Sequence[bool],
+        observations: Sequence[Observation], used: Sequence[bool], background_distance: float | None = None,
     ) -> Calibration:  # fmt: skip
         """Sum up an adjusted bundle.
 
@@ -94,6 +103,7 @@ class Calibration:
         sigma : standard deviations of every camera's parameters (bundle.adjust)
         observations : all points found
         used : which observations the adjustment took
+        background_distance : where no target was laid, of a plane across the optical axis, behind the origin, mm
         """
         errors = [
             ImageError(names[o.camera], o.picture, bundle.rms(o), len(o.detection.points), u, o.on_background)
@@ -104,8 +114,7 @@ class Calibration:
             own = [o for o, u in zip(observations, used, strict=True) if u and o.camera == i]
             residuals.append(np.concatenate([np.hstack([o.detection.pixels, bundle.residual(o)]) for o in own]))
             laid = [bundle.poses[o.pose].moved(o.detection.points) for o in own if o.on_background]
-            centre = bundle.cameras[i].inverse.translation
-            backgrounds.append(FittedPlane.through(np.concatenate(laid), centre) if laid else None)
+            backgrounds.append(_background(bundle.cameras[i], laid, background_distance))
         return cls(
             names=tuple(names),
             sizes=bundle.sizes,
@@ -117,6 +126,7 @@ class Calibration:
             sigma_translation=np.linalg.norm(sigma[:, 12:], axis=1),
             sigma_focal=sigma[:, 0] / bundle.intrinsics[:, 0],
             residuals=tuple(residuals),
+            projection=bundle.projection,
         )
 
     def rms(self, camera: str | None = None) -> float:
@@ -140,6 +150,7 @@ class Calibration:
             distortion=torch.from_numpy(self.intrinsics[i, 4:].copy()),
             image_size=self.sizes[i],
             background=None if plane is None else Plane(torch.tensor(plane.normal, dtype=torch.float64), plane.offset),
+            projection=self.projection,
         )
 
     @property
@@ -159,10 +170,17 @@ class Calibration:
                 )
             if self.sigma_focal[i] > FOCAL_KNOWN:
                 notes.append(
-                    f"{name}: the focal length is known to {self.sigma_focal[i]:.1%} only; tilt the target more"
+                    f"{name}: the {self.projection.scale} is known to {self.sigma_focal[i]:.1%} only; tilt the target "
+                    "more"
                 )
             if self.backgrounds[i] is None:
-                notes.append(f"{name}: no target on the background was found, so its plane is not known")
+                why = "no target on the background was found" if self.projection.shows_depth else "depth does not show"
+                notes.append(f"{name}: {why}, so its plane is not known; --background-distance gives it")
+        if not self.projection.shows_depth:
+            notes.append(
+                "where telecentric cameras are along their optical axes does not show in pictures, and does not "
+                "matter: z_cam = 0 was laid through the origin"
+            )
         return tuple(notes)
 
     def check(self, max_error: float) -> None:
@@ -185,8 +203,9 @@ class Calibration:
             fx, fy, cx, cy = self.intrinsics[i, :4]
             if not (0.8 < fx / fy < 1.25 and -0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
                 raise InputError(
-                    f"view '{name}': got fx = {fx:.5g}, fy = {fy:.5g}, cx = {cx:.5g}, cy = {cy:.5g} px, which no "
-                    "camera has; take more target pictures, tilted in different ways and filling the picture"
+                    f"view '{name}': got fx = {fx:.5g}, fy = {fy:.5g} {self.projection.unit}, cx = {cx:.5g}, "
+                    f"cy = {cy:.5g} px, which no camera has; take more target pictures, tilted in different ways and "
+                    "filling the picture"
                 )
             plane = self.backgrounds[i]
             if plane is not None and plane.rms > PLANE_FLAT * np.linalg.norm(self.poses[i].translation):
@@ -206,3 +225,10 @@ class Calibration:
             "notes": list(self.notes),
         }
         write_cameras(path, self.cameras, about)
+
+
+def _background(camera: Pose, laid: Sequence[np.ndarray], distance: float | None) -> FittedPlane | None:
+    """The plane through targets laid on it, or as far behind the origin as is said, or None."""
+    if laid:
+        return FittedPlane.through(np.concatenate(laid), camera.inverse.translation)
+    return None if distance is None else FittedPlane.across(camera, distance)

@@ -3,8 +3,9 @@
 format = "nerif-calibration-1"
 [[camera]]
 name = "cam1"
+projection = "perspective"              # or "telecentric"; may be left out
 image_size = [200, 240]                 # height, width, px; may be left out
-intrinsics = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]    # px
+intrinsics = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]    # px; fx, s, fy of a telecentric camera px/mm
 distortion = [k1, k2, p1, p2, k3]       # may be left out
 rotation = [[...], [...], [...]]        # world to camera
 translation = [tx, ty, tz]              # mm
@@ -26,7 +27,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError, Matrix3
-from nerif.geometry import Camera, Plane
+from nerif.geometry import PERSPECTIVE, Camera, Plane, Projection, projection_named
 from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = [
@@ -35,7 +36,7 @@ __all__ = [
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
-KEYS = ("name", "image_size", "intrinsics", "distortion", "rotation", "translation", "background")
+KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotation", "translation", "background")
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
 """Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
 ANYWHERE = Plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.0)
@@ -48,12 +49,13 @@ class CalibratedCamera:
     Parameters
     ----------
     name : of the view
-    intrinsics : (3, 3) K, px
+    intrinsics : (3, 3) K, px; fx and fy of a telecentric camera in px/mm
     rotation : (3, 3) world to camera
     translation : (3,) world to camera, mm
     distortion : (5,) k1, k2, p1, p2, k3
     image_size : (height, width), px, or None
     background : Plane, world frame, mm, or None
+    projection : perspective or telecentric
     """
 
     name: str
@@ -63,6 +65,7 @@ class CalibratedCamera:
     distortion: Float[Tensor, 5]
     image_size: tuple[int, int] | None = None
     background: Plane | None = None
+    projection: Projection = PERSPECTIVE
 
     def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
         """Return the whole camera.
@@ -81,15 +84,16 @@ class CalibratedCamera:
                 "give nerif calibrate --background-distance"
             )
         return Camera(
-            self.intrinsics, self.rotation, self.translation, image_size, background, self.distortion, self.name
-        )
+            self.intrinsics, self.rotation, self.translation, image_size, background, self.distortion, self.name,
+            self.projection,
+        )  # fmt: skip
 
     @classmethod
     def from_camera(cls, camera: Camera) -> CalibratedCamera:
         """Take over a whole camera."""
         return cls(
             camera.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion,
-            camera.image_size, camera.background,
+            camera.image_size, camera.background, camera.projection,
         )  # fmt: skip
 
 
@@ -206,6 +210,8 @@ def write_cameras(
     tables = []
     for camera in cameras:
         table: dict[str, Any] = {"name": camera.name}
+        if camera.projection != PERSPECTIVE:
+            table["projection"] = camera.projection.name
         if camera.image_size is not None:
             table["image_size"] = list(camera.image_size)
         for name in ("intrinsics", "distortion", "rotation", "translation"):
@@ -255,5 +261,6 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
         distortion=numbers(table.get("distortion", [0.0] * 5), (5,), f"{where}: distortion"),
         image_size=image_size(table["image_size"], f"{where}: image_size") if "image_size" in table else None,
         background=None if given is None else plane(given["normal"], given["offset"], f"{where}: background"),
+        projection=projection_named(table.get("projection", PERSPECTIVE.name), f"{where}: projection"),
     )
     return checked(camera, path)

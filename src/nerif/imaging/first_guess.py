@@ -1,96 +1,65 @@
-"""A first guess of a whole rig: each camera alone, then from camera to camera through the target poses they share."""
+"""A first guess of a whole rig, by the way that its projection needs, as a bundle to adjust."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
+from collections.abc import Callable, Sequence
 
 from nerif.conventions import InputError
-from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation, Pose
+from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
+from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation
+from nerif.imaging.guess import Guess
+from nerif.imaging.perspective_guess import guess_perspective
 from nerif.imaging.targets import ViewPictures
+from nerif.imaging.telecentric_guess import guess_telecentric
 
 __all__ = ["first_guess"]
 
-DISAGREE = (5.0, 0.1)  # degrees, and share of the distance, by which two guesses of a camera pose may differ
-
-Alone = tuple[np.ndarray, dict[tuple[str, bool], Pose]]
-"""Intrinsics of one camera, and target poses before it by name and whether the target lies on the background."""
+GUESSES: dict[Projection, Callable[[Sequence[ViewPictures], str], Guess]] = {
+    PERSPECTIVE: guess_perspective,
+    TELECENTRIC: guess_telecentric,
+}
 
 
 def first_guess(
-    views: Sequence[ViewPictures], distortion: Sequence[str], world: str = ""
+    views: Sequence[ViewPictures], distortion: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
 ) -> tuple[Bundle, list[Observation]]:
     """Return a bundle to adjust, in the frame of one target pose, and all points found.
+
+    The principal point of a camera that shows no depth stays in the middle of the picture: moving it is moving the
+    camera and, for the distortion, p1 and p2.
 
     Parameters
     ----------
     views : what was found in the pictures of each camera
     distortion : coefficients to be adjusted
     world : name of the target pose that is the world frame; the one that most cameras see if empty
+    projection : of all cameras
 
     Raises
     ------
     InputError
         If a camera has too few poses, is not tied to the others by shared ones, or contradicts them.
     """
-    alone = [_alone(view) for view in views]
     poses, world = _pose_names(views, world)
-    cameras, found = _tie_together(views, alone, world)
-    every, observations = [found[n] for n in poses], []
+    guess = GUESSES[projection](views, world)
+    every, observations = [guess.targets[n] for n in poses], []
     for i, view in enumerate(views):
         for name, seen in view.poses.items():
             observations.append(Observation(i, poses.index(name), seen, name))
-        for name, seen in view.background.items():  # each a pose of its own
-            every.append(cameras[i].inverse @ alone[i][1][name, True])
-            observations.append(Observation(i, len(every) - 1, seen, name, on_background=True))
+        for name, pose in guess.laid[i].items():  # each a pose of its own
+            every.append(pose)
+            observations.append(Observation(i, len(every) - 1, view.background[name], name, on_background=True))
+    principal = projection.shows_depth
     bundle = Bundle(
-        intrinsics=np.stack([a[0] for a in alone]),
-        cameras=tuple(cameras[i] for i in range(len(views))),
+        intrinsics=guess.intrinsics,
+        cameras=guess.cameras,
         poses=tuple(every),
         fixed=poses.index(world),
-        free=(True, True, True, True, *(c in distortion for c in COEFFICIENTS)),
+        free=(True, True, principal, principal, *(c in distortion for c in COEFFICIENTS)),
         sizes=tuple(v.size for v in views),
+        projection=projection,
     )
     return bundle, observations
-
-
-def _alone(view: ViewPictures) -> Alone:
-    """Focal length of one camera and the pose of each target before it, by name and whether it is on the background."""
-    import cv2
-
-    pictures = {(n, False): d for n, d in view.poses.items()} | {(n, True): d for n, d in view.background.items()}
-    if len(pictures) < 3:
-        raise InputError(
-            f"view '{view.name}': expected the target in 3 pictures at least (10 or more, tilted in different ways, "
-            f"are good), found it in {len(pictures)}"
-        )
-    height, width = view.size
-    points = [d.points.astype(np.float32) for d in pictures.values()]
-    pixels = [d.pixels.astype(np.float32) for d in pictures.values()]
-    # principal point and distortion wait for the bundle adjustment: one camera alone cannot tell them well
-    flags = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
-    flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
-    best = None
-    for focal in (1.0, 3.0, 10.0):  # times the width: a guess too far off ends elsewhere
-        k = np.array([[focal * width, 0, (width - 1) / 2], [0, focal * width, (height - 1) / 2], [0, 0, 1]])
-        rms, k, _, rotations, translations = cv2.calibrateCamera(
-            points, pixels, (width, height), k, np.zeros(5), flags=flags
-        )
-        in_front = all(float(t.ravel()[2]) > 0 for t in translations)
-        if np.isfinite(rms) and in_front and (best is None or rms < best[0]):
-            best = (rms, k, rotations, translations)
-    if best is None:
-        raise InputError(
-            f"view '{view.name}': no camera explains its {len(pictures)} target pictures; check the number of squares "
-            "and that the target was tilted differently in them"
-        )
-    _, k, rotations, translations = best
-    found = {
-        key: Pose.of_vector(np.concatenate([r.ravel(), t.ravel()]))
-        for key, r, t in zip(pictures, rotations, translations, strict=True)
-    }
-    return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0], dtype=np.float64), found
 
 
 def _pose_names(views: Sequence[ViewPictures], world: str) -> tuple[list[str], str]:
@@ -107,51 +76,3 @@ def _pose_names(views: Sequence[ViewPictures], world: str) -> tuple[list[str], s
         )
     names = sorted(seen)
     return names, world or max(names, key=lambda n: seen[n])
-
-
-def _tie_together(
-    views: Sequence[ViewPictures], alone: Sequence[Alone], world: str
-) -> tuple[dict[int, Pose], dict[str, Pose]]:
-    """Poses of cameras (world to camera) and targets (to world), from camera to camera through shared poses."""
-    targets = {world: Pose(np.eye(3), np.zeros(3))}
-    cameras: dict[int, Pose] = {}
-    while len(cameras) < len(views):
-        counts = {
-            i: sum((n in targets) for n in view.poses) for i, view in enumerate(views) if i not in cameras
-        }  # fmt: skip
-        i = max(counts, key=lambda c: counts[c])
-        if not counts[i]:
-            missing = ", ".join(f"'{views[c].name}'" for c in counts)
-            raise InputError(
-                f"view {missing}: no target pose shared with the other cameras, so there is no common frame; take "
-                "pictures of one pose with neighbouring cameras at the same time, under the same number"
-            )
-        guesses = {n: alone[i][1][n, False] @ targets[n].inverse for n in views[i].poses if n in targets}
-        cameras[i] = _agreed(guesses, views[i].name)
-        for n in views[i].poses:
-            targets.setdefault(n, cameras[i].inverse @ alone[i][1][n, False])
-    return cameras, targets
-
-
-def _agreed(guesses: dict[str, Pose], name: str) -> Pose:
-    """The guess that agrees best with the others, if they agree at all."""
-    every = list(guesses.values())
-    distances = np.array([[_angle(a, b) for b in every] for a in every])
-    middle = int(np.argmin(np.median(distances, axis=1)))
-    best = every[middle]
-    far = np.array([np.linalg.norm(a.inverse.translation - best.inverse.translation) for a in every])
-    reach = np.linalg.norm(best.translation)
-    bad = (distances[middle] > DISAGREE[0]) | (far > DISAGREE[1] * reach)
-    if bad.sum() * 2 >= len(every) and len(every) > 1:
-        worst = list(guesses)[int(np.argmax(distances[middle]))]
-        raise InputError(
-            f"view '{name}': its target poses contradict those of the other cameras (by {distances[middle].max():.0f} "
-            f"degrees in '{worst}'); are its pictures mirrored (flip), or of other poses than their names say?"
-        )
-    return best
-
-
-def _angle(a: Pose, b: Pose) -> float:
-    """Angle between two rotations, degrees."""
-    cosine = (np.trace(a.rotation @ b.rotation.T) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

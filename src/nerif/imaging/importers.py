@@ -10,8 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+
 from nerif.conventions import InputError
 from nerif.geometry import Plane
+from nerif.geometry.distortion import POWERS
 from nerif.imaging.cameras_file import CalibratedCamera, checked
 from nerif.imaging.matlab import read_matlab
 from nerif.imaging.nerfstudio import read_transforms
@@ -34,7 +37,8 @@ class ImportSettings:
     pose: int = 1
     """Number of the target picture that is the world frame, where a file of MATLAB's keeps a pose for each picture."""
     background_distance: float | None = None
-    """Where planes are not known: background across the optical axis, this far behind the origin, mm."""
+    """Where planes are not known: background across the optical axis, this far behind the origin, mm; from target
+    pictures too."""
     image_size: tuple[int, int] | None = None
     """Height and width of the pictures where the file does not say, px."""
 
@@ -95,8 +99,14 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
         plane = Plane(plane.normal, scale * plane.offset)
     elif settings.background_distance is not None:
         plane = Plane(-camera.rotation[2], -settings.background_distance)  # its normal points to the camera
+    intrinsics, distortion = camera.intrinsics.clone(), camera.distortion
+    if not camera.projection.shows_depth:  # (x, y) are lengths of the file's unit
+        intrinsics[:2, :2] /= scale
+        distortion = distortion / scale ** torch.tensor(POWERS)
     return replace(
         camera,
+        intrinsics=intrinsics,
+        distortion=distortion,
         translation=scale * camera.translation,
         image_size=camera.image_size or settings.image_size,
         background=plane,

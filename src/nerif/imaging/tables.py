@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from nerif.conventions import InputError
+from nerif.geometry import PERSPECTIVE, projection_named
 from nerif.imaging.cameras_file import FORMAT, CalibratedCamera, five, image_size, numbers, plane, read_cameras, upright
 from nerif.toml import check_known, read_toml
 
@@ -17,11 +18,11 @@ __all__ = ["read_csv", "read_tables"]
 
 
 def read_tables(path: Path) -> list[CalibratedCamera]:
-    """Ours, or a table a camera: [cam1] K = ..., R = ..., t = ..., distortion = ..., image_size = [height, width]."""
+    """Ours, or a table a camera: [cam1] K, R, t, and, if known, the others of `known` (image_size: height, width)."""
     table = read_toml(path)
     if "format" in table or "camera" in table:
         return list(read_cameras(path))
-    known = ("K", "R", "t", "distortion", "image_size", "normal", "offset")
+    known = ("K", "R", "t", "distortion", "image_size", "normal", "offset", "projection")
     cameras = []
     for name, own in table.items():
         where = f"{path}: camera '{name}'"
@@ -40,13 +41,15 @@ def read_tables(path: Path) -> list[CalibratedCamera]:
                 distortion=five(own.get("distortion", []), f"{where}: distortion"),
                 image_size=image_size(own["image_size"], f"{where}: image_size") if "image_size" in own else None,
                 background=plane(own["normal"], own["offset"], where) if {"normal", "offset"} <= set(own) else None,
+                projection=projection_named(own.get("projection", PERSPECTIVE.name), f"{where}: projection"),
             )
         )
     return cameras
 
 
 NEEDED = ("fx", "fy", "cx", "cy", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz")
-COLUMNS = ("name", *NEEDED, "s", "k1", "k2", "p1", "p2", "k3", "width", "height", "nx", "ny", "nz", "offset")
+OPTIONAL = ("s", "k1", "k2", "p1", "p2", "k3", "width", "height", "nx", "ny", "nz", "offset", "projection")
+COLUMNS = ("name", *NEEDED, *OPTIONAL)
 
 
 def read_csv(path: Path) -> list[CalibratedCamera]:
@@ -95,6 +98,7 @@ def read_csv(path: Path) -> list[CalibratedCamera]:
                 background=plane([number(k) for k in ("nx", "ny", "nz")], number("offset"), f"{path}: line {i + 2}")
                 if "nx" in given and "offset" in given
                 else None,
+                projection=projection_named(given.get("projection", PERSPECTIVE.name), f"{path}: {name}: projection"),
             )
         )
     return cameras

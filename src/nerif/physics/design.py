@@ -40,7 +40,7 @@ class DesignSettings:
     pressure_pa: float = 101325.0
     """Pressure, Pa."""
     f_number: float = 16.0
-    """Focal length over aperture."""
+    """Focal length over aperture; of a telecentric lens the f-number on the sensor's side."""
     wavelength_nm: float = 532.0
     """Wavelength of the light, nm."""
     flow_size: float = 50.0
@@ -119,17 +119,15 @@ def expect(ring: Ring, flow: DesignSettings) -> Expectation:
     height, width = camera.image_size
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
     ray = camera.rays(middle)
-    to_flow, to_background = ring.distance, float(ray.ends.distance[0])
-    lever = to_background - to_flow
+    lever = float(ray.ends.distance[0]) - ring.distance
     # a deflection in the plane of the picture's columns
     per_mrad = lever * float((ray.ends.sensitivity[0, 0] @ camera.rotation[0]).abs()) / 1000
-    focal = float(camera.intrinsics[0, 0])
-    at_flow, at_background = to_flow / focal, to_background / focal
+    at_flow, at_background = (float(camera.pixel_size(p)) for p in (torch.zeros_like(ray.origin), ray.end_points))
     deflection = 1000 * flow.contrast * math.sqrt(2 * math.pi / math.e)
     displacement = per_mrad * deflection
     sheet = per_mrad * 1000 * flow.contrast * flow.flow_size / flow.feature_size
-    # the cone is as wide as the aperture at the lens, and a point on the background
-    cone = ring.focal_length / flow.f_number * lever / to_background
+    # the cone has its tip on the background, and the lens's f-number times the magnification there
+    cone = lever * (ring.pixel_pitch / at_background) / flow.f_number
     airy = DIFFRACTION * flow.wavelength_nm * 1e-6 * flow.f_number / ring.pixel_pitch * at_flow
     window = flow.window * at_flow
     size = (1.1 * width * at_background, 1.1 * height * at_background)
@@ -158,7 +156,7 @@ def _notes(e: Expectation, ring: Ring, flow: DesignSettings) -> list[str]:
     if e.displacement < 3 * flow.displacement_noise:
         notes.append(
             f"the displacement of {e.displacement:.3f} px is hardly above the noise of {flow.displacement_noise:g} px: "
-            "move the background away from the flow, or take a longer lens"
+            "move the background away from the flow, or magnify it more"
         )
     if e.displacement > flow.window / 2:
         notes.append(f"the displacement of {e.displacement:.1f} px is more than half a window of {flow.window:g} px")

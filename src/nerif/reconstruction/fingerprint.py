@@ -64,7 +64,7 @@ def check_fingerprint(kept: dict[str, str] | None, asked: dict[str, str]) -> Non
 
 def _parts(camera: Camera) -> tuple[Any, ...]:
     plane = camera.background
-    optics = (camera.intrinsics, camera.rotation, camera.translation, camera.distortion)
+    optics = (camera.projection.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion)
     return (*optics, camera.image_size, *(() if plane is None else (plane.normal, plane.offset)))
 
 

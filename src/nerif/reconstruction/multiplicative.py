@@ -59,7 +59,8 @@ class MLEM(Multiplicative):
     It stops at the noise where sigma is known (discrepancy principle), else when an iteration gains less than the
     tolerance, or after the given iterations.
 
-    Source: Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113; Lange & Carson, J. Comput. Assist. Tomogr. 8 (1984) 306.
+    Source: Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113; for transmission as line integrals see Lange & Carson,
+    J. Comput. Assist. Tomogr. 8 (1984) 306.
     """
 
     iterations: int = 100

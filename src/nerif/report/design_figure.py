@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from nerif.atomic import atomic
 from nerif.geometry import Ring
@@ -22,15 +23,14 @@ def draw_plan(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
     """Draw the rig from above: cameras, what they see, backgrounds and the flow; mm."""
     from matplotlib.patches import Circle
 
-    view = expect(ring, flow)
-    for angle in np.radians(ring.angles):
-        towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        lens, back = ring.distance * towards, -ring.background_distance * towards
-        half = view.background_size[0] / 2.2
-        edges = [back - half * across, back + half * across]
-        axes.fill(*np.stack([lens, *edges]).T, color="#0072B2", alpha=0.08, linewidth=0)
-        axes.plot(*np.stack(edges).T, color="black", linewidth=2)
-        axes.plot(*lens, marker="o", color="#0072B2", markersize=5)
+    for camera in ring.cameras():
+        height, width = camera.image_size
+        ends = torch.tensor([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]], dtype=torch.float64)
+        rays = camera.rays(ends)
+        lens, edges = rays.origin[:, :2].numpy(), rays.end_points[:, :2].numpy()
+        axes.fill(*np.concatenate([lens, edges[::-1]]).T, color="#0072B2", alpha=0.08, linewidth=0)
+        axes.plot(*edges.T, color="black", linewidth=2)
+        axes.plot(*lens.T, marker="o", color="#0072B2", markersize=5)
     axes.add_patch(Circle((0, 0), flow.flow_size / 2, color="#D55E00", alpha=0.7))
     axes.set_aspect("equal")
     axes.set_xlabel("x [mm]")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from nerif.atomic import atomic
 from nerif.geometry import Box, Camera
@@ -17,36 +20,42 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["draw_rig", "draw_two_sides", "picture_corners", "save_rig"]
+__all__ = ["PictureCorners", "draw_rig", "draw_two_sides", "picture_corners", "save_rig"]
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")  # Okabe & Ito
 
 
 def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) -> Axes3D:
-    """Draw cameras as pyramids (a thick edge marks the top of the picture), backgrounds, box and world axes; mm."""
+    """Draw cameras as the pyramids or, telecentric, the beams they see along; backgrounds, box and world axes; mm.
+
+    A thick edge marks the top of the picture.
+    """
     from matplotlib.ticker import MaxNLocator
 
-    centres = np.stack([c.centre.numpy() for c in cameras])
+    middle = np.zeros(3) if box is None else np.array(box.centre)
+    seen = [picture_corners(c, middle) for c in cameras]
+    centres = np.stack([s.start.mean(axis=0) for s in seen])
     reach = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or float(np.linalg.norm(centres[0]))
     everything = [centres]
     around = np.argsort(np.argsort(np.arctan2(*(centres - centres.mean(axis=0)).T[1::-1])))
-    for i, camera in enumerate(cameras):
+    for i, (camera, corners, centre) in enumerate(zip(cameras, seen, centres, strict=True)):
         colour = COLOURS[i % len(COLOURS)]
-        directions, hits = picture_corners(camera)
-        pyramid = camera.centre.numpy() + 0.18 * reach * directions
-        _close(axes, pyramid, color=colour, linewidth=0.8)
-        axes.plot(*pyramid[:2].T, color=colour, linewidth=3)
-        _close(axes, hits, color=colour, linewidth=0.8, linestyle="--")
-        axes.plot(*hits[:2].T, color=colour, linewidth=3)
-        for corner in pyramid:
-            axes.plot(*np.stack([camera.centre.numpy(), corner]).T, color=colour, linewidth=0.8)
-        axes.plot(*np.stack([camera.centre.numpy(), hits.mean(axis=0)]).T, color=colour, linewidth=0.4, alpha=0.6)
-        outward = camera.centre.numpy() - hits.mean(axis=0)
-        outward /= np.linalg.norm(outward)
+        tips = corners.start + 0.18 * reach * corners.direction
+        _close(axes, tips, color=colour, linewidth=0.8)
+        axes.plot(*tips[:2].T, color=colour, linewidth=3)
+        for start, tip in zip(corners.start, tips, strict=True):
+            axes.plot(*np.stack([start, tip]).T, color=colour, linewidth=0.8)
+        _close(axes, corners.start, color=colour, linewidth=0.8)
+        if camera.background is not None:
+            _close(axes, corners.end, color=colour, linewidth=0.8, linestyle="--")
+            axes.plot(*corners.end[:2].T, color=colour, linewidth=3)
+        target = corners.end.mean(axis=0)
+        axes.plot(*np.stack([centre, target]).T, color=colour, linewidth=0.4, alpha=0.6)
+        outward = (centre - target) / np.linalg.norm(centre - target)
         away = (0.09, 0.2)[around[i] % 2] * reach  # names of neighbours are not in each other's way
-        name_at = camera.centre.numpy() + away * outward
+        name_at = centre + away * outward
         axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center", parse_math=False)
-        everything += [name_at[None], hits]
+        everything += [name_at[None], corners.start, corners.end]
     if box is not None:
         _draw_box(axes, box)
     for axis, (name, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
@@ -81,8 +90,8 @@ def draw_two_sides(figure: Figure, cameras: Sequence[Camera], box: Box | None = 
             axes.set_zlabel("")
     figure.text(
         0.5, 0.02,
-        "solid pyramids: cameras; dashed: what they see of their backgrounds; thick edges: top of the picture; "
-        "black: box",
+        "solid pyramids, or beams of telecentric lenses: cameras; dashed: what they see of their backgrounds; "
+        "thick edges: top of the picture; black: box",
         ha="center",
     )  # fmt: skip
 
@@ -99,14 +108,38 @@ def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> N
             figure.savefig(part, dpi=130)
 
 
-def picture_corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of the four corners of the picture, the top edge first, and where they meet the background (mm)."""
+@dataclass(frozen=True)
+class PictureCorners:
+    """The lines along which a camera sees the four corners of its picture, the top edge first; mm.
+
+    Parameters
+    ----------
+    start : (4, 3) where to begin drawing them: the optical centre, or places before what is looked at
+    direction : (4, 3) unit vectors, away from the camera
+    end : (4, 3) on the background or, without one, abreast of what is looked at
+    """
+
+    start: Float[np.ndarray, "4 3"]
+    direction: Float[np.ndarray, "4 3"]
+    end: Float[np.ndarray, "4 3"]
+
+
+def picture_corners(camera: Camera, middle: Float[np.ndarray, 3]) -> PictureCorners:
+    """Return the lines to the corners of the picture of a camera that looks at `middle` (mm).
+
+    Lines without a beginning are drawn from where the camera's frame is, or from twice the diagonal of the picture
+    before the middle if that is further off.
+    """
     height, width = camera.image_size
     pixels = torch.tensor(
         [[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=torch.float64
     )  # fmt: skip
-    rays = camera.rays(pixels)
-    return rays.direction.numpy(), rays.end_points.numpy()
+    rays = camera.rays(pixels, sensitivity=False)
+    origin, direction = rays.origin.numpy(), rays.direction.numpy()
+    abreast = ((middle - origin) * direction).sum(axis=1, keepdims=True)
+    first = np.minimum(0.0, abreast - 2 * np.linalg.norm(origin[2] - origin[0])) if math.isinf(rays.begin) else 0.0
+    last = abreast if rays.background is None else rays.background.distance.numpy()[:, None]
+    return PictureCorners(origin + first * direction, direction, origin + last * direction)
 
 
 def _close(axes: Axes3D, corners: np.ndarray, **style: object) -> None:

@@ -132,20 +132,22 @@ def _variants(sources: dict[str, Volume]) -> dict[str, str]:
 
 
 def _cameras(result: Result) -> list[dict[str, Any]]:
-    """Centre, directions of the picture's corners and where they meet the background, of every camera; mm."""
+    """The lines to the corners of the picture, from where to draw them to the background, of every camera; mm."""
     if result.measurement is None:
         return []
     held_out = () if result.reprojection is None else result.reprojection.held_out
     found = []
+    middle = np.array(result.measurement.box.centre)
     for camera in result.measurement.cameras:
-        directions, hits = picture_corners(camera)
+        corners = picture_corners(camera, middle)
         found.append(
             {
                 "name": camera.name,
                 "held_out": camera.name in held_out,
-                "centre": camera.centre.tolist(),
-                "directions": np.round(directions, 6).tolist(),
-                "background": np.round(hits, 3).tolist(),
+                "background": camera.background is not None,
+                "starts": np.round(corners.start, 3).tolist(),
+                "directions": np.round(corners.direction, 6).tolist(),
+                "ends": np.round(corners.end, 3).tolist(),
             }
         )
     return found

@@ -63,6 +63,15 @@ class Absorption(LineIntegral):
                 f"below (down to {float(seen.min()):.3g}): subtract the offset that pixels beside the medium show"
             )
 
+    @classmethod
+    def detected(
+        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
+        """Return absorbances of so many quanta a pixel without the medium; the reference has no noise."""
+        passed = torch.poisson(counts * torch.exp(-values.nan_to_num()), generator)
+        found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_pictures=math.inf)
+        return torch.from_numpy(found).to(values), torch.from_numpy(sigma).to(values)
+
 
 @dataclass(frozen=True)
 class Intensity(Absorption):

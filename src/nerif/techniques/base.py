@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.conventions import InputError
 from nerif.geometry import Camera, Rays
 
 __all__ = ["ForwardModel", "Light", "Weights", "midpoints"]
@@ -163,6 +164,19 @@ class ForwardModel(ABC):
             Saying what is wrong, and what to do.
         """
         return
+
+    @classmethod
+    def detected(
+        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
+        """Return what is measured with so many detected quanta, and its sigma.
+
+        Raises
+        ------
+        InputError
+            If the noise of the technique is not that of quanta.
+        """
+        raise InputError(f"counts: expected a technique that counts quanta, got {cls.name}; give --noise")
 
     def reading(
         self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None

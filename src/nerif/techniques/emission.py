@@ -42,6 +42,15 @@ class Emission(LineIntegral):
         return 1.0
 
     @classmethod
+    def detected(
+        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
+        """Return radiances of so many quanta where they are largest; sigma is that of a quantum at least."""
+        quantum = float(values.nan_to_num().max()) / counts or 1.0
+        seen = torch.poisson((values.nan_to_num() / quantum).clamp_min(0), generator) * quantum
+        return torch.where(values.isnan(), values, seen), (seen * quantum).clamp_min(quantum**2).sqrt()
+
+    @classmethod
     def check(
         cls,
         values: Float[Tensor, "row column c"],

@@ -147,17 +147,17 @@ function makeSpace(scene, canvas) {
   const rig = new THREE.Group();
   let rigReach = reach;
   for (const camera of scene.cameras) {
-    const colour = camera.held_out ? 0xb85c00 : 0x0b5a9c, c = camera.centre;
+    const colour = camera.held_out ? 0xb85c00 : 0x0b5a9c, mean = (four) => [0, 1, 2].map((a) => four.reduce((s, p) => s + p[a], 0) / 4);
+    const c = mean(camera.starts), centre = mean(camera.ends);
     const away = middle.distanceTo(new THREE.Vector3(...c));
     rigReach = Math.max(rigReach, away);
-    const tips = camera.directions.map((d) => d.map((v, a) => c[a] + 0.16 * away * v));
+    const tips = camera.directions.map((d, k) => d.map((v, a) => camera.starts[k][a] + 0.16 * away * v));
     const body = [], sight = [];
     for (let k = 0; k < 4; k++) {
-      body.push(c, tips[k], tips[k], tips[(k + 1) % 4]);
-      sight.push(camera.background[k], camera.background[(k + 1) % 4]);
-      rigReach = Math.max(rigReach, middle.distanceTo(new THREE.Vector3(...camera.background[k])));
+      body.push(camera.starts[k], tips[k], tips[k], tips[(k + 1) % 4], camera.starts[k], camera.starts[(k + 1) % 4]);
+      if (camera.background) sight.push(camera.ends[k], camera.ends[(k + 1) % 4]);
+      rigReach = Math.max(rigReach, middle.distanceTo(new THREE.Vector3(...camera.ends[k])));
     }
-    const centre = [0, 1, 2].map((a) => camera.background.reduce((s, b) => s + b[a], 0) / 4);
     rig.add(lines(body, colour, 0.95, camera.held_out), lines(sight, colour, 0.7, camera.held_out), lines([c, centre], colour, 0.22, false));
     const beyond = c.map((v, a) => v + 0.07 * (v - middle.getComponent(a)));
     rig.add(label(camera.name, beyond, 0.021, camera.held_out ? "#8a4b00" : "#0b5a9c"));

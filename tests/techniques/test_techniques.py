@@ -1,0 +1,290 @@
+"""Techniques: each is one file, and whatever is one runs through all that there is."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views
+from nerif.fields.base import Field
+from nerif.fields.grid import Boundary
+from nerif.fields.phantoms import GaussianBalls, Scaled
+from nerif.geometry import Box, Grid, Rays, Ring
+from nerif.measurement import Measurement, measurement_of
+from nerif.physics.path_integral import PathIntegral
+from nerif.prediction import predict, reproject
+from nerif.reconstruction.multiplicative import MART, MLEM
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.total_variation import TotalVariation
+from nerif.simulation import Simulation, simulate
+from nerif.techniques import registry
+from nerif.techniques.absorption import Absorption, absorbance
+from nerif.techniques.base import ForwardModel, Light, Weights
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.emission import Emission
+from nerif.techniques.interferometry import Interferometry
+from nerif.techniques.registry import TECHNIQUES, forward_model, forward_models
+
+PACKAGE = Path(registry.__file__).parents[1]
+BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
+RING = Ring(views=5, image_size=(18, 23), pixel_pitch=0.13, distance=400.0, background_distance=300.0)
+OTHERS = [Absorption, Emission, Interferometry]
+
+
+@pytest.fixture(scope="module")
+def balls() -> Field:
+    """A few balls of extinction or emission, about 0.1 1/mm."""
+    return Scaled(GaussianBalls.random(BOX, 3, count=4), -500.0)
+
+
+@pytest.fixture(scope="module")
+def measured(balls) -> dict[str, Measurement]:
+    def of(kind: type[ForwardModel]) -> Measurement:
+        field = Scaled(balls, 1e-3) if kind.quantity == "index_excess" else balls
+        return simulate(field, RING.cameras(), BOX, 1.00027, 0.02, 1, 60, 532.0, techniques=[kind])
+
+    return {kind.name: of(kind) for kind in TECHNIQUES.values()}
+
+
+# -- one file each ---------------------------------------------------------------------------------------------------
+
+
+def test_a_technique_is_one_file():
+    for kind in TECHNIQUES.values():
+        own = PACKAGE / "techniques" / f"{kind.name}.py"
+        assert own.is_file()
+        assert Path(ast.parse(own.read_text()) and own).stem == kind.__module__.rpartition(".")[2]
+    others = {kind.__module__ for kind in TECHNIQUES.values() if kind is not Deflection}
+    importing = [
+        (path.relative_to(PACKAGE), node.module)
+        for path in PACKAGE.rglob("*.py")
+        if path.parent.name != "techniques"
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and node.module in others
+    ]
+    assert importing == []  # nothing else knows which techniques there are
+
+
+@dataclass(frozen=True)
+class Knife(ForwardModel):
+    """A toy: deflection across the vertical, less and less the deeper, and a little of the field itself."""
+
+    name, measured, sigma = "knife", "grey", "grey_sigma"
+    channels = ("",)
+    unit = "1"
+    limits = (1e-9, 1e9)
+    quantity = "index_excess"
+
+    @classmethod
+    def of(cls, light: Light, model: str) -> ForwardModel:
+        return cls()
+
+    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+        side = torch.linalg.cross(rays.direction, rays.direction.new_tensor([[0.0, 0.0, 1.0]]).expand_as(rays.direction))
+        depth = (s - rays.near[:, None]) / 40
+        value = rays.near.new_full((len(rays), 1), 300.0)
+        return Weights(torch.exp(-depth) * step, value=value, slope=3e3 * side[:, None])
+
+
+def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp_path):
+    monkeypatch.setitem(registry.TECHNIQUES, "knife", Knife)
+    field = Scaled(balls, 1e-3)
+    cameras = RING.cameras()
+    seen = simulate(field, cameras, BOX, 1.00027, 0.02, 1, 60, techniques=[Knife])
+    seen.write(tmp_path / "knife.nc")
+    back = Measurement.read(tmp_path / "knife.nc")
+    assert back.techniques == (Knife,)
+    assert torch.equal(back.maps["grey"].nan_to_num(), seen.maps["grey"].nan_to_num())
+    clean = predict(field, cameras, BOX, 1.00027, technique=Knife)
+    noise = (clean.maps["grey"] - seen.maps["grey"])[seen.sees_box] / seen.maps["grey_sigma"][seen.sees_box]
+    assert 0.9 < float(noise.std()) < 1.1
+    for method in (NeRIF(max_steps=150, device="cpu"), Tikhonov(voxels=20, device="cpu")):
+        result = method(back)
+        assert not result.outcome.failed
+        assert result.quantity == "index_excess"
+        assert all(v["cc"] > 0.98 for v in evaluate_views(reproject(result.field, back)))
+    simulation = Simulation(technique=("knife",), truth_voxels=8, steps=20, noise=0.1)
+    assert simulation(RING.cameras())[0].techniques == (Knife,)
+
+
+# -- what the pixels see ---------------------------------------------------------------------------------------------
+
+
+def rays_of(m: Measurement) -> Rays:
+    return m.rays()[0].to(dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", [*TECHNIQUES.values(), Knife], ids=lambda k: k.name)
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
+    m = measured["deflection"]
+    model, rays, grid = forward_model(kind, m), rays_of(m)[::3], Grid(BOX, (11, 9, 13))
+    a = VoxelOperator(rays, grid, model, basis, Boundary(("x-", "z+")), dtype=torch.float64)
+    g = torch.Generator().manual_seed(0)
+    c, y = (torch.randn(shape, generator=g, dtype=torch.float64) for shape in (a.domain_shape, a.range_shape))
+    there, back = float((a(c) * y).sum()), float((c * a.T(y)).sum())
+    assert abs(there - back) <= 1e-12 * float(a(c).norm() * y.norm())
+    # and it is the path integral through the spline
+    fine = VoxelOperator(rays, grid, model, basis, Boundary(), step=0.05, dtype=torch.float64)
+    exact = PathIntegral(model, 600)(fine.field(c), rays)
+    assert float((fine(c) - exact).norm() / exact.norm()) < 5e-3
+
+
+@pytest.mark.parametrize("kind", OTHERS, ids=lambda k: k.name)
+def test_line_integrals_of_a_ball_are_exact(kind, measured):
+    width, peak, centre = 2.0, 0.3, torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
+    ball = GaussianBalls(centre[None], torch.tensor([width]).double(), torch.tensor([peak]).double())
+    m = measured["deflection"]
+    rays = rays_of(m)
+    away = centre - rays.origin
+    along = (away * rays.direction).sum(-1)
+    distance = (away.square().sum(-1) - along.square()).clamp_min(0)
+    exact = peak * width * (2 * torch.pi) ** 0.5 * torch.exp(-distance / (2 * width**2))
+    weight = 1 / 532e-6 if kind is Interferometry else 1.0
+    inside = distance < 4.0
+    got = PathIntegral(forward_model(kind, m), 300)(ball, rays)[:, 0]
+    assert torch.allclose(got[inside], weight * exact[inside], rtol=2e-3)
+
+
+@pytest.mark.parametrize("kind", OTHERS, ids=lambda k: k.name)
+def test_a_file_keeps_every_technique(kind, measured, tmp_path):
+    m = replace(measured[kind.name], about_views={"aperture_diameter": torch.full((5,), 3.0).double()})
+    m.write(tmp_path / "m.nc")
+    back = Measurement.read(tmp_path / "m.nc")
+    assert back.techniques == (kind,)
+    assert back.displacement is None
+    assert all(camera.background is None for camera in back.cameras)
+    for name, value in m.maps.items():
+        assert torch.equal(back.maps[name].nan_to_num(), value.nan_to_num())
+    assert back.about_views["aperture_diameter"].tolist() == [3.0] * 5
+    assert back.select(back.names[:2]).about_views["aperture_diameter"].shape == (2,)
+
+
+# -- reconstruction --------------------------------------------------------------------------------------------------
+
+
+def error(result, balls, kind) -> float:
+    field = Scaled(balls, 1e-3) if kind.quantity == "index_excess" else balls
+    grid = Grid.of_resolution(BOX, 24)
+    truth = field.sample(grid)
+    return float((result.field.sample(grid) - truth).norm() / truth.norm())
+
+
+@pytest.mark.parametrize("kind", OTHERS, ids=lambda k: k.name)
+def test_every_method_finds_the_field(kind, measured, balls):
+    methods = {"nerif": NeRIF(max_steps=200, device="cpu"), "tv": TotalVariation(voxels=20, device="cpu")}
+    if kind.additive:
+        methods |= {"mlem": MLEM(voxels=20, device="cpu"), "mart": MART(voxels=20, device="cpu")}
+    for name, method in methods.items():
+        result = method(measured[kind.name])
+        assert result.quantity == kind.quantity
+        assert error(result, balls, kind) < 0.3, name
+        if kind.additive:
+            assert float(result.field.sample(Grid.of_resolution(BOX, 20)).min()) >= -1e-6, name
+
+
+def test_two_techniques_of_one_index_are_weighed_by_their_noise(balls):
+    field = Scaled(balls, 1e-3)
+    kinds = [Deflection, Interferometry]
+    both = simulate(field, RING.cameras(), BOX, 1.00027, 0.05, 1, 60, 532.0, techniques=kinds)
+    assert both.techniques == (Deflection, Interferometry)
+    result = Tikhonov(voxels=20, device="cpu")(both)
+    alone = Tikhonov(voxels=20, device="cpu")(replace(both, maps={}))
+    assert error(result, balls, Interferometry) < error(alone, balls, Interferometry)
+    views = evaluate_views(reproject(result.field, both))
+    assert [v["measured"] for v in views] == ["displacement"] * 5 + ["fringes"] * 5
+    assert error(NeRIF(max_steps=200, device="cpu")(both), balls, Interferometry) < 0.3
+
+
+def test_bounds_cannot_be_left(measured):
+    m = measured["deflection"]
+    bounded = NeRIF(max_steps=60, lower=-1e-5, upper=0.0, device="cpu")(m)
+    values = bounded.field.sample(Grid.of_resolution(BOX, 30))
+    assert -1e-5 <= float(values.min())
+    assert float(values.max()) <= 0
+    with pytest.raises(InputError, match="lower, upper: expected bounds of the field around 0"):
+        NeRIF(lower=1e-5)
+
+
+def test_intensities_are_fitted_where_little_light_is_left(balls):
+    dense = Scaled(balls, 12.0)  # absorbance up to some 6
+    m = simulate(dense, RING.cameras(), BOX, 1.00027, 0.02, 1, 60, techniques=[Absorption])
+    (model,) = forward_models(m.techniques, m, "intensity")
+    values, sigma = model.reading(torch.tensor([[0.0], [3.0]]), torch.tensor([[0.1], [0.1]]))
+    assert values.flatten().tolist() == pytest.approx([1, 0.0497871], rel=1e-5)
+    assert sigma is not None
+    assert torch.allclose(model.read(torch.tensor([[0.0], [3.0]])), values)
+    assert not NeRIF(max_steps=40, model="intensity", device="cpu")(m).outcome.failed
+    with pytest.raises(InputError, match="model: expected a linear one, got 'intensity'"):
+        Tikhonov(model="intensity")(m)
+
+
+# -- what cannot be right --------------------------------------------------------------------------------------------
+
+
+def test_absorbance_of_counts_and_its_sigma():
+    rng = torch.Generator().manual_seed(0)
+    truth = torch.full((60_000,), 1.5, dtype=torch.float64)
+    passed = 20 + torch.poisson(400 * torch.exp(-truth), rng) / 2
+    found, sigma = absorbance(passed.numpy(), (20 + 200 * torch.ones(60_000)).numpy(), 20.0, 2.0, 0.0, float("inf"))
+    assert float(found.mean()) == pytest.approx(1.5, abs=0.01)
+    assert float(found.std()) == pytest.approx(float(sigma.mean()), rel=0.05)
+
+
+def test_counts_that_cannot_be():
+    bright, dim = torch.full((50,), 100.0).numpy(), torch.full((50,), 30.0).numpy()
+    with pytest.raises(InputError, match="intensity: expected at most the reference"):
+        absorbance(bright, dim)
+    with pytest.raises(InputError, match="intensity: expected counts of 0 or more"):
+        absorbance(dim - 90, bright)
+    with pytest.raises(InputError, match="reference: expected pictures of shape"):
+        absorbance(dim[:3], bright)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_measurements_that_cannot_be(measured):
+    m = measured["absorption"]
+    with pytest.raises(InputError, match="subtract the offset that pixels beside the medium show"):
+        replace(m, maps={"absorbance": m.maps["absorbance"] - 0.6})
+    with pytest.raises(InputError, match="radiance: expected 0 or more"):
+        replace(measured["emission"], maps={"radiance": -measured["emission"].maps["radiance"]})
+    with pytest.raises(InputError, match="maps: expected names out of .*got 'phase'"):
+        replace(m, maps={**m.maps, "phase": m.maps["absorbance"]})
+    with pytest.raises(InputError, match="expected techniques of one field, got deflection and absorption"):
+        replace(measured["deflection"], maps=m.maps)
+    fringes = measured["interferometry"]
+    with pytest.raises(InputError, match="together are weighed by their noise"):
+        replace(measured["deflection"], sigma=None, wavelength_nm=532.0, maps=fringes.maps)
+    with pytest.raises(InputError, match="wavelength_nm: expected the wavelength of the interferometer"):
+        replace(fringes, wavelength_nm=None)
+    with pytest.raises(InputError, match="background of view '0deg': expected none for absorption"):
+        replace(m, cameras=RING.cameras())
+    with pytest.raises(InputError, match="background of view '0deg': expected a plane for deflection, got none"):
+        replace(measured["deflection"], cameras=m.cameras)
+    whole = fringes.maps["fringes"] / fringes.maps["fringes"].nan_to_num().abs().max() * 4
+    with pytest.raises(InputError, match="expected an unwrapped phase"):
+        replace(fringes, maps={"fringes": torch.remainder(whole, 1)})
+    with pytest.raises(InputError, match="mlem and mart take line integrals of what is never negative"):
+        MLEM(voxels=8, device="cpu")(measured["deflection"])
+    with pytest.raises(InputError, match="model: expected one of auto, absorbance, intensity for absorption"):
+        NeRIF(model="curved")(m)
+    with pytest.raises(InputError, match="technique: expected one of deflection"):
+        Simulation(technique=("schlieren",))
+    with pytest.raises(InputError, match="counts: expected a technique that counts quanta"):
+        Simulation(technique=("interferometry",), counts=100.0, truth_voxels=4)(RING.cameras())
+
+
+def test_nothing_measured_is_refused():
+    with pytest.raises(InputError, match="measurement: expected one of displacement, absorbance, radiance, fringes"):
+        Measurement(RING.cameras(), None, BOX, 1.0)
+    empty = measurement_of({Absorption: torch.zeros(5, 18, 23, 1)}, [Absorption.seen_by(c) for c in RING.cameras()], BOX, 1.0)
+    assert empty.techniques == (Absorption,)

@@ -1,0 +1,187 @@
+"""From parallel rays to a field: telecentric cameras, and pictures of one row, on the whole way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nerif.consistency import binned
+from nerif.conventions import InputError
+from nerif.fields.grid import Boundary
+from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
+from nerif.measurement import Measurement
+from nerif.physics.path_integral import PathIntegral
+from nerif.physics.ray_tracing import background_points
+from nerif.prediction import _interpolated, reproject
+from nerif.reconstruction.bins import binned_rays
+from nerif.reconstruction.fingerprint import _parts, digest
+from nerif.reconstruction.gauge import visual_hull
+from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.report.rig_figure import draw_rig, picture_corners
+from nerif.simulation import simulate, view_displacement
+from nerif.techniques.deflection import LeverArm
+from nerif.techniques.registry import TECHNIQUES, forward_model
+
+AMBIENT = 1.00027
+
+
+def ring(kind: str = "telecentric", rows: int = 20) -> tuple[Camera, ...]:
+    return Ring(
+        views=5, arc=(0.0, 144.0), elevation=8.0 if rows > 1 else 0.0, image_size=(rows, 26), pixel_pitch=0.11,
+        distance=700.0, background_distance=450.0, projection=kind,
+    ).cameras()  # fmt: skip
+
+
+def through_the_origin(camera: Camera) -> Camera:
+    """The same camera with the plane z_cam = 0 through the box."""
+    return replace(camera, translation=camera.translation * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))
+
+
+CAMERAS = ring()
+
+
+@pytest.fixture(scope="module")
+def seen(ball, box) -> Measurement:
+    return simulate(ball, tuple(through_the_origin(c) for c in CAMERAS), box, AMBIENT, noise=0.02, seed=5, steps=60)
+
+
+def test_where_a_telecentric_camera_is_along_its_axis_does_not_matter(ball, box):
+    for camera in CAMERAS[:2]:
+        moved = []
+        for c in (camera, through_the_origin(camera)):
+            rays = c.rays(c.pixel_grid().reshape(-1, 2)).clip(box)
+            moved.append(background_points(ball, rays[rays.crosses], 60, AMBIENT))
+        assert float(moved[0].norm(dim=-1).max()) > 0.1
+        assert float((moved[0] - moved[1]).norm() / moved[0].norm()) < 1e-10
+
+
+def test_straight_and_traced_rays_agree(ball, box):
+    camera = through_the_origin(CAMERAS[1])
+    rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box)
+    assert float(rays.near[rays.crosses].median()) < 0 < float(rays.far[rays.crosses].median())
+    straight = torch.zeros(len(rays), 2, dtype=torch.float64)
+    straight[rays.crosses] = PathIntegral(LeverArm(AMBIENT))(ball, rays[rays.crosses])
+    traced = view_displacement(ball, camera, box, AMBIENT).reshape(-1, 2)
+    assert float((straight - traced).norm() / traced.norm()) < 2e-3
+
+
+@pytest.mark.parametrize("rows", [1, 20])
+@pytest.mark.parametrize("technique", sorted(TECHNIQUES))
+@pytest.mark.parametrize("kind", sorted(PROJECTIONS))
+def test_the_adjoint_of_the_voxel_operator_is_exact(seen, box, kind, technique, rows):
+    model = forward_model(TECHNIQUES[technique], replace(seen, wavelength_nm=532.0))
+    rays = Rays.concatenate([c.rays(c.pixel_grid().reshape(-1, 2)).clip(box) for c in ring(kind, rows)])
+    a = VoxelOperator(
+        rays[rays.crosses], Grid(box, (9, 11, 13)), model, boundary=Boundary(("x-", "y+")), dtype=torch.float64
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(0)
+    c = torch.randn(a.domain_shape, dtype=torch.float64, generator=generator)
+    d = torch.randn(a.range_shape, dtype=torch.float64, generator=generator)
+    forward, back = a(c), a.T(d)
+    assert float(forward.norm()) > 0
+    assert abs(float((forward * d).sum() - (c * back).sum())) <= 1e-12 * float(forward.norm() * d.norm())
+
+
+def test_the_file_keeps_the_projection_of_each_view(seen, tmp_path):
+    mixed = replace(seen, cameras=(*ring("perspective")[:1], *seen.cameras[1:]))
+    mixed.write(tmp_path / "m.nc")
+    again = Measurement.read(tmp_path / "m.nc")
+    assert [c.projection for c in again.cameras] == [c.projection for c in mixed.cameras]
+    assert again.cameras[1].projection == TELECENTRIC
+    for a, b in zip(again.cameras, mixed.cameras, strict=True):
+        assert torch.equal(a.rays(a.pixel_grid()[3]).origin, b.rays(b.pixel_grid()[3]).origin)
+    dataset = mixed.to_dataset()
+    dataset["projection"] = (("view",), ["fisheye"] * 5)
+    with pytest.raises(InputError, match="projection of view '0deg': expected one of perspective, telecentric"):
+        Measurement.from_dataset(dataset)
+    dataset["projection"] = (("row",), ["telecentric"] * 20)
+    with pytest.raises(InputError, match="variable 'projection': expected one name a view, got dimensions"):
+        Measurement.from_dataset(dataset)
+    assert dataset.attrs["Conventions"] == "BOST-1.1"  # a reader of BOST-1.0 would take them for pinholes
+
+
+def test_a_field_comes_back_and_is_seen_again(seen, ball, box):
+    result = Tikhonov(voxels=14, device="cpu")(seen)
+    grid = Grid.of_resolution(box, 14)
+    truth, found = ball.sample(grid).double(), result.field.sample(grid).double()
+    assert float((truth - found).norm() / truth.norm()) < 0.28  # 0.255, as of perspective cameras
+    again = reproject(result.field, seen)
+    usable = seen.usable
+    left = (again.predicted - seen.displacement)[usable]
+    assert float(left.norm() / seen.displacement[usable].norm()) < 0.07  # 0.057
+
+
+def test_a_run_is_not_resumed_with_another_projection():
+    camera = ring("perspective")[0]
+    assert digest(_parts(camera)) == digest(_parts(replace(camera)))
+    assert digest(_parts(camera)) != digest(_parts(replace(camera, projection=TELECENTRIC)))
+
+
+def test_a_background_before_the_box_is_refused(seen):
+    plane = seen.cameras[2].plane
+    for offset in (-plane.offset, 3.0):
+        wrong = replace(seen.cameras[2], background=replace(plane, offset=offset))
+        with pytest.raises(InputError, match="background of view '72deg': expected a plane behind the box"):
+            replace(seen, cameras=(*seen.cameras[:2], wrong, *seen.cameras[3:]))
+
+
+def test_one_row_is_a_picture(ball, box):
+    """Line scans: rays, hull, bins, a reconstruction in their plane, and the pictures it would give."""
+    row = simulate(ball, ring(rows=1), box, AMBIENT, noise=0.0, steps=40)
+    assert row.displacement.shape == (5, 1, 26, 2)
+    grid = Grid.of_resolution(box, 13)
+    masked = replace(row, flow_mask=row.displacement.abs().amax(dim=-1) > 1e-3)
+    inside = visual_hull(masked, grid)
+    planes = (inside != inside.any()).flatten(1).any(dim=1)  # what the line sees; beyond it nothing is carved away
+    assert 1 <= int(planes.sum()) < grid.shape[0]
+    rays, d, _ = binned_rays(row, row.observations[0], 2)
+    assert len(rays) == len(d) > 20
+    result = Tikhonov(voxels=13, device="cpu")(row)
+    again = reproject(result.field, row)
+    assert float((again.predicted - row.displacement)[row.sees_box].norm() / row.displacement.norm()) < 0.2
+
+
+def test_lines_are_binned_along_themselves_only(ball, box):
+    row = simulate(ball, ring(rows=1), box, AMBIENT, noise=0.0, steps=40)
+    small = binned(row, 13)
+    assert small.displacement.shape == (5, 1, 13, 2)
+    k, whole = small.cameras[0].intrinsics, row.cameras[0].intrinsics
+    assert k.diagonal().tolist() == pytest.approx([float(whole[0, 0]) / 2, float(whole[1, 1]), 1.0])
+    mean = row.displacement.reshape(5, 1, 13, 2, 2).mean(dim=3)
+    assert torch.allclose(small.displacement, mean / torch.tensor([2.0, 1.0]), atol=1e-7)
+
+
+@pytest.mark.parametrize("size", [(1, 26), (9, 26), (20, 1)])
+@pytest.mark.parametrize("step", [1, 3, 8])
+def test_pictures_of_few_rows_are_interpolated(box, size, step):
+    camera = CAMERAS[0].view((20 - size[0]) // 2, (26 - size[1]) // 2, *size)
+
+    def see(rays: Rays) -> torch.Tensor:
+        return torch.stack([rays.pixel @ rays.pixel.new_tensor([0.3, -0.1]), rays.pixel[:, 0] + 2], dim=-1)
+
+    view = _interpolated(camera, box, step, see)
+    expected = camera.pixel_grid() @ torch.tensor([[0.3, 1.0], [-0.1, 0.0]], dtype=torch.float64)
+    assert torch.allclose(view.double(), expected + torch.tensor([0.0, 2.0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("background", [True, False])
+@pytest.mark.parametrize("kind", sorted(PROJECTIONS))
+def test_cameras_are_drawn_before_what_they_look_at(kind, background):
+    from matplotlib.figure import Figure
+
+    cameras = [through_the_origin(c) if not c.projection.shows_depth else c for c in ring(kind)]
+    cameras = cameras if background else [replace(c, background=None) for c in cameras]
+    for camera in cameras:
+        corners, axis = picture_corners(camera, np.zeros(3)), camera.rotation[2].numpy()
+        assert (corners.start @ axis).max() < -20  # mm; the picture is 40 mm wide there
+        assert (corners.end @ axis).min() > (400 if background else -1)
+        assert np.allclose(np.cross(corners.end - corners.start, corners.direction), 0, atol=1e-6)
+        spread = np.ptp(corners.start, axis=0).max()
+        assert (spread > 20) != camera.projection.shows_depth  # a beam, or an optical centre
+    axes = Figure().add_subplot(projection="3d")
+    names = {text.get_text() for text in draw_rig(axes, cameras).texts}
+    assert {c.name for c in cameras} < names
