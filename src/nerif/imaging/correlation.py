@@ -19,6 +19,7 @@ from nerif.imaging.warping import warp
 
 __all__ = ["Vectors", "correlate", "normalised_median_outliers", "window_correlation"]
 
+FAINT = 1e-4  # of the mean variance, below which a window shows nothing
 LOWEST_PEAK = 0.1  # of the correlation, which is 1 where both windows are equal
 
 
@@ -105,7 +106,7 @@ def _starts(length: int, size: int, step: int) -> np.ndarray:
 def _shifts(
     first: np.ndarray, second: np.ndarray, starts: list[np.ndarray], size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shift (*nodes, d) and height (*nodes, 0 to 1) of the correlation peak of every window."""
+    """Shift (*nodes, d) and height (*nodes, 0 to 1) of the correlation peak of every window; 0 where there is nothing."""
     from scipy import fft
 
     dimensions = first.ndim
@@ -115,7 +116,7 @@ def _shifts(
     for _ in range(dimensions - 1):
         weight = weight[..., None] * axis
     weight = (weight / weight.sum()).astype(np.float32)
-    shifts, heights = [], []
+    shifts, heights, strengths = [], [], []
     for start in starts[0]:  # the windows of one start at a time bound the memory
         a, b = (
             (w - (w * weight).sum(within, keepdims=True)) * np.sqrt(weight)
@@ -123,12 +124,14 @@ def _shifts(
         )
         product = np.conj(fft.rfftn(a, axes=within)) * fft.rfftn(b, axes=within)
         surface = fft.fftshift(fft.irfftn(product, s=(size,) * dimensions, axes=within), axes=within)
-        norm = np.sqrt((a**2).sum(within, keepdims=True) * (b**2).sum(within, keepdims=True)) + 1e-12
-        shift, height = _peak(surface / norm)
+        strength = np.sqrt((a**2).sum(within) * (b**2).sum(within)) + 1e-12
+        shift, height = _peak(surface / np.expand_dims(strength, within))
         shifts.append(shift)
         heights.append(height)
+        strengths.append(strength)
     nodes = [len(s) for s in starts]
-    return np.stack(shifts).reshape(*nodes, dimensions), np.stack(heights).reshape(nodes)
+    seen = np.stack(strengths) > FAINT * np.mean(strengths)
+    return np.stack(shifts).reshape(*nodes, dimensions), (np.stack(heights) * seen).reshape(nodes)
 
 
 def _windows(slab: np.ndarray, starts: list[np.ndarray], size: int) -> np.ndarray:
