@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+from dataclasses import replace
 
 from bench import Table, add_write
 from nerif.geometry import Grid
@@ -18,15 +19,23 @@ from nerif.particles.pictures import pictures
 from nerif.particles.rig import four_cameras
 from nerif.particles.ring import VortexRing
 from nerif.particles.velocity import velocity_between
+from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.multiplicative import MART, MLEM
-from nerif.reconstruction.voxels import VoxelReconstructor
+from nerif.reconstruction.presets import preset
 from nerif.volume import Volume
 
 SECONDS, VOXEL = 1e-3, 0.1
-METHODS: dict[str, type[VoxelReconstructor]] = {"MART": MART, "MLEM": MLEM}
+METHODS = ("MART", "MLEM", "NeRIF")
 COLUMNS = (
     "particles a pixel", "volumes", "Q", "iterations", "seconds a volume", "rms error [voxel]", "vectors found",
 )  # fmt: skip
+
+
+def method_of(name: str, voxels: int, time_limit: float) -> Reconstructor:
+    """Return the settings of a method."""
+    if name == "NeRIF":
+        return replace(preset("fast"), time_limit=time_limit, epochs=1e6, device="cpu")
+    return (MART if name == "MART" else MLEM)(voxels=voxels, basis="linear", device="cpu")
 
 
 class Case:
@@ -35,7 +44,7 @@ class Case:
     def __init__(self, arguments: argparse.Namespace, per_pixel: float, seed: int) -> None:
         self.cameras, self.box = four_cameras(arguments.pixels, arguments.depth)
         self.ring = VortexRing.within(self.box, arguments.displacement * VOXEL / SECONDS)
-        self.window = arguments.window
+        self.window, self.time_limit = arguments.window, arguments.time_limit
         before = Particles.draw(self.box, round(per_pixel * arguments.pixels**2), arguments.variation, seed)
         self.particles = before, self.ring.advect(before, SECONDS)
         self.grid = Grid.of_resolution(self.box, round(max(self.box.edges) / VOXEL))
@@ -49,7 +58,7 @@ class Case:
         """Return the volumes by a method, or the ideal ones, and what they took, the mean of both."""
         if method == "ideal":
             return self.ideal, {}
-        settings = METHODS[method](voxels=max(self.grid.shape), basis="linear", device="cpu")
+        settings = method_of(method, max(self.grid.shape), self.time_limit)
         results = [settings(measurement) for measurement in self.seen]
         volumes = [result.volume(self.grid) for result in results]
         quality = [quality_factor(v.values, ideal.values) for v, ideal in zip(volumes, self.ideal, strict=True)]
@@ -72,7 +81,7 @@ def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--per-pixel", type=float, nargs="+", default=[0.02, 0.05], help="particles a pixel")
-    parser.add_argument("--method", nargs="+", default=["ideal", *METHODS], choices=["ideal", *METHODS])
+    parser.add_argument("--method", nargs="+", default=["ideal", *METHODS[:2]], choices=["ideal", *METHODS])
     parser.add_argument("--pixels", type=int, default=200, help="of an edge of each picture")
     parser.add_argument("--depth", type=int, default=40, help="of the volume, in pixels")
     parser.add_argument("--counts", type=float, default=1000.0, help="quanta of a particle in a picture")
@@ -80,6 +89,7 @@ def main() -> None:
     parser.add_argument("--displacement", type=float, default=4.0, help="of the fastest particles, voxels")
     parser.add_argument("--window", type=int, default=24, help="of the correlation, voxels")
     parser.add_argument("--seeds", type=int, default=3, help="clouds, of whose figures the median is taken")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="of NeRIF, seconds")
     add_write(parser)
     arguments = parser.parse_args()
     table = Table(

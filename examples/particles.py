@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import torch
+import numpy as np
 
 from nerif.geometry import Grid
 from nerif.particles.cloud import Particles, quality_factor
@@ -56,15 +56,15 @@ error = velocity.rms_error(truth) / voxel
 print(f"Q {quality:.3f}, rms error {error:.3f} voxel a component, found at {velocity.found.double().mean():.0%}")
 
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
-left.imshow(seen[0].maps["radiance"][0], cmap="gray")
+left.imshow(seen[0].maps["radiance"][0].numpy(), cmap="gray")
 left.set_title("one of four pictures")
 extent = (box.lower[1], box.upper[1], box.lower[2], box.upper[2])
-middle.imshow(volumes[0].values[:, :, grid.shape[2] // 2], cmap="gray", origin="lower", extent=extent)
+middle.imshow(volumes[0].values[:, :, grid.shape[2] // 2].numpy(), cmap="gray", origin="lower", extent=extent)
 middle.set_title("middle of the volume")
 plane = velocity.points.shape[2] // 2
-_, y, z = velocity.points[:, :, plane].unbind(-1)
+_, y, z = velocity.points[:, :, plane].numpy().transpose(2, 0, 1)
 for values, colour, name in ((truth, "0.7", "truth"), (velocity.values, "tab:blue", "found")):
-    _, v, w = values[:, :, plane].unbind(-1)
+    _, v, w = values[:, :, plane].numpy().transpose(2, 0, 1)
     right.quiver(y, z, v, w, color=colour, angles="xy", scale_units="xy", scale=float(truth.norm(dim=-1).max()),
                  label=name)  # fmt: skip
 right.set_title("velocity in that plane")
@@ -72,4 +72,4 @@ figure.legend(loc="outside lower right", ncols=2)
 for axes in (middle, right):
     axes.set(xlabel="y [mm]", ylabel="z [mm]", aspect="equal")
 figure.savefig(arguments.out / "particles.png", dpi=150)
-torch.save({"points": velocity.points, "velocity": velocity.values}, arguments.out / "velocity.pt")
+np.savez(arguments.out / "velocity.npz", points=velocity.points, velocity=velocity.values)

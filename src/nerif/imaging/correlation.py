@@ -106,7 +106,7 @@ def _starts(length: int, size: int, step: int) -> np.ndarray:
 def _shifts(
     first: np.ndarray, second: np.ndarray, starts: list[np.ndarray], size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shift (*nodes, d) and height (*nodes, 0 to 1) of the correlation peak of every window; 0 where there is nothing."""
+    """Shift (*nodes, d) and height (*nodes) of the correlation peak of every window; 0 high where it shows nothing."""
     from scipy import fft
 
     dimensions = first.ndim
