@@ -15,6 +15,7 @@ from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
+from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls, Scaled
 from nerif.geometry import Box, Grid, Rays, Ring
 from nerif.measurement import Measurement, measurement_of
@@ -38,12 +39,14 @@ PACKAGE = Path(registry.__file__).parents[1]
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
 RING = Ring(views=5, image_size=(18, 23), pixel_pitch=0.13, distance=400.0, background_distance=300.0)
 OTHERS = [Absorption, Emission, Interferometry]
+NETWORK = NeRIF(network=NetworkShape(width=48, depth=3), points_per_batch=2048, max_steps=200, device="cpu")
 
 
 @pytest.fixture(scope="module")
 def balls() -> Field:
     """A few balls of extinction or emission, about 0.1 1/mm."""
-    return Scaled(GaussianBalls.random(BOX, 3, count=4), -500.0)
+    centres = torch.tensor([[-3.0, 0.0, 1.0], [3.0, 4.0, -1.0], [1.0, -1.5, 1.5]])
+    return GaussianBalls(centres, torch.tensor([2.2, 2.0, 1.8]), torch.tensor([0.1, 0.08, 0.12]))
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +92,8 @@ class Knife(ForwardModel):
         return cls()
 
     def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
-        side = torch.linalg.cross(rays.direction, rays.direction.new_tensor([[0.0, 0.0, 1.0]]).expand_as(rays.direction))
+        up = rays.direction.new_tensor([[0.0, 0.0, 1.0]]).expand_as(rays.direction)
+        side = torch.linalg.cross(rays.direction, up)
         depth = (s - rays.near[:, None]) / 40
         value = rays.near.new_full((len(rays), 1), 300.0)
         return Weights(torch.exp(-depth) * step, value=value, slope=3e3 * side[:, None])
@@ -107,7 +111,7 @@ def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp
     clean = predict(field, cameras, BOX, 1.00027, technique=Knife)
     noise = (clean.maps["grey"] - seen.maps["grey"])[seen.sees_box] / seen.maps["grey_sigma"][seen.sees_box]
     assert 0.9 < float(noise.std()) < 1.1
-    for method in (NeRIF(max_steps=150, device="cpu"), Tikhonov(voxels=20, device="cpu")):
+    for method in (NETWORK, Tikhonov(voxels=16, device="cpu")):
         result = method(back)
         assert not result.outcome.failed
         assert result.quantity == "index_excess"
@@ -136,7 +140,7 @@ def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
     # and it is the path integral through the spline
     fine = VoxelOperator(rays, grid, model, basis, Boundary(), step=0.05, dtype=torch.float64)
     exact = PathIntegral(model, 600)(fine.field(c), rays)
-    assert float((fine(c) - exact).norm() / exact.norm()) < 5e-3
+    assert float((fine(c) - exact).norm() / exact.norm()) < 2e-2
 
 
 @pytest.mark.parametrize("kind", OTHERS, ids=lambda k: k.name)
@@ -192,15 +196,15 @@ def error(result, balls, kind) -> float:
 
 @pytest.mark.parametrize("kind", OTHERS, ids=lambda k: k.name)
 def test_every_method_finds_the_field(kind, measured, balls):
-    methods = {"nerif": NeRIF(max_steps=200, device="cpu"), "tv": TotalVariation(voxels=20, device="cpu")}
+    methods = {"nerif": NETWORK, "tv": TotalVariation(voxels=16, device="cpu")}
     if kind.additive:
-        methods |= {"mlem": MLEM(voxels=20, device="cpu"), "mart": MART(voxels=20, device="cpu")}
+        methods |= {"mlem": MLEM(voxels=16, device="cpu"), "mart": MART(voxels=16, device="cpu")}
     for name, method in methods.items():
         result = method(measured[kind.name])
         assert result.quantity == kind.quantity
         assert error(result, balls, kind) < 0.3, name
         if kind.additive:
-            assert float(result.field.sample(Grid.of_resolution(BOX, 20)).min()) >= -1e-6, name
+            assert float(result.field.sample(Grid.of_resolution(BOX, 16)).min()) >= 0, name
 
 
 def test_two_techniques_of_one_index_are_weighed_by_their_noise(balls):
@@ -208,19 +212,19 @@ def test_two_techniques_of_one_index_are_weighed_by_their_noise(balls):
     kinds = [Deflection, Interferometry]
     both = simulate(field, RING.cameras(), BOX, 1.00027, 0.05, 1, 60, 532.0, techniques=kinds)
     assert both.techniques == (Deflection, Interferometry)
-    result = Tikhonov(voxels=20, device="cpu")(both)
-    alone = Tikhonov(voxels=20, device="cpu")(replace(both, maps={}))
+    result = Tikhonov(voxels=16, device="cpu")(both)
+    alone = Tikhonov(voxels=16, device="cpu")(replace(both, maps={}))
     assert error(result, balls, Interferometry) < error(alone, balls, Interferometry)
     views = evaluate_views(reproject(result.field, both))
     assert [v["measured"] for v in views] == ["displacement"] * 5 + ["fringes"] * 5
-    assert error(NeRIF(max_steps=200, device="cpu")(both), balls, Interferometry) < 0.3
+    assert error(NETWORK(both), balls, Interferometry) < 0.3
 
 
 def test_bounds_cannot_be_left(measured):
     m = measured["deflection"]
-    bounded = NeRIF(max_steps=60, lower=-1e-5, upper=0.0, device="cpu")(m)
+    bounded = replace(NETWORK, max_steps=30, lower=-1e-5, upper=0.0)(m)
     values = bounded.field.sample(Grid.of_resolution(BOX, 30))
-    assert -1e-5 <= float(values.min())
+    assert float(values.min()) >= -1e-5
     assert float(values.max()) <= 0
     with pytest.raises(InputError, match="lower, upper: expected bounds of the field around 0"):
         NeRIF(lower=1e-5)
@@ -234,7 +238,7 @@ def test_intensities_are_fitted_where_little_light_is_left(balls):
     assert values.flatten().tolist() == pytest.approx([1, 0.0497871], rel=1e-5)
     assert sigma is not None
     assert torch.allclose(model.read(torch.tensor([[0.0], [3.0]])), values)
-    assert not NeRIF(max_steps=40, model="intensity", device="cpu")(m).outcome.failed
+    assert not replace(NETWORK, max_steps=20, model="intensity")(m).outcome.failed
     with pytest.raises(InputError, match="model: expected a linear one, got 'intensity'"):
         Tikhonov(model="intensity")(m)
 
@@ -268,7 +272,7 @@ def test_measurements_that_cannot_be(measured):
         replace(m, maps={"absorbance": m.maps["absorbance"] - 0.6})
     with pytest.raises(InputError, match="radiance: expected 0 or more"):
         replace(measured["emission"], maps={"radiance": -measured["emission"].maps["radiance"]})
-    with pytest.raises(InputError, match="maps: expected names out of .*got 'phase'"):
+    with pytest.raises(InputError, match=r"maps: expected names out of .*got 'phase'"):
         replace(m, maps={**m.maps, "phase": m.maps["absorbance"]})
     with pytest.raises(InputError, match="expected techniques of one field, got deflection and absorption"):
         replace(measured["deflection"], maps=m.maps)
@@ -297,5 +301,6 @@ def test_measurements_that_cannot_be(measured):
 def test_nothing_measured_is_refused():
     with pytest.raises(InputError, match="measurement: expected one of displacement, absorbance, radiance, fringes"):
         Measurement(RING.cameras(), None, BOX, 1.0)
-    empty = measurement_of({Absorption: torch.zeros(5, 18, 23, 1)}, [Absorption.seen_by(c) for c in RING.cameras()], BOX, 1.0)
+    cameras = [Absorption.seen_by(c) for c in RING.cameras()]
+    empty = measurement_of({Absorption: torch.zeros(5, 18, 23, 1)}, cameras, BOX, 1.0)
     assert empty.techniques == (Absorption,)

@@ -182,7 +182,7 @@ class Network(nn.Module):
                 beyond = SHARPNESS * sign * (bound - v)  # above 0 beyond the bound
                 value = value + sign * torch.nn.functional.softplus(beyond) / SHARPNESS
                 slope = slope - torch.sigmoid(beyond)
-        return value, slope
+        return value.clamp(low, high), slope  # of rounding alone
 
     def _encode(self, p: Tensor) -> Tensor:
         """What the first layer is given of a point."""

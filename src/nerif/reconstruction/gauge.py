@@ -25,8 +25,9 @@ def is_open(measurement: Measurement) -> bool:
 
 
 def ambient_faces(measurement: Measurement, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Return the faces on which the field is to be ambient: those asked for, else, where it needs any, the file's."""
-    return asked or (measurement.ambient_faces if is_open(measurement) else ())
+    """Return the faces on which the field is to be ambient: those asked for, else, where a technique needs any, the file's."""
+    needed = any(kind.gauge for kind in measurement.techniques)
+    return asked or (measurement.ambient_faces if needed else ())
 
 
 def check_gauge(measurement: Measurement, faces: tuple[str, ...], hull: bool = True) -> None:

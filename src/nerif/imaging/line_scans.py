@@ -1,0 +1,160 @@
+"""Scans by parallel rays, angle by angle and position by position, as X-ray sources and line cameras give them.
+
+    A(theta, x) = integral mu along the line at distance x - x_axis from the axis of rotation
+
+A reading is -ln of an intensity with an offset that is not known, the axis is somewhere, and where A is large harmonics
+of the source, scatter and the detector let it seem smaller. What the scan itself tells of all three:
+
+    offset   median of the readings at both ends of every angle, beside the medium
+    axis     x_axis of the sinusoid x_axis + a cos(theta) + b sin(theta) through the centres of mass
+    bend     k of A + k A^2, by which the total of every angle that holds all of the medium is most nearly the same
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nerif.conventions import InputError
+from nerif.geometry import Box, Camera
+from nerif.geometry.projection import TELECENTRIC
+from nerif.measurement import Measurement, measurement_of
+from nerif.techniques.absorption import Absorption
+
+__all__ = ["LineScan"]
+
+ENDS = 3  # readings at either end of an angle that are beside the medium
+EMPTY = 0.02  # of the largest reading, below which an end is beside the medium
+LARGEST_BEND, BENDS = 0.3, 301  # tried
+EVEN = 1e-3  # of a step: how far positions may be from evenly spaced
+
+
+@dataclass(frozen=True)
+class LineScan:
+    """Readings of one slice.
+
+    Parameters
+    ----------
+    angles : (a,) of the rotation, rad
+    positions : (p,) of the rays across it, evenly spaced, mm
+    readings : (a, p) absorbance
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, positions are not evenly spaced, or there are too few angles to find the axis.
+    """
+
+    angles: Float[np.ndarray, " a"]
+    positions: Float[np.ndarray, " p"]
+    readings: Float[np.ndarray, "a p"]
+
+    def __post_init__(self) -> None:
+        shape = (len(self.angles), len(self.positions))
+        if self.readings.shape != shape:
+            raise InputError(f"readings: expected one for each angle and position {shape}, got {self.readings.shape}")
+        if min(shape) < 4:
+            raise InputError(f"readings: expected four angles and positions or more, got {shape}")
+        steps = np.diff(self.positions)
+        if not (steps.mean() > 0 and np.abs(steps - steps.mean()).max() < EVEN * steps.mean()):
+            raise InputError("positions: expected evenly spaced, rising positions in mm; interpolate them first")
+
+    @property
+    def spacing(self) -> float:
+        """Between positions, mm."""
+        return float(np.diff(self.positions).mean())
+
+    def select(self, angles: Sequence[int]) -> LineScan:
+        """Return the scan of some angles, by number."""
+        return replace(self, angles=self.angles[angles], readings=self.readings[angles])
+
+    @property
+    def offset(self) -> float:
+        """Reading beside the medium."""
+        return float(np.median(np.concatenate([self.readings[:, :ENDS], self.readings[:, -ENDS:]])))
+
+    def without_offset(self) -> LineScan:
+        """Return the scan with readings of 0 beside the medium."""
+        return replace(self, readings=self.readings - self.offset)
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the readings beside the medium, robustly: 1.48 times the median deviation."""
+        ends = np.concatenate([self.readings[:, :ENDS], self.readings[:, -ENDS:]])
+        return float(1.4826 * np.median(np.abs(ends - np.median(ends))))
+
+    @property
+    def complete(self) -> Float[np.ndarray, " c"]:
+        """Numbers of the angles that hold all of the medium: both ends are beside it."""
+        least = EMPTY * self.readings.max()
+        inside = (self.readings[:, :2].max(axis=1) < least) & (self.readings[:, -2:].max(axis=1) < least)
+        return np.flatnonzero(inside)
+
+    def bend(self) -> tuple[float, float, float]:
+        """Return k, and how much the totals of complete angles scatter, as a share, without it and with it."""
+        chosen = self.readings[self.complete]
+        if len(chosen) < 3:
+            raise InputError(f"readings: expected three angles or more that hold all of the medium, got {len(chosen)}")
+        tried = np.linspace(0, LARGEST_BEND, BENDS)
+        totals = [(chosen + k * chosen**2).sum(axis=1) for k in tried]
+        scatter = [float(t.std() / t.mean()) for t in totals]
+        best = int(np.argmin(scatter))
+        return float(tried[best]), scatter[0], scatter[best]
+
+    def unbent(self, k: float) -> LineScan:
+        """Return the scan with readings A + k A^2."""
+        return replace(self, readings=self.readings + k * self.readings**2)
+
+    @staticmethod
+    def bent(absorbance: Float[np.ndarray, "*n"], k: float) -> Float[np.ndarray, "*n"]:
+        """Return the readings that absorbances give: the inverse of A + k A^2."""
+        return absorbance if k == 0 else (np.sqrt(1 + 4 * k * np.clip(absorbance, 0, None)) - 1) / (2 * k)
+
+    def axis(self) -> float:
+        """Return the position of the axis of rotation, mm."""
+        chosen = self.complete
+        if len(chosen) < 4:
+            raise InputError(f"readings: expected four angles or more that hold all of the medium, got {len(chosen)}")
+        total = self.readings[chosen].sum(axis=1)
+        centre = (self.readings[chosen] * self.positions).sum(axis=1) / total
+        turn = np.stack([np.ones(len(chosen)), np.cos(self.angles[chosen]), np.sin(self.angles[chosen])], axis=1)
+        return float(np.linalg.lstsq(turn, centre, rcond=None)[0][0])
+
+    def measurement(self, axis: float, relative_sigma: float = 0.0) -> Measurement:
+        """Return the slice as a measurement of absorption: a telecentric camera of one row of pixels for every angle.
+
+        The axis of rotation is the z axis, the slice as thick as a step between positions.
+
+        Parameters
+        ----------
+        axis : position of the axis of rotation, mm
+        relative_sigma : standard deviation as a share of the reading, beside the noise at the ends
+        """
+        half = float(np.abs(self.positions - axis).max()) + self.spacing / 2
+        thickness = self.spacing / 2
+        cameras = [self._camera(float(angle), axis) for angle in self.angles]
+        values = torch.from_numpy(self.readings).float()[:, None, :, None]
+        measurement = measurement_of(
+            {Absorption: values}, cameras, Box((-half, -half, -thickness), (half, half, thickness)), 1.0
+        )
+        sigma = torch.sqrt(self.noise**2 + (relative_sigma * values.clamp_min(0)) ** 2)
+        return measurement.observed({Absorption.name: values}, {Absorption.name: sigma})
+
+    def _camera(self, angle: float, axis: float) -> Camera:
+        across, along = (np.cos(angle), np.sin(angle), 0.0), (-np.sin(angle), np.cos(angle), 0.0)
+        rotation = torch.tensor([across, (0.0, 0.0, -1.0), along], dtype=torch.float64)
+        scale, centre = 1 / self.spacing, (axis - float(self.positions[0])) / self.spacing
+        return Camera(
+            intrinsics=torch.tensor([[scale, 0, centre], [0, scale, 0], [0, 0, 1]], dtype=torch.float64),
+            rotation=rotation,
+            translation=torch.zeros(3, dtype=torch.float64),
+            image_size=(1, len(self.positions)),
+            background=None,
+            distortion=torch.zeros(5, dtype=torch.float64),
+            name=f"{np.degrees(angle):.4g}deg",
+            projection=TELECENTRIC,
+        )
