@@ -123,6 +123,7 @@ def test_a_few_particles_are_found(method):
         (lambda: Particles.draw(BOX, 3, variation=-1), "variation: expected 0 or more, got -1"),
         (lambda: one(0, 0, 0).volume(GRID, diameter=0), "diameter: expected above 0, got 0"),
         (lambda: pictures(one(0, 0, 0), four_cameras(48, 12)[0], counts=-1), "counts: expected 0 or more, got -1"),
+        (lambda: pictures(one(0, 0, 99), four_cameras(48, 12)[0]), "particles: expected some in view 'left below'"),
         (lambda: four_cameras(angle=90), "angle: expected between 0 and 80 degrees, got 90"),
         (lambda: four_cameras(depth=0), "depth: expected at least 1 px, got 0"),
         (lambda: four_cameras(20, 100), "pixels: expected pictures that hold a box 100 px deep, got 20 px"),

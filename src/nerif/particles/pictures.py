@@ -43,7 +43,7 @@ def pictures(
     Raises
     ------
     InputError
-        If a number cannot be one, or a camera cannot see the box.
+        If a number cannot be one, or a camera sees no particle.
     """
     if not 0 <= counts < math.inf:
         raise InputError(f"counts: expected 0 or more, got {counts}")
@@ -54,6 +54,8 @@ def pictures(
     for i, camera in enumerate(cameras):
         h, w = camera.image_size
         clean = picture(particles, camera, diameter)
+        if not float(clean.sum()) > 0:
+            raise InputError(f"particles: expected some in view '{camera.name}', got none; check camera and box")
         if counts:
             unit = float(clean.sum()) / (counts * len(particles))  # radiance of one quantum
             found = torch.poisson(clean / unit, generator)
