@@ -11,6 +11,7 @@ scikit-image and MLEM. TV and NeRIF know nothing of those angles. "but one" leav
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 import time
 from pathlib import Path
@@ -25,7 +26,9 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.total_variation import TotalVariation
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
-from spray import HELD_OUT, read, reconstruct, relative_error
+example = importlib.import_module("spray")
+HELD_OUT, read, reconstruct = example.HELD_OUT, example.read, example.reconstruct
+relative_error = example.relative_error
 
 SLICES = ("impingement", "jets", "near")
 OUT = list(HELD_OUT)

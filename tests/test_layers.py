@@ -26,7 +26,7 @@ LAYERS = (
     ("experiment", "particles"),
     ("reconstruction",),
     ("result", "monitor"),
-    ("prediction", "evaluation", "consistency", "mistakes"),
+    ("prediction", "evaluation", "consistency", "mistakes", "gains"),
     ("members",),
     ("report", "sequence"),
     ("workflow",),

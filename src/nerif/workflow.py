@@ -8,9 +8,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
+from nerif.gains import fit_gains, with_gains
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
@@ -51,6 +54,8 @@ class Run:
     """Views kept out of the reconstruction and re-projected from it."""
     start_from: Path | None = None
     """Result directory of another reconstruction in the same box, of any method, to start from."""
+    fit_gains: bool = False
+    """Of emission: fit how bright each camera sees, beside the field; views held out are taken as they are."""
     ensemble: int = 0
     """Reconstruct so many times more with other seeds and noise, for mean and standard deviation of every quantity."""
     leave_one_out: bool = False
@@ -108,6 +113,8 @@ def reconstruct_into(
     if voxels < 1:
         raise InputError(f"voxels: expected at least 1, got {voxels}")
     training = measurement.without(run.hold_out)
+    if run.fit_gains:
+        measurement, training = _evened(measurement, training, monitor)
     _check_ensemble(run, training)
     run = replace(run, gas=run.gas.for_measurement(measurement))
     if measurement.bad_pixels:
@@ -211,6 +218,14 @@ def _write(
     monitor.say(
         f"{out.path}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView"
     )
+
+
+def _evened(measurement: Measurement, training: Measurement, monitor: Monitor) -> tuple[Measurement, Measurement]:
+    """Both with every training view divided by its gain."""
+    found = dict(zip(training.names, fit_gains(training).tolist(), strict=True))
+    monitor.say("gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in found.items()))
+    gains = torch.tensor([found.get(name, 1.0) for name in measurement.names])
+    return with_gains(measurement, gains), with_gains(training, torch.tensor(list(found.values())))
 
 
 def _check_ensemble(run: Run, training: Measurement) -> None:

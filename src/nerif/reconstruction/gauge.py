@@ -25,7 +25,7 @@ def is_open(measurement: Measurement) -> bool:
 
 
 def ambient_faces(measurement: Measurement, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Return the faces on which the field is to be ambient: those asked for, else, where a technique needs any, the file's."""
+    """Return the faces on which the field is ambient: those asked for, else those of the file, if any is needed."""
     needed = any(kind.gauge for kind in measurement.techniques)
     return asked or (measurement.ambient_faces if needed else ())
 

@@ -114,6 +114,10 @@ class ForwardModel(ABC):
     """Whether samples stand on the straight ray."""
     additive: ClassVar[bool] = False
     """Whether a pixel sees a sum, with weights above 0, of a field that is never negative."""
+    fill: ClassVar[float] = 1.0
+    """Share of the path through the box that counts towards what is measured, at about: for the size of the field."""
+    gains: ClassVar[bool] = False
+    """Whether cameras may be of different brightness, which a fit can tell."""
     linear: ClassVar[bool] = True
     """Whether the weights say all: neither `bend` nor `read` changes anything."""
 
@@ -201,7 +205,7 @@ class ForwardModel(ABC):
         rays, measured, length = rays[through], measured[through], length[through]
         middle = 0.5 * (rays.near + rays.far)
         sizes = self.weights(rays, middle[:, None], length[:, None]).sizes(length)
-        return float((measured / sizes[:, None]).square().mean().sqrt())
+        return float((measured / sizes[:, None]).square().mean().sqrt()) / self.fill
 
 
 def midpoints(rays: Rays, samples: int) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:

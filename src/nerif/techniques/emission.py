@@ -31,6 +31,7 @@ class Emission(LineIntegral):
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
     additive = True
+    gains = True
     bounds = (0.0, math.inf)
 
     @classmethod

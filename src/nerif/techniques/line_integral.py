@@ -24,6 +24,7 @@ class LineIntegral(ForwardModel):
     channels = ("",)
     unit = "1"
     limits = (1e-12, 1e12)
+    fill = 0.2  # objects fill a part of the box; what they show nothing of counts as 0
 
     @property
     @abstractmethod

@@ -1,0 +1,74 @@
+"""How bright each camera sees: gains of the views, fitted together with the field where no calibration tells them.
+
+    min over f >= 0 and g of  sum_v |g_v A_v f - L_v|^2,      the geometric mean of g_v is 1
+
+One iteration of MLEM for the field on coarse voxels and the best gains for it follow one another.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
+from nerif.reconstruction.operator import VoxelOperator
+from nerif.techniques.registry import forward_model
+
+__all__ = ["fit_gains", "with_gains"]
+
+VOXELS = 32  # along the longest edge
+ROUNDS = 200  # at most
+SETTLED = 1e-5  # change of a gain in a round
+
+
+def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> Float[Tensor, " view"]:
+    """Return the gain of every view, their geometric mean 1.
+
+    Parameters
+    ----------
+    measurement : of emission, by two views or more; those held out have been taken out of it
+    voxels : of the coarse field, along the longest edge
+
+    Raises
+    ------
+    InputError
+        If it is of another technique, or of one view.
+    """
+    (observation, *others) = measurement.observations
+    if others or not observation.technique.gains:
+        names = " and ".join(o.technique.name for o in measurement.observations)
+        raise InputError(f"fit_gains: expected emission, whose cameras may be of different brightness, got {names}")
+    if len(measurement.cameras) < 2:
+        raise InputError("fit_gains: expected two views or more, got one, whose gain nothing tells")
+    rays, values, _ = measurement.rays(observation)
+    view, measured = rays.view.long(), values[:, 0].clamp_min(0)
+    grid, model = Grid.of_resolution(measurement.box, voxels), forward_model(observation.technique, measurement)
+    operator = VoxelOperator(rays, grid, model)
+    reach = operator.T(torch.ones_like(values)).clamp_min(1e-12)
+    field, gains = torch.ones(operator.domain_shape), torch.ones(len(measurement.cameras))
+    field *= measured.sum() / operator(field).sum()
+    count = len(gains)
+    for _ in range(ROUNDS):
+        seen = operator(field)[:, 0].clamp_min(1e-12)
+        product, square = (torch.zeros(count).index_add(0, view, x) for x in (seen * measured, seen * seen))
+        fresh = torch.where(square > 0, product / square.clamp_min(1e-30), torch.ones(count)).clamp_min(1e-6)
+        fresh = fresh / fresh.log().mean().exp()
+        settled = float((fresh - gains).abs().max()) < SETTLED
+        gains = fresh
+        field = field * operator.T((measured / gains[view] / seen)[:, None]) / reach
+        if settled:
+            break
+    return gains
+
+
+def with_gains(measurement: Measurement, gains: Float[Tensor, " view"]) -> Measurement:
+    """Return the measurement with the values and sigmas of every view divided by its gain."""
+    values, sigmas = {}, {}
+    for o in measurement.observations:
+        own = gains[:, None, None, None]
+        values[o.technique.name] = o.values / own
+        sigmas[o.technique.name] = None if o.sigma is None else o.sigma / own
+    return measurement.observed(values, sigmas)
