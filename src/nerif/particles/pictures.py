@@ -17,8 +17,8 @@ from torch import Tensor
 from nerif.conventions import AMBIENT_INDEX, InputError
 from nerif.geometry import Camera
 from nerif.measurement import Measurement, measurement_of
-from nerif.particles.cloud import DIAMETER, Particles, spread
-from nerif.techniques.emission import Emission
+from nerif.particles.cloud import DIAMETER, QUANTITY, Particles, spread
+from nerif.techniques.registry import technique_of
 
 __all__ = ["picture", "pictures"]
 
@@ -47,6 +47,7 @@ def pictures(
     """
     if not 0 <= counts < math.inf:
         raise InputError(f"counts: expected 0 or more, got {counts}")
+    kind = technique_of(QUANTITY)
     generator = torch.Generator().manual_seed(seed)
     height, width = (max(c.image_size[i] for c in cameras) for i in (0, 1))
     radiance = torch.full((len(cameras), height, width), float("nan"))
@@ -62,10 +63,10 @@ def pictures(
             clean, noise = unit * found, unit * found.clamp_min(1).sqrt()
             sigma[i, :h, :w] = noise.float()
         radiance[i, :h, :w] = clean.float()
-    measurement = measurement_of({Emission: radiance[..., None]}, cameras, particles.box, AMBIENT_INDEX)
+    measurement = measurement_of({kind: radiance[..., None]}, cameras, particles.box, AMBIENT_INDEX)
     if not counts:
         return measurement
-    return measurement.observed({Emission.name: radiance[..., None]}, {Emission.name: sigma[..., None]})
+    return measurement.observed({kind.name: radiance[..., None]}, {kind.name: sigma[..., None]})
 
 
 def picture(particles: Particles, camera: Camera, diameter: float = DIAMETER) -> Float[Tensor, "row column"]:
