@@ -21,6 +21,7 @@ from nerif.imaging.line_scans import LineScan
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 
 HELD_OUT = (2, 7, 12, 17)
+WEIGHTS = (5e-4, 1e-3, 2e-3, 5e-3, 1e-2)  # of total variation, tried
 WATER = 1006.0  # mm2/g at 8 keV: extinction over density
 
 
@@ -49,6 +50,19 @@ def reconstruct(
     predicted = LineScan.bent(reproject(found.field, whole).predicted[:, 0, :, 0].numpy(), bend)
     told = {"offset": offset, "axis_mm": axis, "bend": bend, "scatter": before, "scatter_after": after}
     return scan, predicted, found, told
+
+
+def total_variation(scan: LineScan, held_out: tuple[int, ...], weights: tuple[float, ...] = WEIGHTS) -> TotalVariation:
+    """Return total variation with the weight that best predicts every fifth of the other angles from the rest."""
+    method = TotalVariation(voxels=75, basis="linear", iterations=200)
+    kept = scan.select([i for i in range(len(scan.angles)) if i not in held_out])
+    out = tuple(range(2, len(kept.angles), 5))
+
+    def error(weight: float) -> float:
+        tried, predicted, _, _ = reconstruct(kept, out, replace(method, regularisation=weight))
+        return relative_error(predicted[list(out)], tried.readings[list(out)])
+
+    return replace(method, regularisation=min(weights, key=error))
 
 
 def relative_error(predicted: np.ndarray, measured: np.ndarray) -> float:
@@ -104,10 +118,11 @@ def main() -> None:
     asked = parser.parse_args()
     methods: dict[str, Reconstructor] = {
         "nerif": NeRIF(max_steps=asked.steps, epochs=1e9, samples=(24, 40)),
-        "tv": TotalVariation(voxels=75, basis="linear", regularisation=1e-3, iterations=200),
     }
-    held_out = tuple(asked.hold_out)
-    scan, predicted, found, told = reconstruct(read(asked.data, asked.slice), held_out, methods[asked.method])
+    scan, held_out = read(asked.data, asked.slice), tuple(asked.hold_out)
+    if asked.method == "tv":
+        methods["tv"] = total_variation(scan, held_out)
+    scan, predicted, found, told = reconstruct(scan, held_out, methods[asked.method])
     print(f"offset {told['offset']:.4f}, axis of rotation at {told['axis_mm']:.3f} mm")
     print(
         f"readings are A - {told['bend']:.3f} A^2 or so: totals of the angles scatter by {told['scatter']:.2%}, "

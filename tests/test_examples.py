@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from nerif.geometry import Grid
 from nerif.measurement import Measurement
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -51,5 +52,25 @@ def test_from_images(tmp_path):
     assert len(metrics["views"]) == 9
 
 
+SPRAY = Path(__file__).parents[2] / "shared" / "data" / "spray_absorption" / "spray_Re6700.hdf5"
+
+
+@pytest.mark.skipif(not SPRAY.is_file(), reason="the data of the spray are not beside the project (shared/data)")
+def test_spray(tmp_path, monkeypatch, capsys):
+    """Two jets of water: their density is that of water, though nothing was told of it."""
+    arguments = ["--slice", "jets", "--method", "nerif", "--steps", "60", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["spray.py", str(SPRAY), *arguments])
+    example = runpy.run_path(str(EXAMPLES / "spray.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    assert "axis of rotation at -0.27" in said
+    assert (tmp_path / "jets-nerif.png").stat().st_size > 20_000
+    method = example["TotalVariation"](voxels=50, basis="linear", regularisation=2e-3, iterations=40, device="cpu")
+    _, _, found, told = example["reconstruct"](example["read"](SPRAY, "jets"), example["HELD_OUT"], method)
+    density = found.volume(Grid.of_resolution(found.box, 50)).values / example["WATER"] * 1e3
+    inside = density[density > 0.5]
+    assert 0.95 < float(inside.median()) < 1.1  # mg/mm3
+    assert told["scatter_after"] < 0.5 * told["scatter"]
+
+
 def test_examples_are_all_tested():
-    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py", "from_images.py", "particles.py"}
+    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py", "from_images.py", "particles.py", "spray.py"}

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from nerif.conventions import InputError
 from nerif.geometry import Box, Camera
@@ -88,7 +88,7 @@ class LineScan:
         return float(1.4826 * np.median(np.abs(ends - np.median(ends))))
 
     @property
-    def complete(self) -> Float[np.ndarray, " c"]:
+    def complete(self) -> Int[np.ndarray, " c"]:
         """Numbers of the angles that hold all of the medium: both ends are beside it."""
         least = EMPTY * self.readings.max()
         inside = (self.readings[:, :2].max(axis=1) < least) & (self.readings[:, -2:].max(axis=1) < least)
