@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -27,6 +28,17 @@ def test_own_data(tmp_path, monkeypatch):
     # from further left, p0 < p, and d = p - p0 > 0 there
     left_half = m.displacement[0, 60, :99, 0]
     assert float(left_half.mean()) > 0
+
+
+def test_particles(tmp_path, monkeypatch, capsys):
+    words = ["--pixels", "64", "--depth", "16", "--displacement", "2", "--window", "12"]
+    monkeypatch.setattr(sys, "argv", ["particles.py", str(tmp_path), *words])
+    runpy.run_path(str(EXAMPLES / "particles.py"), run_name="__main__")
+    quality, error = map(float, re.findall(r"Q ([\d.]+), rms error ([\d.]+)", capsys.readouterr().out)[0])
+    assert quality > 0.75
+    assert error < 0.15
+    assert Measurement.read(tmp_path / "after.nc").names == ("left below", "right below", "left above", "right above")
+    assert (tmp_path / "particles.png").is_file()
 
 
 @pytest.mark.slow
@@ -61,4 +73,4 @@ def test_spray(tmp_path, monkeypatch, capsys):
 
 
 def test_examples_are_all_tested():
-    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py", "from_images.py", "spray.py"}
+    assert {p.name for p in EXAMPLES.glob("*.py")} == {"own_data.py", "from_images.py", "particles.py", "spray.py"}

@@ -23,7 +23,7 @@ LAYERS = (
     ("fields",),
     ("physics",),
     ("metrics", "resolution", "simulation", "rendering"),
-    ("experiment",),
+    ("experiment", "particles"),
     ("reconstruction",),
     ("result", "monitor"),
     ("prediction", "evaluation", "consistency", "mistakes", "quick_views", "symptoms", "gains"),

@@ -16,6 +16,7 @@ SMALLEST = {
     "ensemble": "--members 2 --steps 5 --phantoms gaussians --noise 0.05 --leave-one-out no",
     "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 5 --voxels 12",
     "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",
+    "particles": "--per-pixel 0.05 --pixels 48 --depth 12 --displacement 1 --window 12 --seeds 1",
     "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5 --joint 5",
     "voxel_cost": "--voxels 8 --basis linear --iterations 1 --pixels 12",
     "warm_start": "--pixels 12 --seconds 8 --voxels 12 --fit-steps 5",

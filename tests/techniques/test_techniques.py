@@ -174,6 +174,17 @@ def test_a_file_keeps_every_technique(kind, measured, tmp_path):
     assert back.select(back.names[:2]).about_views["aperture_diameter"].shape == (2,)
 
 
+@pytest.mark.parametrize("name", list(TECHNIQUES))
+def test_a_ray_that_grazes_the_box_says_nothing_of_the_scale(measured, name):
+    measurement = measured[name]
+    model = forward_model(TECHNIQUES[name], measurement)
+    rays, values, _ = measurement.rays()
+    first = replace(rays[:1], far=rays.near[:1])  # of no length in single precision
+    grazing = Rays.collect([rays, first], len(rays) + 1)
+    scale = model.field_scale(grazing, torch.cat([values, values[:1]]))
+    assert scale == pytest.approx(model.field_scale(rays, values), rel=1e-6)
+
+
 # -- reconstruction --------------------------------------------------------------------------------------------------
 
 

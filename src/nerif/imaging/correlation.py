@@ -1,7 +1,8 @@
-"""Window cross-correlation, as in particle image velocimetry: several passes, the reference deformed in between.
+"""Window cross-correlation, as in particle image velocimetry, of pictures or volumes: several passes, deformed between.
 
-Each window of the flow picture is correlated with the same window of the reference, moved by what is known so far; the
-peak is fitted by a Gaussian through three points a direction; vectors that do not fit their neighbours are replaced.
+Each window of the first array is correlated with the same window of the second, moved by what is known so far; the peak
+is fitted by a Gaussian through three points a direction; vectors that do not fit their neighbours are replaced. Arrays
+are indexed (row, column) or (z, y, x), movements have components (u, v) or (x, y, z).
 
 Sources: Scarano, Iterative image deformation methods in PIV, Meas. Sci. Technol. 13 (2002) R1; Westerweel & Scarano,
 Universal outlier detection for PIV data, Exp. Fluids 39 (2005) 1096. No library under a licence like ours was found.
@@ -9,12 +10,33 @@ Universal outlier detection for PIV data, Exp. Fluids 39 (2005) 1096. No library
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from nerif.conventions import InputError
 from nerif.imaging.warping import warp
 
-__all__ = ["normalised_median_outliers", "window_correlation"]
+__all__ = ["Vectors", "correlate", "normalised_median_outliers", "window_correlation"]
+
+FAINT = 1e-4  # of the mean variance, below which a window shows nothing
+LOWEST_PEAK = 0.1  # of the correlation, which is 1 where both windows are equal
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """Movements at the centres of windows.
+
+    Parameters
+    ----------
+    axes : centres along each axis of the arrays, px (in volumes: voxels)
+    movement : (*nodes, d) in px; where it was not found, what its neighbours say
+    found : (*nodes) False where the peak is low or the vector does not fit its neighbours
+    """
+
+    axes: tuple[np.ndarray, ...]
+    movement: np.ndarray
+    found: np.ndarray
 
 
 def window_correlation(flow: np.ndarray, reference: np.ndarray, window: int = 16, passes: int = 4) -> np.ndarray:
@@ -33,20 +55,47 @@ def window_correlation(flow: np.ndarray, reference: np.ndarray, window: int = 16
     """
     if min(flow.shape) < 2 * window:
         raise InputError(f"window: expected at most half the picture ({min(flow.shape) // 2} px), got {window} px")
-    movement = np.zeros((*flow.shape, 2), dtype=np.float32)
+    return _everywhere(correlate(flow, reference, window, passes), flow.shape)
+
+
+def correlate(
+    first: np.ndarray, second: np.ndarray, window: int, passes: int = 4, central: bool = False
+) -> Vectors:  # fmt: skip
+    """Return the movement from the first array to the second at the centres of windows.
+
+    Parameters
+    ----------
+    first, second : pictures or volumes of one shape and scale
+    window : edge of the windows of the last passes, px; the first uses twice that where four of them fit
+    passes : number of passes; windows overlap by three quarters
+    central : whether both arrays are moved, by half each, so that the movement is that of what passes a node halfway;
+        else it is of what stands there in the first array
+
+    Raises
+    ------
+    InputError
+        If shapes differ, or an array is smaller than a window.
+    """
+    if first.shape != second.shape:
+        raise InputError(f"second: expected the shape of the first, {first.shape}, got {second.shape}")
+    if not 4 <= window <= min(first.shape):
+        raise InputError(f"window: expected between 4 and the shortest edge, {min(first.shape)}, got {window}")
+    if passes < 1:
+        raise InputError(f"passes: expected at least 1, got {passes}")
+    movement = np.zeros((*first.shape, first.ndim), dtype=np.float32)
     for i in range(passes):
-        size = 2 * window if i == 0 and min(flow.shape) >= 4 * window else window
-        step = max(2, size // 4)
-        moved = warp(reference, movement)
-        rows, columns = (_starts(n, size, step) for n in flow.shape)
-        residual, height = _correlate(flow, moved, rows, columns, size)
-        centre_rows, centre_columns = rows + (size - 1) / 2, columns + (size - 1) / 2
-        known = _at(movement, centre_rows, centre_columns)
-        vectors = known + residual
-        bad = normalised_median_outliers(vectors) | ~(height > 0.1) | (np.abs(residual).max(-1) > size / 3)
-        vectors = _replace(vectors, bad)
-        movement = _to_pixels(vectors, centre_rows, centre_columns, flow.shape)
-    return movement
+        size = 2 * window if i == 0 and min(first.shape) >= 4 * window else window
+        starts = [_starts(n, size, max(2, size // 4)) for n in first.shape]
+        still = warp(first, -movement / 2) if central else first
+        moved = warp(second, movement / 2 if central else movement)
+        residual, height = _shifts(still, moved, starts, size)
+        axes = tuple(s + (size - 1) / 2 for s in starts)
+        movements = _at(movement, axes) + residual
+        bad = normalised_median_outliers(movements) | ~(height > LOWEST_PEAK) | (np.abs(residual).max(-1) > size / 3)
+        vectors = Vectors(axes, _replace(movements, bad), ~bad)
+        if i < passes - 1:
+            movement = _everywhere(vectors, first.shape)
+    return vectors
 
 
 def _starts(length: int, size: int, step: int) -> np.ndarray:
@@ -54,66 +103,84 @@ def _starts(length: int, size: int, step: int) -> np.ndarray:
     return starts if starts[-1] == length - size else np.append(starts, length - size)
 
 
-def _correlate(
-    flow: np.ndarray, moved: np.ndarray, rows: np.ndarray, columns: np.ndarray, size: int
+def _shifts(
+    first: np.ndarray, second: np.ndarray, starts: list[np.ndarray], size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shift (2) and height (0 to 1) of the correlation peak of every window."""
+    """Shift (*nodes, d) and height (*nodes) of the correlation peak of every window; 0 high where it shows nothing."""
     from scipy import fft
 
-    axis = (np.arange(size) - (size - 1) / 2) / size
-    weight = np.exp(-0.5 * (axis / 0.3) ** 2)
-    weight = weight[:, None] * weight[None, :]
+    dimensions = first.ndim
+    within = tuple(range(1, dimensions + 1))  # axes of a stack of windows
+    axis = np.exp(-0.5 * ((np.arange(size) - (size - 1) / 2) / size / 0.3) ** 2)
+    weight = axis
+    for _ in range(dimensions - 1):
+        weight = weight[..., None] * axis
     weight = (weight / weight.sum()).astype(np.float32)
-    shifts, heights = [], []
-    for row in rows:  # one row of windows at a time bounds the memory
-        strips = [
-            np.lib.stride_tricks.sliding_window_view(i[row : row + size], size, axis=1)[:, columns].swapaxes(0, 1)
-            for i in (flow, moved)
-        ]
-        a, b = ((s - (s * weight).sum((1, 2), keepdims=True)) * np.sqrt(weight) for s in strips)
-        product = np.conj(fft.rfft2(a)) * fft.rfft2(b)
-        surface = fft.fftshift(fft.irfft2(product, s=(size, size)), axes=(1, 2))
-        norm = np.sqrt((a**2).sum((1, 2)) * (b**2).sum((1, 2))) + 1e-12
-        shift, height = _peak(surface / norm[:, None, None])
+    shifts, heights, strengths = [], [], []
+    for start in starts[0]:  # the windows of one start at a time bound the memory
+        a, b = (
+            (w - (w * weight).sum(within, keepdims=True)) * np.sqrt(weight)
+            for w in (_windows(array[start : start + size], starts[1:], size) for array in (first, second))
+        )
+        product = np.conj(fft.rfftn(a, axes=within)) * fft.rfftn(b, axes=within)
+        surface = fft.fftshift(fft.irfftn(product, s=(size,) * dimensions, axes=within), axes=within)
+        strength = np.sqrt((a**2).sum(within) * (b**2).sum(within)) + 1e-12
+        shift, height = _peak(surface / np.expand_dims(strength, within))
         shifts.append(shift)
         heights.append(height)
-    return np.stack(shifts), np.stack(heights)
+        strengths.append(strength)
+    nodes = [len(s) for s in starts]
+    seen = np.stack(strengths) > FAINT * np.mean(strengths)
+    return np.stack(shifts).reshape(*nodes, dimensions), (np.stack(heights) * seen).reshape(nodes)
+
+
+def _windows(slab: np.ndarray, starts: list[np.ndarray], size: int) -> np.ndarray:
+    """The windows (n, size, ...) of a slab as thick as they are."""
+    others = tuple(range(1, slab.ndim))
+    views = np.lib.stride_tricks.sliding_window_view(slab, (size,) * len(others), axis=others)
+    index: tuple[slice | np.ndarray, ...] = (slice(None), *np.ix_(*starts))
+    chosen = np.moveaxis(views[index], 0, len(others))
+    return chosen.reshape(-1, *(size,) * slab.ndim)
 
 
 def _peak(surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where (u, v) the highest point of each surface lies from its middle, by Gaussian fits through three points."""
-    n, size, _ = surface.shape
-    inner = surface[:, 1:-1, 1:-1].reshape(n, -1)
-    best = inner.argmax(axis=1)
-    i, j = best // (size - 2) + 1, best % (size - 2) + 1
-    each = np.arange(n)
-    height = surface[each, i, j]
+    """Where (u, v) or (x, y, z) the top of each surface lies from its middle, by Gaussian fits through three points."""
+    n, size, dimensions = len(surface), surface.shape[1], surface.ndim - 1
+    inner = surface[(slice(None), *(slice(1, -1),) * dimensions)]
+    best = np.unravel_index(inner.reshape(n, -1).argmax(axis=1), inner.shape[1:])
+    top = np.stack([np.arange(n), *(b + 1 for b in best)])
+    height = surface[tuple(top)]
 
-    def fit(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    def fit(axis: int) -> np.ndarray:
+        step = np.zeros((dimensions + 1, 1), dtype=int)
+        step[axis] = 1
         floor = 1e-6
-        l0, l1, l2 = (np.log(np.maximum(v, floor)) for v in (before, height, after))
+        around = surface[tuple(top - step)], height, surface[tuple(top + step)]
+        l0, l1, l2 = (np.log(np.maximum(v, floor)) for v in around)
         curvature = l0 - 2 * l1 + l2
         return np.where(curvature < 0, 0.5 * (l0 - l2) / np.where(curvature < 0, curvature, -1), 0)
 
-    v = i - size // 2 + fit(surface[each, i - 1, j], surface[each, i + 1, j])
-    u = j - size // 2 + fit(surface[each, i, j - 1], surface[each, i, j + 1])
-    return np.stack([u, v], axis=-1), height
+    return np.stack([top[a] - size // 2 + fit(a) for a in range(dimensions, 0, -1)], axis=-1), height
 
 
 def normalised_median_outliers(vectors: np.ndarray, threshold: float = 2.0, noise: float = 0.1) -> np.ndarray:
-    """Return which vectors (row, column, 2) differ from the median of their eight neighbours by more than `threshold`.
+    """Return which vectors (*nodes, d) differ from the median of their 8 or 26 neighbours by more than `threshold`.
 
     |d - median| / (median |d_i - median| + noise) > threshold, `noise` in px (Westerweel & Scarano 2005).
     """
-    padded = np.pad(vectors, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-    rows, columns = vectors.shape[:2]
+    nodes = vectors.shape[:-1]
+    padded = np.pad(vectors, (*((1, 1),) * len(nodes), (0, 0)), constant_values=np.nan)
     around = np.stack(
-        [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    )  # fmt: skip
+        [
+            padded[tuple(slice(i, i + n) for i, n in zip(start, nodes, strict=True))]
+            for start in np.ndindex((3,) * len(nodes))
+            if any(i != 1 for i in start)
+        ]
+    )
     median = _nanmedian(around)
     spread = _nanmedian(np.abs(around - median))
     ratio = np.abs(vectors - median) / (spread + noise)
-    return np.asarray(np.hypot(ratio[..., 0], ratio[..., 1]) > threshold)
+    return np.asarray(np.sqrt((ratio**2).sum(axis=-1)) > threshold)
 
 
 def _nanmedian(values: np.ndarray) -> np.ndarray:
@@ -131,23 +198,27 @@ def _replace(vectors: np.ndarray, bad: np.ndarray) -> np.ndarray:
     if not bad.any() or bad.all():
         return np.where(bad[..., None], 0, vectors)
     weight = gaussian_filter((~bad).astype(float), 1.5) + 1e-9
-    filled = [gaussian_filter(np.where(bad, 0, vectors[..., k]), 1.5) / weight for k in range(2)]
+    filled = [gaussian_filter(np.where(bad, 0, vectors[..., k]), 1.5) / weight for k in range(vectors.shape[-1])]
     return np.where(bad[..., None], np.stack(filled, axis=-1), vectors)
 
 
-def _at(movement: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def _at(movement: np.ndarray, axes: tuple[np.ndarray, ...]) -> np.ndarray:
     from scipy.ndimage import map_coordinates
 
-    where = np.meshgrid(rows, columns, indexing="ij")
-    return np.stack([map_coordinates(movement[..., k], where, order=1, mode="nearest") for k in range(2)], axis=-1)
+    where = np.meshgrid(*axes, indexing="ij")
+    parts = [map_coordinates(movement[..., k], where, order=1, mode="nearest") for k in range(movement.shape[-1])]
+    return np.stack(parts, axis=-1)
 
 
-def _to_pixels(vectors: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Cubic splines through the vectors; beyond the outer ones their values go on."""
-    from scipy.interpolate import RectBivariateSpline
+def _everywhere(vectors: Vectors, shape: tuple[int, ...]) -> np.ndarray:
+    """The movement (*shape, d) by cubic splines through the vectors; beyond the outer ones their values go on."""
+    from scipy.interpolate import make_interp_spline
 
-    at_rows = np.clip(np.arange(shape[0]), rows[0], rows[-1])
-    at_columns = np.clip(np.arange(shape[1]), columns[0], columns[-1])
-    order = min(3, len(rows) - 1, len(columns) - 1)
-    splines = [RectBivariateSpline(rows, columns, vectors[..., k], kx=order, ky=order) for k in range(2)]
-    return np.stack([spline(at_rows, at_columns) for spline in splines], axis=-1).astype(np.float32)
+    movement = vectors.movement
+    for axis, (centres, n) in enumerate(zip(vectors.axes, shape, strict=True)):
+        at = np.clip(np.arange(n), centres[0], centres[-1])
+        if len(centres) == 1:
+            movement = movement.repeat(n, axis=axis)
+            continue
+        movement = make_interp_spline(centres, movement, min(3, len(centres) - 1), axis=axis)(at)
+    return np.asarray(movement, dtype=np.float32)

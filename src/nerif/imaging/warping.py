@@ -1,4 +1,4 @@
-"""A picture moved by a displacement map."""
+"""A picture or volume moved by a displacement map."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ __all__ = ["warp"]
 
 
 def warp(image: np.ndarray, movement: np.ndarray) -> np.ndarray:
-    """Return image(p + movement(p)) by cubic splines, edge values beyond the edges."""
+    """Return image(p + movement(p)) by cubic splines, edge values beyond the edges.
+
+    Parameters
+    ----------
+    image : (row, column) or (z, y, x)
+    movement : (row, column, 2) u, v, or (z, y, x, 3) x, y, z, px
+    """
     from scipy.ndimage import map_coordinates
 
-    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
-    where = [rows + movement[..., 1], columns + movement[..., 0]]
+    where = [cell + movement[..., -1 - axis] for axis, cell in enumerate(np.indices(image.shape))]
     return np.asarray(map_coordinates(image.astype(np.float32), where, order=3, mode="nearest"))

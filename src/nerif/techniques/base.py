@@ -25,6 +25,8 @@ from nerif.geometry import Camera, Rays
 
 __all__ = ["ForwardModel", "Light", "Weights", "midpoints"]
 
+GRAZING = 1e-3  # of the longest way through the box, below which a ray says nothing of the size of the field
+
 
 class Light(Protocol):
     """What a forward model has to know of a measurement."""
@@ -203,6 +205,8 @@ class ForwardModel(ABC):
     def field_scale(self, rays: Rays, measured: Float[Tensor, "n c"]) -> float:
         """Return the size of field that makes measurements of the size given; 0 where all of them are 0."""
         length = rays.far - rays.near
+        through = length > GRAZING * length.max()
+        rays, measured, length = rays[through], measured[through], length[through]
         middle = 0.5 * (rays.near + rays.far)
         sizes = self.weights(rays, middle[:, None], length[:, None]).sizes(length)
         return float((measured / sizes[:, None]).square().mean().sqrt()) / self.fill

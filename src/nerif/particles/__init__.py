@@ -1,0 +1,1 @@
+"""Tomographic particle imaging: many small bright points, seen by a few cameras at two instants, and their velocity."""

@@ -1,0 +1,96 @@
+"""Pictures of particles: Gaussian images of a given diameter in px, integrated over the pixels, with shot noise.
+
+    L(p) = sum_i b_i / a_i integral over pixel p of G(p' - p_i) dp'
+
+b_i is the brightness of a particle, p_i its image and a_i the area (mm^2) that a pixel has where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import AMBIENT_INDEX, InputError
+from nerif.geometry import Camera
+from nerif.measurement import Measurement, measurement_of
+from nerif.particles.cloud import DIAMETER, QUANTITY, Particles, spread
+from nerif.techniques.registry import technique_of
+
+__all__ = ["picture", "pictures"]
+
+STEP = 1e-3  # mm, over which the scale of a picture is taken
+
+
+def pictures(
+    particles: Particles,
+    cameras: Sequence[Camera],
+    counts: float = 1000.0,
+    diameter: float = DIAMETER,
+    seed: int = 0,
+) -> Measurement:
+    """Return what cameras see of particles: a measurement of emission, in the box of the particles.
+
+    Parameters
+    ----------
+    counts : detected quanta of a particle of mean brightness in one picture, whose shot noise there is; 0 for none
+    diameter : of a particle image, four standard deviations, px
+    seed : of the noise
+
+    Raises
+    ------
+    InputError
+        If a number cannot be one, or a camera sees no particle.
+    """
+    if not 0 <= counts < math.inf:
+        raise InputError(f"counts: expected 0 or more, got {counts}")
+    kind = technique_of(QUANTITY)
+    generator = torch.Generator().manual_seed(seed)
+    height, width = (max(c.image_size[i] for c in cameras) for i in (0, 1))
+    radiance = torch.full((len(cameras), height, width), float("nan"))
+    sigma = torch.full_like(radiance, float("nan"))
+    for i, camera in enumerate(cameras):
+        h, w = camera.image_size
+        clean = picture(particles, camera, diameter)
+        if not float(clean.sum()) > 0:
+            raise InputError(f"particles: expected some in view '{camera.name}', got none; check camera and box")
+        if counts:
+            unit = float(clean.sum()) / (counts * len(particles))  # radiance of one quantum
+            found = torch.poisson(clean / unit, generator)
+            clean, noise = unit * found, unit * found.clamp_min(1).sqrt()
+            sigma[i, :h, :w] = noise.float()
+        radiance[i, :h, :w] = clean.float()
+    measurement = measurement_of({kind: radiance[..., None]}, cameras, particles.box, AMBIENT_INDEX)
+    if not counts:
+        return measurement
+    return measurement.observed({kind.name: radiance[..., None]}, {kind.name: sigma[..., None]})
+
+
+def picture(particles: Particles, camera: Camera, diameter: float = DIAMETER) -> Float[Tensor, "row column"]:
+    """Return the radiance of particles in the pixels of a camera, without noise.
+
+    Parameters
+    ----------
+    diameter : of a particle image, four standard deviations, px
+    """
+    places = camera.project(particles.positions)
+    amounts = particles.brightness * _px_per_mm2(camera, particles.positions, places)
+    return spread(places.flip(-1), amounts, diameter / 4, camera.image_size)
+
+
+def _px_per_mm2(
+    camera: Camera, points: Float[Tensor, "n 3"], places: Float[Tensor, "n 2"]
+) -> Float[Tensor, " n"]:  # fmt: skip
+    """Pixels that a square millimetre across the line of sight covers, at points whose images are given."""
+    direction = camera.rays(places, sensitivity=False).direction
+    least = torch.nn.functional.one_hot(direction.abs().argmin(dim=1), 3).to(direction)
+    across = torch.linalg.cross(direction, least)
+    across = across / across.norm(dim=1, keepdim=True)
+    (a, b), (c, d) = (
+        ((camera.project(points + STEP * e) - camera.project(points - STEP * e)) / (2 * STEP)).unbind(-1)
+        for e in (across, torch.linalg.cross(direction, across))
+    )
+    return (a * d - b * c).abs()
