@@ -53,7 +53,7 @@ def test_a_scan_tells_its_offset_axis_and_saturation(measured):
 
 def test_the_slice_is_the_right_way_round():
     scan = true_scan()
-    result = Tikhonov(voxels=44, basis="linear", regularisation=1e-4, device="cpu")(scan.measurement(AXIS, 0.01))
+    result = METHOD(scan.measurement(AXIS, 0.01))
     assert result.quantity == "extinction"
     for x, y, _, extinction in BALLS:
         at = result.field(_point(x, y))
