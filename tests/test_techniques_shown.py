@@ -202,6 +202,7 @@ def test_an_offset_of_the_background_is_told(absorption):
     assert looks(alone, alone, [1.0] * 3) == []
 
 
+@pytest.mark.slow
 def test_check_names_the_view_whose_sign_is_flipped(tmp_path, capsys):
     path = tmp_path / "fringes.nc"
     words = ["--phantom", "gaussians", "--noise", "0.05", "--seed", "1", "-o", str(path), *RIG]
