@@ -4,7 +4,7 @@ See kernels_torch.py for the same in plain PyTorch. Along ray r the samples m = 
 
     x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
-with the weight w_m = profile_0 + m profile_1, or profile_m where there are more than two. A matrix (n, c, 3) takes
+with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3) takes
 sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m). Arithmetic is in double precision, whatever the arrays.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit, prange
-from numba.extending import overload, register_jitable
+from numba.extending import overload
 
 __all__ = ["adjoint", "forward"]
 
@@ -57,9 +57,22 @@ def _compiled_weights(t: Any, spline: Any) -> Any:
     return _linear if len(spline) == 2 else _cubic  # by the type of `spline`, so that no branch is left
 
 
-@njit(fastmath=FASTMATH)
+def _even_weight(profile, m):
+    return profile[0] + m * profile[1]
+
+
+def _listed_weight(profile, m):
+    return profile[m, 0]
+
+
 def _weight(profile, m):
-    return profile[0] + m * profile[1] if profile.shape[0] == 2 else profile[m]
+    """Weight of a sample: the profile of a ray is (2,), first value and increment, or (m, 1), sample by sample."""
+    raise NotImplementedError("compiled only")
+
+
+@overload(_weight, jit_options={"fastmath": FASTMATH})
+def _compiled_weight(profile, m):
+    return _even_weight if profile.ndim == 1 else _listed_weight
 
 
 def _see_slope(c, start, stride, profile, count, spline, matrix, seen):
@@ -93,7 +106,8 @@ def _see_slope(c, start, stride, profile, count, spline, matrix, seen):
 
 def _see_value(c, start, stride, profile, count, spline, matrix, seen):
     """Add A sum w f along one ray."""
-    neighbours, q = len(spline), 0.0
+    neighbours = len(spline)
+    q = 0.0
     for m in range(count):
         x, y, z = start[0] + m * stride[0], start[1] + m * stride[1], start[2] + m * stride[2]
         ix, iy, iz = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -142,7 +156,7 @@ def _samples_between(start, stride, count, first, last):
     return low, high
 
 
-def _spread_slope(c, start, stride, profile, count, spline, q, first, last):
+def _spread_slope(c, start, stride, profile, count, spline, q, first, last, matrix):
     """Add w q . grad of each basis function along one ray, for the samples between planes `first` and `last`."""
     neighbours = len(spline)
     low, high = _samples_between(start, stride, count, first, last)
@@ -166,7 +180,7 @@ def _spread_slope(c, start, stride, profile, count, spline, q, first, last):
                     c[iz + k, iy + j, ix + i] += slope * sx[i] + along * bx[i]
 
 
-def _spread_value(c, start, stride, profile, count, spline, q, first, last):
+def _spread_value(c, start, stride, profile, count, spline, q, first, last, matrix):
     """Add w q of each basis function along one ray, for the samples between planes `first` and `last`."""
     neighbours = len(spline)
     low, high = _samples_between(start, stride, count, first, last)
@@ -193,14 +207,7 @@ def _spread(c, start, stride, profile, count, spline, q, first, last, matrix):
 
 @overload(_spread, jit_options={"fastmath": FASTMATH})
 def _compiled_spread(c, start, stride, profile, count, spline, q, first, last, matrix):
-    slope, value = register_jitable(_spread_slope), register_jitable(_spread_value)
-    if matrix.ndim == 2:
-        return lambda c, start, stride, profile, count, spline, q, first, last, matrix: slope(
-            c, start, stride, profile, count, spline, q, first, last
-        )
-    return lambda c, start, stride, profile, count, spline, q, first, last, matrix: value(
-        c, start, stride, profile, count, spline, q, first, last
-    )
+    return _spread_slope if matrix.ndim == 2 else _spread_value
 
 
 def _gather(matrix, seen, q):

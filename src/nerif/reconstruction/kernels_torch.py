@@ -4,7 +4,7 @@ See kernels_numba.py for the same on all cores of a CPU. Along ray r the samples
 
     x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
-with the weight w_m = profile_0 + m profile_1, or profile_m where there are more than two. A matrix (n, c, 3) takes
+with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3) takes
 sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m).
 """
 
@@ -88,8 +88,8 @@ def _samples(
     x = start[:, None] + step[..., None] * stride[:, None]
     cell = x.floor()
     weights, slopes = spline_weights(x - cell, degree)
-    even = profile.shape[1] == 2
-    w = profile[:, :1] + step * profile[:, 1:] if even else profile.gather(1, step.long())
+    even = profile.ndim == 2
+    w = profile[:, :1] + step * profile[:, 1:] if even else profile[..., 0].gather(1, step.long())
     w = w * (m < count[:, None])
     return cell.long(), weights.unbind(-2), slopes.unbind(-2), w
 

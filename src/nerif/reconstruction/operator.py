@@ -188,14 +188,14 @@ class VoxelOperator:
         return rays * ((8 + 3 * channels) * dtype.itemsize + 4) + 2 * padded * dtype.itemsize
 
 
-def _tabulated(model: ForwardModel, rays: Rays, s: Tensor, interval: Tensor, most: int) -> Float[Tensor, "n m"]:
-    """The profile of a model at every sample of every ray; three or more, or it would be first value and increment."""
-    m = torch.arange(max(most, 3), dtype=s.dtype, device=s.device)
+def _tabulated(model: ForwardModel, rays: Rays, s: Tensor, interval: Tensor, most: int) -> Float[Tensor, "n m 1"]:
+    """The profile of a model at every sample of every ray."""
+    m = torch.arange(most, dtype=s.dtype, device=s.device)
     parts = []
     for i in torch.arange(len(rays), device=s.device).split(CHUNK):
         at = s[i, None] + m * interval[i, None]
         parts.append(model.weights(rays[i], at, interval[i, None].expand_as(at)).profile)
-    return torch.cat(parts)
+    return torch.cat(parts)[..., None]
 
 
 def operator_norm(
