@@ -4,8 +4,8 @@ See kernels_torch.py for the same in plain PyTorch. Along ray r the samples m = 
 
     x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
-with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3) takes
-sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m). Arithmetic is in double precision, whatever the arrays.
+with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3)
+takes sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m). Arithmetic is in double precision.
 """
 
 from __future__ import annotations

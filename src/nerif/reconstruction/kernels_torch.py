@@ -4,8 +4,8 @@ See kernels_numba.py for the same on all cores of a CPU. Along ray r the samples
 
     x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
-with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3) takes
-sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m).
+with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3)
+takes sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m).
 """
 
 from __future__ import annotations
