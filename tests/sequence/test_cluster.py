@@ -334,6 +334,7 @@ def test_a_store_begun_with_other_settings_is_left_alone(five, tmp_path, capsys)
     assert "ending in .zarr" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_from_python_in_one_call(five, tmp_path):
     out, said, told = tmp_path / "r.zarr", [], []
     settings = SequenceSettings(chunk=3, warm_steps=10, voxels=10)
