@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -215,3 +216,23 @@ def test_rows_and_corners_without_a_wanted_pixel_are_passed_over(measurement, mo
         expected = camera.rays(pixels).clip(measurement.box)
         mine = rays[(rays.origin - camera.centre.float()).norm(dim=-1) < 1e-2]
         assert len(mine) == int(expected.crosses.sum()) > 0
+
+
+RIGS = Path(__file__).parents[2] / "shared" / "data" / "rigs"
+
+
+@pytest.mark.skipif(not RIGS.is_dir(), reason="the measurements of others are not beside the project (shared/data)")
+@pytest.mark.parametrize(("name", "known"), [("all", {"aperture_diameter", "pose_sigma"}), ("window6", {"window"})])
+def test_files_of_others_are_read(name, known):
+    m = Measurement.read(RIGS / f"{name}.nc")
+    assert set(m.about_views) == known
+    assert len(m.cameras) == 9
+
+
+def test_units_of_a_list_may_have_commas(full, tmp_path):
+    turned = torch.full((len(full.cameras), 6), 1e-3, dtype=torch.float64)
+    replace(full, about_views={"pose_sigma": turned}).write(tmp_path / "m.nc")
+    dataset = xr.load_dataset(tmp_path / "m.nc")
+    dataset["pose_sigma"].attrs["units"] = "rad, rad, rad, mm, mm, mm"
+    dataset.to_netcdf(tmp_path / "commas.nc", engine="h5netcdf")
+    assert torch.equal(Measurement.read(tmp_path / "commas.nc").about_views["pose_sigma"], turned)

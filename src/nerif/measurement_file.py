@@ -54,7 +54,7 @@ ABOUT_VIEWS = {
     "aperture_diameter": (("view",), "mm"),
     "focus_distance": (("view",), "mm"),
     "window": (("view",), "px"),
-    "pose_sigma": (("view", "parameter"), "rad, rad, rad, mm, mm, mm"),
+    "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
 }
 """Dimensions and unit of what else may be known of the views."""
 
@@ -201,7 +201,7 @@ def _check_variables(dataset: xr.Dataset) -> None:
             if given_size == 0 or (size is not None and given_size != size):
                 raise InputError(f"variable '{name}': expected {size or 'some'} along {dimension}, got {given_size}")
         given = variable.attrs.get("units", unit)
-        if not (isinstance(given, str) and given == unit):
+        if not (isinstance(given, str) and given.replace(",", " ").split() == unit.split()):
             raise InputError(f"variable '{name}': expected units '{unit}', got '{given}'")
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
