@@ -5,8 +5,9 @@
 Relative rms error |predicted - measured| / |measured| of the angles left out. "on the axis" compares readings that are
 interpolated to a grid about the axis of rotation, as scikit-image's transforms need them and as its users see them;
 half of the noise is averaged away there. Peers, with the iteration that is best for the angles left out: SART of
-scikit-image and MLEM. TV and NeRIF know nothing of those angles; TV's weight is chosen by leaving out others. "but one"
-leaves out the reading furthest off.
+scikit-image and MLEM. TV and NeRIF are fitted without those angles, and TV's weight is chosen by leaving out
+others; but that all readings count alike, and that saturation is undone, was settled with the errors of those angles in
+view. "but one" leaves out the reading furthest off.
 """
 
 from __future__ import annotations

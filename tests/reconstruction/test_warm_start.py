@@ -6,6 +6,7 @@ with the CPU fails there as it would on CUDA. What comes out on a GPU, the tests
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -19,7 +20,7 @@ from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.warm_start import fit_network
+from nerif.reconstruction.warm_start import adopt, fit_network
 from nerif.techniques.deflection import MODELS
 
 BOX = Box((-3.0, -2.0, -1.0), (3.0, 2.0, 1.0))
@@ -95,3 +96,14 @@ def test_a_run_on_a_gpu_starts_from_a_network_on_the_cpu(measurement, method):
     start = NeuralField(Network(replace(SHAPE, width=12)), measurement.box, 1e-4)
     result = replace(method, device="cuda")(measurement, start=start)
     assert bool(torch.isfinite(result.field.to("cpu")(torch.rand(5, 3))).all())
+
+
+def test_a_bounded_network_starts_from_one_of_the_same_bounds_in_its_own_scale():
+    def field(scale: float, low: float) -> NeuralField:
+        return NeuralField(Network(SHAPE, bounds=(low / scale, math.inf)), BOX, scale)
+
+    points = torch.rand(40, 3) * 4 - 2
+    before, after = field(2e-3, -1e-3), field(5e-3, -1e-3)
+    assert adopt(after, before)
+    assert torch.equal(after(points), before(points))
+    assert not adopt(field(5e-3, -2e-3), before)

@@ -198,10 +198,6 @@ class ForwardModel(ABC):
         """Return what the pixel reads of the integral: the integral itself."""
         return prediction
 
-    def index_offset(self, n_ambient: float) -> float:
-        """Return the constant that L2 of a truth is measured from, beside its variation: 0 but for an index."""
-        return 0.0
-
     def field_scale(self, rays: Rays, measured: Float[Tensor, "n c"]) -> float:
         """Return the size of field that makes measurements of the size given; 0 where all of them are 0."""
         length = rays.far - rays.near

@@ -58,9 +58,6 @@ class Deflection(ForwardModel):
     def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
         return Weights(self.lever(rays, s) * step, slope=rays.ends.sensitivity / self.n_ambient)
 
-    def index_offset(self, n_ambient: float) -> float:
-        return n_ambient - 1
-
 
 @dataclass(frozen=True)
 class LeverArm(Deflection):

@@ -48,9 +48,6 @@ class Interferometry(LineIntegral):
     def weight(self) -> float:
         return 1 / (self.wavelength_nm * MM_PER_NM)
 
-    def index_offset(self, n_ambient: float) -> float:
-        return n_ambient - 1
-
     @classmethod
     def check(
         cls,
