@@ -15,3 +15,11 @@ ROOT = Path(__file__).parents[1]
 def test_nothing_is_found(command: list[str]) -> None:
     done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_no_merge_was_left_half_done() -> None:
+    files = [file for folder in ("docs", "src", "tests", "examples", "benchmarks") for file in (ROOT / folder).rglob("*")]
+    texts = [file for file in [*files, *ROOT.glob("*.*")] if file.suffix in (".md", ".py", ".toml", ".txt", ".js", ".css")]
+    assert len(texts) > 300
+    left = [str(f) for f in texts if any(line.startswith(("<" * 7, ">" * 7)) for line in f.read_text().splitlines())]
+    assert not left
