@@ -5,7 +5,10 @@ See kernels_torch.py for the same in plain PyTorch. Along ray r the samples m = 
     x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
 with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3)
-takes sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m). Arithmetic is in double precision.
+takes sum_m w_m grad f(x_m), a matrix (n, c, 1) takes sum_m w_m f(x_m). Arithmetic is in double precision.
+
+What is known before a ray is walked along goes by the length of a tuple, so that no branch is left in the compiled loops:
+`spline` has a number for each neighbour, `part` three for the gradient and one for the value.
 """
 
 from __future__ import annotations
@@ -21,18 +24,23 @@ __all__ = ["adjoint", "forward"]
 
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}  # no promise of finite numbers: a NaN stays a NaN
 LINEAR, CUBIC = (0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+VALUE, GRADIENT = (0.0,), (0.0, 0.0, 0.0)
 SLAB = 4  # planes; at least the 4 that a cubic spline touches, so that slabs of one colour never meet
 BLOCK = 64  # rays, neighbours in an image mostly, of which is known between which planes they stay
 
 
 def forward(degree: int, padded: np.ndarray, path: Sequence[np.ndarray], matrix: np.ndarray, seen: np.ndarray) -> None:
     """Add to `seen` (n, c) what the matrix of each ray makes of the padded coefficients (z, y, x)."""
-    _forward(padded, *path, matrix, seen, LINEAR if degree == 1 else CUBIC)
+    _forward(padded, *path, matrix, seen, *_kind(degree, matrix))
 
 
 def adjoint(degree: int, seen: np.ndarray, path: Sequence[np.ndarray], matrix: np.ndarray, padded: np.ndarray) -> None:
     """Add to the padded coefficients (z, y, x) what the adjoint makes of `seen` (n, c)."""
-    _adjoint(padded, *path, matrix, seen, LINEAR if degree == 1 else CUBIC)
+    _adjoint(padded, *path, matrix, seen, *_kind(degree, matrix))
+
+
+def _kind(degree: int, matrix: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    return LINEAR if degree == 1 else CUBIC, GRADIENT if matrix.shape[-1] == 3 else VALUE
 
 
 def _linear(t: Any, spline: Any) -> Any:
@@ -75,8 +83,9 @@ def _compiled_weight(profile, m):
     return _even_weight if profile.ndim == 1 else _listed_weight
 
 
-def _see_slope(c, start, stride, profile, count, spline, matrix, seen):
-    """Add B sum w grad f along one ray, in field per voxel."""
+@njit(fastmath=FASTMATH)
+def _integrate(c, start, stride, profile, count, spline, part):
+    """Sum of w grad f along one ray, in field per voxel, or of w f, in the first place."""
     neighbours = len(spline)
     qx = qy = qz = 0.0
     for m in range(count):
@@ -93,73 +102,43 @@ def _see_slope(c, start, stride, profile, count, spline, matrix, seen):
                     value = c[iz + k, iy + j, ix + i]
                     along += value * bx[i]
                     slope += value * sx[i]
-                gx += slope * by[j] * bz[k]
-                gy += along * sy[j] * bz[k]
-                gz += along * by[j] * sz[k]
+                if len(part) == 1:
+                    gx += along * by[j] * bz[k]
+                else:
+                    gx += slope * by[j] * bz[k]
+                    gy += along * sy[j] * bz[k]
+                    gz += along * by[j] * sz[k]
         w = _weight(profile, m)
         qx += w * gx
         qy += w * gy
         qz += w * gz
-    for i in range(seen.shape[0]):
-        seen[i] += matrix[i, 0] * qx + matrix[i, 1] * qy + matrix[i, 2] * qz
-
-
-def _see_value(c, start, stride, profile, count, spline, matrix, seen):
-    """Add A sum w f along one ray."""
-    neighbours = len(spline)
-    q = 0.0
-    for m in range(count):
-        x, y, z = start[0] + m * stride[0], start[1] + m * stride[1], start[2] + m * stride[2]
-        ix, iy, iz = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-        bx, by, bz = _weights(x - ix, spline)[0], _weights(y - iy, spline)[0], _weights(z - iz, spline)[0]
-        total = 0.0
-        for k in range(neighbours):
-            for j in range(neighbours):
-                along = 0.0
-                for i in range(neighbours):
-                    along += c[iz + k, iy + j, ix + i] * bx[i]
-                total += along * by[j] * bz[k]
-        q += _weight(profile, m) * total
-    for i in range(seen.shape[0]):
-        seen[i] += matrix[i] * q
-
-
-def _see(c, start, stride, profile, count, spline, matrix, seen):
-    """Add what one ray sees, by its matrix (c, 3) of the gradient or (c,) of the value."""
-    raise NotImplementedError("compiled only")
-
-
-@overload(_see, jit_options={"fastmath": FASTMATH})
-def _compiled_see(c, start, stride, profile, count, spline, matrix, seen):
-    return _see_slope if matrix.ndim == 2 else _see_value
+    return qx, qy, qz
 
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _forward(c, start, stride, profile, count, matrix, seen, spline):
+def _forward(c, start, stride, profile, count, matrix, seen, spline, part):
     for r in prange(count.shape[0]):
-        _see(c, start[r], stride[r], profile[r], count[r], spline, matrix[r], seen[r])
+        q = _integrate(c, start[r], stride[r], profile[r], count[r], spline, part)
+        for i in range(seen.shape[1]):
+            for j in range(len(part)):
+                seen[r, i] += matrix[r, i, j] * q[j]
 
 
 @njit(fastmath=FASTMATH)
-def _samples_between(start, stride, count, first, last):
-    """About which samples stand between planes: one more at both ends, for each is to be asked again."""
+def _spread(c, start, stride, profile, count, q, first, last, spline, part):
+    """Add w q . grad of each basis function along one ray, or w q of each, for the samples between two planes."""
+    neighbours = len(spline)
     low, high = 0, count
+    # about which samples: one more at both ends, for each is asked again below
     if abs(stride[2]) * count > 1e-3:
         a, b = (first - start[2]) / stride[2], (last - start[2]) / stride[2]
         if a > b:
             a, b = b, a
         if b < -1 or a > count:
-            return 0, 0
+            return
         low = max(0, int(a) - 1)
         if b < count - 2:
             high = int(b) + 2
-    return low, high
-
-
-def _spread_slope(c, start, stride, profile, count, spline, q, first, last, matrix):
-    """Add w q . grad of each basis function along one ray, for the samples between planes `first` and `last`."""
-    neighbours = len(spline)
-    low, high = _samples_between(start, stride, count, first, last)
     for m in range(low, high):
         z = start[2] + m * stride[2]
         iz = int(np.floor(z))
@@ -174,75 +153,29 @@ def _spread_slope(c, start, stride, profile, count, spline, q, first, last, matr
         ax, ay, az = w * q[0], w * q[1], w * q[2]
         for k in range(neighbours):
             for j in range(neighbours):
-                slope = ax * by[j] * bz[k]
-                along = ay * sy[j] * bz[k] + az * by[j] * sz[k]
+                if len(part) == 1:
+                    slope, along = 0.0, ax * by[j] * bz[k]
+                else:
+                    slope = ax * by[j] * bz[k]
+                    along = ay * sy[j] * bz[k] + az * by[j] * sz[k]
                 for i in range(neighbours):
                     c[iz + k, iy + j, ix + i] += slope * sx[i] + along * bx[i]
 
 
-def _spread_value(c, start, stride, profile, count, spline, q, first, last, matrix):
-    """Add w q of each basis function along one ray, for the samples between planes `first` and `last`."""
-    neighbours = len(spline)
-    low, high = _samples_between(start, stride, count, first, last)
-    for m in range(low, high):
-        z = start[2] + m * stride[2]
-        iz = int(np.floor(z))
-        if iz < first or iz >= last:
-            continue
-        x, y = start[0] + m * stride[0], start[1] + m * stride[1]
-        ix, iy = int(np.floor(x)), int(np.floor(y))
-        bx, by, bz = _weights(x - ix, spline)[0], _weights(y - iy, spline)[0], _weights(z - iz, spline)[0]
-        w = _weight(profile, m) * q[0]
-        for k in range(neighbours):
-            for j in range(neighbours):
-                along = w * by[j] * bz[k]
-                for i in range(neighbours):
-                    c[iz + k, iy + j, ix + i] += along * bx[i]
-
-
-def _spread(c, start, stride, profile, count, spline, q, first, last, matrix):
-    """Add the adjoint of `_see` for one ray, for the samples between planes `first` and `last`."""
-    raise NotImplementedError("compiled only")
-
-
-@overload(_spread, jit_options={"fastmath": FASTMATH})
-def _compiled_spread(c, start, stride, profile, count, spline, q, first, last, matrix):
-    return _spread_slope if matrix.ndim == 2 else _spread_value
-
-
-def _gather(matrix, seen, q):
-    """Write what the matrix of one ray, transposed, makes of what it sees."""
-    raise NotImplementedError("compiled only")
-
-
-@overload(_gather, jit_options={"fastmath": FASTMATH})
-def _compiled_gather(matrix, seen, q):
-    def slope(matrix, seen, q):
-        for i in range(3):
-            q[i] = 0.0
-            for j in range(seen.shape[0]):
-                q[i] += matrix[j, i] * seen[j]
-
-    def value(matrix, seen, q):
-        q[0] = 0.0
-        for j in range(seen.shape[0]):
-            q[0] += matrix[j] * seen[j]
-
-    return slope if matrix.ndim == 2 else value
-
-
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _adjoint(c, start, stride, profile, count, matrix, seen, spline):
+def _adjoint(c, start, stride, profile, count, matrix, seen, spline, part):
     # each slab of planes is one thread's; every second one first, then the others, so that no two write to the same
     # voxel: one array is enough, and the sum is the same however many threads there are
     rays = count.shape[0]
     blocks = (rays + BLOCK - 1) // BLOCK
     low, high = np.empty(blocks), np.empty(blocks)
-    q = np.empty((rays, 3))
+    q = np.zeros((rays, 3))
     for b in prange(blocks):
         below, above = 1e30, -1e30
         for r in range(b * BLOCK, min(rays, (b + 1) * BLOCK)):
-            _gather(matrix[r], seen[r], q[r])
+            for i in range(seen.shape[1]):
+                for j in range(len(part)):
+                    q[r, j] += matrix[r, i, j] * seen[r, i]
             end = start[r, 2] + stride[r, 2] * count[r]
             below, above = min(below, start[r, 2], end), max(above, start[r, 2], end)
         low[b], high[b] = below, above
@@ -254,6 +187,4 @@ def _adjoint(c, start, stride, profile, count, matrix, seen, spline):
                 if high[b] < first - 1 or low[b] > first + SLAB + 1:
                     continue
                 for r in range(b * BLOCK, min(rays, (b + 1) * BLOCK)):
-                    _spread(
-                        c, start[r], stride[r], profile[r], count[r], spline, q[r], first, first + SLAB, matrix[r]
-                    )
+                    _spread(c, start[r], stride[r], profile[r], count[r], q[r], first, first + SLAB, spline, part)

@@ -5,7 +5,7 @@ See kernels_numba.py for the same on all cores of a CPU. Along ray r the samples
     x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
 
 with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3)
-takes sum_m w_m grad f(x_m), a matrix (n, c) takes sum_m w_m f(x_m).
+takes sum_m w_m grad f(x_m), a matrix (n, c, 1) takes sum_m w_m f(x_m).
 """
 
 from __future__ import annotations
@@ -33,22 +33,19 @@ def forward(
     flat, shape = padded.reshape(-1), padded.shape
     for part, (start, stride, profile, count) in _chunks(path):
         index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, profile, count)
-        f, gx, gy, gz = (torch.zeros_like(w) for _ in range(4))
+        gx, gy, gz = (torch.zeros_like(w) for _ in range(3))
         for k in range(degree + 1):
             for j in range(degree + 1):
                 line = flat[_line(index, k, j, shape, degree)]
                 along = (line * bx).sum(-1)
-                if matrix.ndim == 2:
-                    f += along * by[..., j] * bz[..., k]
+                if matrix.shape[-1] == 1:
+                    gx += along * by[..., j] * bz[..., k]
                     continue
                 gx += (line * sx).sum(-1) * by[..., j] * bz[..., k]
                 gy += along * sy[..., j] * bz[..., k]
                 gz += along * by[..., j] * sz[..., k]
-        if matrix.ndim == 2:
-            seen[part] += matrix[part] * (w * f).sum(-1, keepdim=True)
-        else:
-            q = torch.stack([(w * g).sum(-1) for g in (gx, gy, gz)], dim=-1)
-            seen[part] += torch.einsum("nij,nj->ni", matrix[part], q)
+        q = torch.stack([(w * g).sum(-1) for g in (gx, gy, gz)[: matrix.shape[-1]]], dim=-1)
+        seen[part] += torch.einsum("nij,nj->ni", matrix[part], q)
 
 
 def adjoint(
@@ -58,13 +55,14 @@ def adjoint(
     flat, shape = padded.reshape(-1), padded.shape
     for part, (start, stride, profile, count) in _chunks(path):
         index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, profile, count)
-        q = torch.einsum("ni...,ni->n...", matrix[part], seen[part])
+        q = torch.einsum("nij,ni->nj", matrix[part], seen[part])
         for k in range(degree + 1):
             for j in range(degree + 1):
-                if matrix.ndim == 2:
-                    share = (w * q[:, None] * by[..., j] * bz[..., k])[..., None] * bx
+                ax, *others = (w * a[:, None] for a in q.unbind(-1))
+                if not others:
+                    share = (ax * by[..., j] * bz[..., k])[..., None] * bx
                 else:
-                    ax, ay, az = (w * a[:, None] for a in q.unbind(-1))
+                    ay, az = others
                     along = ay * sy[..., j] * bz[..., k] + az * by[..., j] * sz[..., k]
                     share = (ax * by[..., j] * bz[..., k])[..., None] * sx + along[..., None] * bx
                 flat.index_add_(0, _line(index, k, j, shape, degree).reshape(-1), share.reshape(-1))

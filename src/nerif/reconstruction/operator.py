@@ -117,7 +117,7 @@ class VoxelOperator:
             profile = _tabulated(model, rays, s, interval, int(count.max()))
         kept = [a.to(self.device, self.dtype).contiguous() for a in (start, stride, profile)]
         matrices = [] if weights.slope is None else [weights.slope / spacing]
-        matrices += [] if weights.value is None else [weights.value]
+        matrices += [] if weights.value is None else [weights.value[..., None]]
         path = (*kept, count.to(self.device, torch.int32))
         return path, [a.to(self.device, self.dtype).contiguous() for a in matrices]
 
