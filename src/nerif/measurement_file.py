@@ -6,6 +6,7 @@ technique's. The rest is known of the rig.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
 __all__ = [
-    "ABOUT_VIEWS", "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "known_conventions", "map_names", "to_dataset",
-    "variables",
+    "ABOUT_VIEWS", "CONVENTIONS", "PLAIN", "check_about_views", "encoding", "from_dataset", "known_conventions",
+    "map_names", "to_dataset", "variables",
 ]  # fmt: skip
 
 PLAIN, CONVENTIONS = "BOST-1.0", "BOST-1.1"
@@ -60,7 +61,7 @@ ABOUT_VIEWS = {
 
 NEEDED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
-SIZES = {"component": 2, "i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2, "parameter": 6}
+SIZES = {"i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2, "parameter": 6}
 MOST_PIXELS = 1 << 32
 """Of all views together; a damaged file may claim any number."""
 
@@ -69,9 +70,14 @@ def variables() -> dict[str, tuple[tuple[str, ...], str]]:
     """Return dimensions and unit of every variable that a file may have."""
     measured: dict[str, tuple[tuple[str, ...], str]] = {}
     for kind in TECHNIQUES.values():
-        dimensions = (*PIXELS, "component") if len(kind.channels) > 1 else PIXELS
+        dimensions = PIXELS if len(kind.channels) == 1 else (*PIXELS, _component(len(kind.channels)))
         measured |= {kind.measured: (dimensions, kind.unit), kind.sigma: (dimensions, kind.unit)}
     return {**measured, **RIG, **ABOUT_VIEWS}
+
+
+def _component(channels: int) -> str:
+    """The dimension that so many channels stand along: those of one size share one."""
+    return "component" if channels == len(COMPONENTS) else f"component_{channels}"
 
 
 def map_names() -> tuple[str, ...]:
@@ -82,6 +88,22 @@ def map_names() -> tuple[str, ...]:
 def known_conventions(found: object) -> bool:
     """Return whether an attribute Conventions is that of a measurement."""
     return isinstance(found, str) and found in (PLAIN, CONVENTIONS)
+
+
+def check_about_views(given: Mapping[str, Tensor], views: int) -> None:
+    """Refuse what is not known of views, and what is not of as many views as there are.
+
+    Raises
+    ------
+    InputError
+        Naming it.
+    """
+    for name, value in given.items():
+        if name not in ABOUT_VIEWS:
+            raise InputError(f"about_views: expected names out of {', '.join(ABOUT_VIEWS)}, got '{name}'")
+        whole = tuple(SIZES.get(dimension, views) for dimension in ABOUT_VIEWS[name][0])
+        if tuple(value.shape) != whole:
+            raise InputError(f"about_views: expected {name} of shape {whole}, got {tuple(value.shape)}")
 
 
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
@@ -117,8 +139,8 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         nowhere = torch.full((3,), torch.nan, dtype=torch.float64)
         data["background_normal"] = stack([nowhere if c.background is None else c.background.normal for c in cameras])
         data["background_offset"] = np.array([np.nan if c.background is None else c.background.offset for c in cameras])
-    maps = {"displacement": measurement.displacement, "sigma": measurement.sigma, **measurement.maps}
-    for name, value in {**maps, "valid": measurement.valid, "flow_mask": measurement.flow_mask}.items():
+    masks = {"valid": measurement.valid, "flow_mask": measurement.flow_mask}
+    for name, value in {**measurement.measured_maps, **masks}.items():
         if value is not None:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
     data |= {name: value.numpy() for name, value in measurement.about_views.items()}
@@ -187,6 +209,7 @@ def _check_variables(dataset: xr.Dataset) -> None:
     """Refuse missing variables and wrong dimensions, sizes, types and units, by name."""
     kinds = _techniques(dataset)
     needed = [*(kind.measured for kind in kinds), *NEEDED, *(BACKGROUND if any(k.background for k in kinds) else ())]
+    sizes = SIZES | {_component(n): n for n in (len(kind.channels) for kind in TECHNIQUES.values()) if n > 1}
     for name, (dimensions, unit) in variables().items():
         if name not in dataset:
             if name not in needed:
@@ -197,7 +220,7 @@ def _check_variables(dataset: xr.Dataset) -> None:
             got = tuple(map(str, variable.dims))
             raise InputError(f"variable '{name}': expected dimensions {dimensions}, got {got}")
         for dimension in dimensions:
-            size, given_size = SIZES.get(dimension), variable.sizes[dimension]
+            size, given_size = sizes.get(dimension), variable.sizes[dimension]
             if given_size == 0 or (size is not None and given_size != size):
                 raise InputError(f"variable '{name}': expected {size or 'some'} along {dimension}, got {given_size}")
         given = variable.attrs.get("units", unit)

@@ -25,6 +25,7 @@ from nerif.prediction import predict, reproject
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.target import Target
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.simulation import Simulation, simulate
@@ -80,10 +81,10 @@ def test_a_technique_is_one_file():
 
 @dataclass(frozen=True)
 class Knife(ForwardModel):
-    """A toy: deflection across the vertical, less and less the deeper, and a little of the field itself."""
+    """A toy of two edges and none: deflections, less and less the deeper, and a little of the field itself."""
 
     name, measured, sigma = "knife", "grey", "grey_sigma"
-    channels = ("",)
+    channels = ("across", "along", "open")
     unit = "1"
     limits = (1e-9, 1e9)
     quantity = "index_excess"
@@ -96,8 +97,9 @@ class Knife(ForwardModel):
         up = rays.direction.new_tensor([[0.0, 0.0, 1.0]]).expand_as(rays.direction)
         side = torch.linalg.cross(rays.direction, up)
         depth = (s - rays.near[:, None]) / 40
-        value = rays.near.new_full((len(rays), 1), 300.0)
-        return Weights(torch.exp(-depth) * step, value=value, slope=3e3 * side[:, None])
+        value = rays.near.new_tensor([300.0, 100.0, 200.0]).expand(len(rays), 3)
+        slope = 3e3 * torch.stack([side, torch.linalg.cross(side, rays.direction), 0 * side], dim=1)
+        return Weights(torch.exp(-depth) * step, value=value, slope=slope)
 
 
 def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp_path):
@@ -109,6 +111,7 @@ def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp
     back = Measurement.read(tmp_path / "knife.nc")
     assert back.techniques == (Knife,)
     assert torch.equal(back.maps["grey"].nan_to_num(), seen.maps["grey"].nan_to_num())
+    assert seen.maps["grey"].shape == (5, 18, 23, 3)
     clean = predict(field, cameras, BOX, 1.00027, technique=Knife)
     noise = (clean.maps["grey"] - seen.maps["grey"])[seen.sees_box] / seen.maps["grey_sigma"][seen.sees_box]
     assert 0.9 < float(noise.std()) < 1.1
@@ -307,6 +310,31 @@ def test_measurements_that_cannot_be(measured):
         Simulation(technique=("schlieren",))
     with pytest.raises(InputError, match="counts: expected a technique that counts quanta"):
         Simulation(technique=("interferometry",), counts=100.0, truth_voxels=4)(RING.cameras())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_maps_and_notes_on_views_of_other_shapes_are_refused(measured):
+    m = measured["absorption"]
+    with pytest.raises(InputError, match=r"absorbance: expected \(view, row, column\) = .* got \(5, 18, 23, 1\)"):
+        replace(m, maps={"absorbance": m.maps["absorbance"][..., None]})
+    with pytest.raises(InputError, match="about_views: expected names out of aperture_diameter"):
+        replace(m, about_views={"aperture": torch.ones(5)})
+    with pytest.raises(InputError, match=r"about_views: expected pose_sigma of shape \(5, 6\), got \(5,\)"):
+        replace(m, about_views={"pose_sigma": torch.ones(5)})
+
+
+def test_a_technique_by_which_nothing_was_measured_is_none(balls):
+    """As when the only interferometer's view is held out, or a film's instant has no fringes."""
+    kinds = [Deflection, Interferometry]
+    both = simulate(Scaled(balls, 1e-3), RING.cameras(), BOX, 1.00027, 0.1, 1, 30, 532.0, techniques=kinds)
+    fringes = both.maps["fringes"].clone()
+    fringes[1:] = torch.nan
+    one = replace(both, maps={**both.maps, "fringes": fringes})
+    assert one.techniques == (Deflection, Interferometry)
+    rest = one.without([one.names[0]])
+    assert rest.techniques == (Deflection,)
+    assert len(Target.of(rest).parts) == len(Target.of(rest, edge=2).parts) == 1
+    assert rest.observed({"deflection": rest.displacements}).techniques == (Deflection,)
 
 
 def test_nothing_measured_is_refused():
