@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -237,14 +238,29 @@ def test_bounds_cannot_be_left(measured):
 def test_intensities_are_fitted_where_little_light_is_left(balls):
     dense = Scaled(balls, 12.0)  # absorbance up to some 6
     m = simulate(dense, RING.cameras(), BOX, 1.00027, 0.02, 1, 60, techniques=[Absorption])
-    (model,) = forward_models(m.techniques, m, "intensity")
-    values, sigma = model.reading(torch.tensor([[0.0], [3.0]]), torch.tensor([[0.1], [0.1]]))
-    assert values.flatten().tolist() == pytest.approx([1, 0.0497871], rel=1e-5)
-    assert sigma is not None
-    assert torch.allclose(model.read(torch.tensor([[0.0], [3.0]])), values)
-    assert not replace(NETWORK, max_steps=20, model="intensity")(m).outcome.failed
+    integral, noise = torch.tensor([[0.0], [3.0]]).double(), torch.full((2, 1), 0.1).double()
+    for name, power in (("intensity", 1.0), ("poisson", 0.5)):
+        (model,) = forward_models(m.techniques, m, name)
+        values, sigma = model.reading(integral, noise)
+        assert sigma is not None
+        assert values.flatten().tolist() == pytest.approx([1, 0.0497871**power], rel=1e-5)
+        nearby = model.read(integral + 1e-3 * noise)
+        assert torch.allclose((values - nearby) / 1e-3, sigma, rtol=1e-3)
+        assert torch.equal(model.read(integral), values)
+        result = replace(NETWORK, max_steps=20, model=name)(m)
+        assert not result.outcome.failed
     with pytest.raises(InputError, match="model: expected a linear one, got 'intensity'"):
         Tikhonov(model="intensity")(m)
+
+
+def test_bins_of_intensities_weigh_by_their_pixels_where_sigma_is_not_known(measured):
+    m = measured["absorption"]
+    target = Target.of(replace(m, maps={"absorbance": 20 * m.maps["absorbance"]}), edge=2, model="intensity")
+    (part,) = target.parts
+    weights = part.inverse_scale / part.inverse_scale.max()
+    whole = (weights - 1).abs() < 1e-6
+    assert float(whole.float().mean()) > 0.5  # most bins have all their pixels, whatever they saw
+    assert float(part.measured[whole].min()) < 0.2 < 0.9 < float(part.measured[whole].max())
 
 
 def test_gains_of_cameras_are_found(measured):
@@ -269,6 +285,29 @@ def test_absorbance_of_counts_and_its_sigma():
     assert float(found.std()) == pytest.approx(float(sigma.mean()), rel=0.05)
 
 
+def test_where_no_quantum_is_left_the_absorbance_is_large():
+    passed = torch.tensor([0.0, -0.3, 1.0, 50.0]).double().numpy()
+    found, sigma = absorbance(passed, 0 * passed + 100, reference_pictures=float("inf"))
+    assert found.tolist() == pytest.approx([math.log(200), math.log(200), math.log(100), math.log(2)])
+    assert sigma.tolist() == pytest.approx([2, 2, 1, 50**-0.5])
+    found, _ = absorbance(passed, torch.tensor([0.0, 100, 100, 100]).numpy())
+    assert math.isnan(found[0])
+    unseen = torch.tensor([[math.nan], [2.0]])
+    for kind in (Absorption, Emission):
+        values, _ = kind.detected(unseen, 1e4, torch.Generator().manual_seed(0))
+        assert values.isnan().flatten().tolist() == [True, False]
+
+
+def test_noise_alone_is_not_an_offset(measured):
+    """A member of an ensemble has noise added to that of the measurement, and no sigma."""
+    noisy = measured["emission"].maps["radiance"]
+    noise = torch.randn(noisy.shape, generator=torch.Generator().manual_seed(2))
+    noisy = noisy + 0.06 * noisy.nan_to_num().max() * noise
+    replace(measured["emission"], maps={"radiance": noisy})
+    with pytest.raises(InputError, match="radiance: expected 0 or more"):
+        replace(measured["emission"], maps={"radiance": noisy - 0.5 * noisy.nan_to_num().max()})
+
+
 def test_counts_that_cannot_be():
     bright, dim = torch.full((50,), 100.0).numpy(), torch.full((50,), 30.0).numpy()
     with pytest.raises(InputError, match="intensity: expected at most the reference"):
@@ -277,12 +316,14 @@ def test_counts_that_cannot_be():
         absorbance(dim - 90, bright)
     with pytest.raises(InputError, match="reference: expected pictures of shape"):
         absorbance(dim[:3], bright)
+    with pytest.raises(InputError, match="dark: expected pictures of shape"):
+        absorbance(dim, bright, dim[:3])
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_measurements_that_cannot_be(measured):
     m = measured["absorption"]
-    with pytest.raises(InputError, match="subtract the offset that pixels beside the medium show"):
+    with pytest.raises(InputError, match="subtract the offset of pixels beside the medium"):
         replace(m, maps={"absorbance": m.maps["absorbance"] - 0.6})
     with pytest.raises(InputError, match="radiance: expected 0 or more"):
         replace(measured["emission"], maps={"radiance": -measured["emission"].maps["radiance"]})
@@ -304,7 +345,7 @@ def test_measurements_that_cannot_be(measured):
         replace(fringes, maps={"fringes": torch.remainder(whole, 1)})
     with pytest.raises(InputError, match="mlem and mart take line integrals of what is never negative"):
         MLEM(voxels=8, device="cpu")(measured["deflection"])
-    with pytest.raises(InputError, match="model: expected one of auto, absorbance, intensity for absorption"):
+    with pytest.raises(InputError, match="model: expected one of auto, absorbance, intensity, poisson for absorption"):
         NeRIF(model="curved")(m)
     with pytest.raises(InputError, match="technique: expected one of deflection"):
         Simulation(technique=("schlieren",))
