@@ -104,10 +104,13 @@ def test_gains_that_were_fitted_stay_with_the_result(files, tmp_path):
     after = out.metrics()["views"]
     assert [v["rms"] for v in after] == pytest.approx([v["rms"] for v in before], rel=1e-5)
     torch.testing.assert_close(out.reprojection().measurement.maps["radiance"], views.measurement.maps["radiance"])
-    blind = ResultDirectory(tmp_path / "r")
-    blind.write_settings({k: v for k, v in out.settings().items() if k != "about"})
-    evaluate(blind.path, measurement=uneven)
-    assert blind.metrics()["views"][0]["rms"] > 1.5 * before[0]["rms"]
+    settings = {k: v for k, v in out.settings().items() if k != "about"}
+    out.write_settings(settings, {"gains": {"0deg": 0}})
+    with pytest.raises(InputError, match="expected a number above 0 for view '0deg', got 0"):
+        evaluate(out.path, measurement=uneven)
+    out.write_settings(settings)  # forgotten, the views are not what the field was fitted to
+    evaluate(out.path, measurement=uneven)
+    assert out.metrics()["views"][0]["rms"] > 1.5 * before[0]["rms"]
 
 
 @pytest.mark.parametrize("left", [0.0, 1e-3])

@@ -7,6 +7,7 @@ One iteration of MLEM for the field on coarse voxels and the best gains for it f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -73,8 +74,18 @@ def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> dict[str, float
 
 
 def gains_of(run: Mapping[str, Any]) -> dict[str, float]:
-    """Return the gains of views that run.toml keeps, none where none were fitted."""
-    return {name: float(gain) for name, gain in run.get("about", {}).get("gains", {}).items()}
+    """Return the gains of views that run.toml keeps, none where none were fitted.
+
+    Raises
+    ------
+    InputError
+        If one is no number above 0.
+    """
+    found = {str(name): gain for name, gain in run.get("about", {}).get("gains", {}).items()}
+    for name, gain in found.items():
+        if not isinstance(gain, int | float) or not 0 < gain < math.inf:
+            raise InputError(f"gains of run.toml: expected a number above 0 for view '{name}', got {gain!r}")
+    return found
 
 
 def with_gains(measurement: Measurement, gains: Mapping[str, float]) -> Measurement:

@@ -145,12 +145,13 @@ def reproject(
     box, maps, accuracies, done = measurement.box, {}, [], 0
     many = _work(field, measurement.cameras) > EXACT_WORK[torch.device(device).type]
     voxels = on_voxels(field, box, device) if many else None
+    total = sum(len(_seeing(kind, measurement.cameras)) for kind in measurement.techniques)
     for observation in measurement.observations:
         kind = observation.technique
         projector = PathIntegral(forward_model(kind, measurement, model), SAMPLES)
         sampled = None if voxels is None else SampledViews(field, voxels, box, projector, device)
         predicted = torch.full_like(observation.values, float("nan"))
-        views = [(i, kind.seen_by(c)) for i, c in enumerate(measurement.cameras) if c.background or not kind.background]
+        views = [(i, kind.seen_by(measurement.cameras[i])) for i in _seeing(kind, measurement.cameras)]
         for i, camera in views:
             height, width = camera.image_size
             if sampled:
@@ -159,13 +160,18 @@ def reproject(
             else:
                 predicted[i, :height, :width] = predict_view(field, camera, projector, box, device)
             done += 1
-            on_view(done, len(views) * len(measurement.observations))
+            on_view(done, total)
         maps[kind.name] = predicted
         found = Accuracy(kind)
         if sampled:
             found = sampled.accuracy(kind, [camera for _, camera in views], predicted[[i for i, _ in views]])
         accuracies.append(found)
     return Reprojection(measurement, maps, tuple(held_out), tuple(accuracies))
+
+
+def _seeing(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
+    """Which cameras can see by a technique: those with a background, where it needs one."""
+    return [i for i, camera in enumerate(cameras) if camera.background or not kind.background]
 
 
 def _work(field: Field, cameras: Sequence[Camera]) -> float:

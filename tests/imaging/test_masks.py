@@ -164,6 +164,8 @@ def test_of_two_techniques_either_shows_the_flow(four):
     assert bool(combined[0, 4:20, 4:20].all())
     assert not bool(alone[0, 4:12, 4:12].any())
     assert torch.equal(combined[1:], alone[1:])
+    with pytest.raises(InputError, match="sigma: expected none for displacement and fringes"):
+        with_flow_masks(replace(four, maps=maps, wavelength_nm=532.0), sigma=0.1)
 
 
 def test_drawn_masks_are_read(tmp_path):

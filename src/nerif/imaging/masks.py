@@ -131,9 +131,12 @@ def with_flow_masks(
     Raises
     ------
     InputError
-        If there is no noise to measure by, or a mask holds no flow.
+        If there is no noise to measure by, or one for several techniques, or a mask holds no flow.
     """
     drawn = drawn or {}
+    if sigma is not None and len(measurement.observations) > 1:
+        names = " and ".join(o.technique.measured for o in measurement.observations)
+        raise InputError(f"sigma: expected none for {names}, which have units and noise of their own, got {sigma:g}")
     seen = [(o, measurement.usable_for(o)) for o in measurement.observations]
     masks = torch.zeros(measurement.shape, dtype=torch.bool)
     for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
