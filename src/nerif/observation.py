@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.conventions import InputError, unit_shown
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES, forward_model
 
@@ -61,7 +61,7 @@ class Observation:
         """What pictures of the views show."""
         kind = self.technique
         names = " and ".join(name for name in kind.channels if name)
-        unit = "" if kind.unit == "1" else f", in {kind.unit}"
+        unit = f", in {kind.unit}" if unit_shown(kind.unit) else ""
         return f"{kind.measured.capitalize()} {names}".rstrip() + f" of each view{unit}"
 
     def alone(self, measurement: Measurement) -> Measurement:

@@ -265,8 +265,9 @@ def test_bins_of_intensities_weigh_by_their_pixels_where_sigma_is_not_known(meas
 
 def test_gains_of_cameras_are_found(measured):
     even, gains = measured["emission"], torch.tensor([1.0, 1.3, 0.8, 1.1, 0.9])
-    found = fit_gains(with_gains(even, 1 / gains))
-    assert torch.allclose(found, gains / gains.log().mean().exp(), rtol=0.03)
+    found = fit_gains(with_gains(even, dict(zip(even.names, (1 / gains).tolist(), strict=True))))
+    assert [*found] == [*even.names]
+    assert torch.allclose(torch.tensor([*found.values()]), gains / gains.log().mean().exp(), rtol=0.03)
     with pytest.raises(InputError, match="fit_gains: expected emission"):
         fit_gains(measured["absorption"])
     with pytest.raises(InputError, match="fit_gains: expected two views or more"):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from nerif.atomic import atomic
+from nerif.conventions import with_unit
 from nerif.drawing import (
     DIVERGING,
     add_colour_bar,
@@ -119,7 +120,7 @@ def isosurface(volume: Volume, width: float) -> Figure:
     level = default_level(volume)
     draw_isosurface(axes, volume, level)
     name, unit = label_of(volume.quantity).removesuffix("]").split(" [")
-    figure.suptitle(f"{name} = {level:.4g} {'' if unit == '1' else unit}".rstrip(), y=0.97)
+    figure.suptitle(f"{name} = {with_unit(f'{level:.4g}', unit)}", y=0.97)
     return figure
 
 
@@ -150,7 +151,7 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
                 add_colour_bar(list(line), label)
             else:
                 add_colour_bar(list(line[:2]), label)
-                add_colour_bar([line[2]], "difference [1]")
+                add_colour_bar([line[2]], f"difference [{o.technique.unit}]")
     held = ", held out" if measurement.names[i] in reprojection.held_out else ""
     figure.suptitle(f"view {measurement.names[i]}{held}", parse_math=False)
     return figure
