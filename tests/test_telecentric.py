@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from nerif.cli import main
 from nerif.consistency import binned
 from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
+from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral
 from nerif.physics.ray_tracing import background_points
@@ -185,3 +187,12 @@ def test_cameras_are_drawn_before_what_they_look_at(kind, background):
     axes = Figure().add_subplot(projection="3d")
     names = {text.get_text() for text in draw_rig(axes, cameras).texts}
     assert {c.name for c in cameras} < names
+
+
+def test_a_calibration_without_backgrounds_is_a_rig_that_is_drawn(tmp_path, capsys):
+    cameras = [CalibratedCamera.from_camera(replace(through_the_origin(c), background=None)) for c in CAMERAS]
+    write_cameras(tmp_path / "c.toml", cameras)
+    assert [c.camera().background for c in read_cameras(tmp_path / "c.toml")] == [None] * len(CAMERAS)
+    assert main(["calibrate", str(tmp_path / "c.toml"), "--check", "-o", str(tmp_path / "drawn.toml")]) == 0
+    assert "not drawn" not in capsys.readouterr().out
+    assert (tmp_path / "drawn.rig.png").stat().st_size > 20_000
