@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -104,6 +105,37 @@ def test_the_file_keeps_the_projection_of_each_view(seen, tmp_path):
     with pytest.raises(InputError, match="variable 'projection': expected one name a view, got dimensions"):
         Measurement.from_dataset(dataset)
     assert dataset.attrs["Conventions"] == "BOST-1.1"  # a reader of BOST-1.0 would take them for pinholes
+
+
+@pytest.mark.parametrize("characters", [True, False])
+def test_names_in_characters_or_of_fixed_length_are_read(seen, tmp_path, characters):
+    dataset = seen.to_dataset()
+    dataset["projection"] = (("view",), np.array([b"telecentric"] * len(CAMERAS)))
+    dataset["view"] = (("view",), np.array([c.name.encode() for c in CAMERAS]))
+    dataset.to_netcdf(tmp_path / "m.nc", engine="h5netcdf")  # as arrays of characters
+    if not characters:
+        with h5py.File(tmp_path / "m.nc", "r+") as file:
+            del file["projection"]
+            file["projection"] = np.array([b"telecentric   "] * len(CAMERAS), dtype="S14")
+            file["projection"].dims[0].attach_scale(file["translation"].dims[0][0])
+    again = Measurement.read(tmp_path / "m.nc")
+    assert [c.projection for c in again.cameras] == [TELECENTRIC] * len(CAMERAS)
+    assert again.names == tuple(c.name for c in CAMERAS)
+
+
+def test_scales_are_in_pixels_a_millimetre(seen):
+    dataset = seen.to_dataset()
+    assert dataset["intrinsics"].attrs["units"] == "px mm-1"
+    for unit in ("px", "px/mm"):
+        dataset["intrinsics"].attrs["units"] = unit
+        assert Measurement.from_dataset(dataset).cameras[0].projection == TELECENTRIC
+    dataset["intrinsics"].attrs["units"] = "px/m"
+    with pytest.raises(InputError, match="'intrinsics': expected units 'px or px mm-1', got 'px/m'"):
+        Measurement.from_dataset(dataset)
+    pinholes = dataset.drop_vars("projection")
+    pinholes["intrinsics"].attrs["units"] = "px/mm"
+    with pytest.raises(InputError, match="'intrinsics': expected units 'px', got 'px/mm'"):
+        Measurement.from_dataset(pinholes)
 
 
 def test_a_field_comes_back_and_is_seen_again(seen, ball, box):
