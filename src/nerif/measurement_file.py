@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
-from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, projection_named
-from nerif.netcdf import values
+from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, Projection, projection_named
+from nerif.netcdf import reading, values
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.registry import TECHNIQUES, technique
@@ -48,6 +48,9 @@ RIG = {
     "image_size": (("view", "side"), "px"),
 }
 """Dimensions and unit of what is known of the rig."""
+
+SPELLED = {"px/mm": "px mm-1"}
+"""How units are written that may be read in either spelling."""
 
 MASKS = ("valid", "flow_mask")
 
@@ -145,6 +148,9 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
     data |= {name: value.numpy() for name, value in measurement.about_views.items()}
     dataset = xr.Dataset({k: (known[k][0], v, {"units": known[k][1]}) for k, v in data.items()})
+    scales = {c.projection.unit for c in cameras}
+    if len(scales) == 1:
+        dataset["intrinsics"].attrs["units"] = _spelled(scales.pop())
     dataset = dataset.assign_coords(view=list(measurement.names))
     if measurement.displacement is not None:
         dataset = dataset.assign_coords(component=list(COMPONENTS))
@@ -223,9 +229,12 @@ def _check_variables(dataset: xr.Dataset) -> None:
             size, given_size = sizes.get(dimension), variable.sizes[dimension]
             if given_size == 0 or (size is not None and given_size != size):
                 raise InputError(f"variable '{name}': expected {size or 'some'} along {dimension}, got {given_size}")
-        given = variable.attrs.get("units", unit)
-        if not (isinstance(given, str) and given.replace(",", " ").split() == unit.split()):
-            raise InputError(f"variable '{name}': expected units '{unit}', got '{given}'")
+        given, units = variable.attrs.get("units", unit), [unit]
+        if name == "intrinsics":
+            units = list(dict.fromkeys([unit, *(_spelled(p.unit) for p in _projections(dataset))]))
+        words = " ".join(given.replace(",", " ").split()) if isinstance(given, str) else ""
+        if _spelled(words) not in units:
+            raise InputError(f"variable '{name}': expected units '{' or '.join(units)}', got '{given}'")
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
         shape = f"{views} x {rows} x {columns}"
@@ -265,19 +274,39 @@ def _box(dataset: xr.Dataset) -> Box:
     return Box(tuple(lower), tuple(upper))
 
 
+def _spelled(unit: str) -> str:
+    return SPELLED.get(unit, unit)
+
+
+def _texts(variable: xr.DataArray) -> list[str]:
+    """Texts of any kind: of variable or fixed length, in characters or bytes, padded or not."""
+    with reading(f"variable '{variable.name}': cannot be read; is the file damaged?"):
+        found = variable.values.ravel()
+    return [(v.decode(errors="replace") if isinstance(v, bytes) else str(v)).strip(" \0") for v in found]
+
+
+def _names(dataset: xr.Dataset) -> list[str]:
+    return _texts(dataset["view"]) if "view" in dataset.coords else [str(i) for i in range(dataset.sizes["view"])]
+
+
+def _projections(dataset: xr.Dataset) -> list[Projection]:
+    names = _names(dataset)
+    if "projection" not in dataset:
+        return [PERSPECTIVE] * len(names)
+    found = dataset["projection"]
+    if found.dims != ("view",):
+        raise InputError(f"variable 'projection': expected one name a view, got dimensions {found.dims}")
+    return [projection_named(p, f"projection of view '{n}'") for n, p in zip(names, _texts(found), strict=True)]
+
+
 def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
-    views = dataset.sizes["view"]
-    names = [str(n) for n in dataset["view"].values] if "view" in dataset.coords else [str(i) for i in range(views)]
+    views, names, projections = dataset.sizes["view"], _names(dataset), _projections(dataset)
     whole = torch.tensor([dataset.sizes["row"], dataset.sizes["column"]], dtype=torch.float64).expand(views, 2)
     sizes = _array(dataset, "image_size") if "image_size" in dataset else whole
     distortion = _array(dataset, "distortion") if "distortion" in dataset else torch.zeros(views, 5).double()
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
     nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64)
     normals, offsets = (_array(dataset, n, True) if n in dataset else nowhere for n in BACKGROUND)
-    kinds = dataset["projection"].values if "projection" in dataset else np.array([PERSPECTIVE.name] * views)
-    if kinds.shape != (views,):
-        got = dataset["projection"].dims
-        raise InputError(f"variable 'projection': expected one name a view, got dimensions {got}")
     cameras = []
     for i, name in enumerate(names):
         height, width = sizes[i].tolist()
@@ -290,7 +319,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 background=_plane(normals[i], offsets[i], name),
                 distortion=distortion[i],
                 name=name,
-                projection=projection_named(str(kinds[i]), f"projection of view '{name}'"),
+                projection=projections[i],
             )
         )
     return tuple(cameras)

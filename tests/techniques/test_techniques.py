@@ -379,6 +379,41 @@ def test_a_technique_by_which_nothing_was_measured_is_none(balls):
     assert rest.observed({"deflection": rest.displacements}).techniques == (Deflection,)
 
 
+def hill(shape: tuple[int, int], fringes: float, width: float, steepness: float = 1.0) -> Tensor:
+    """A phase of so many fringes, as wide as a share of the picture's shorter side."""
+    y, x = (torch.arange(n) - (n - 1) / 2 for n in shape)
+    radius = torch.sqrt(y[:, None] ** 2 + x**2) / (width * max(min(shape), 40))
+    return fringes * torch.exp(-(radius ** (2 * steepness)) / 2)
+
+
+def check_phase(values: Tensor) -> None:
+    Interferometry.check(values[..., None], None, torch.ones(values.shape, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("size", [(1024, 1024), (200, 200), (60, 75), (1, 200)])
+@pytest.mark.parametrize(("fringes", "noise"), [(0.6, 0.0), (0.8, 0.02), (2.4, 0.15)])
+def test_wrapped_phases_are_refused_whatever_the_size(size, fringes, noise):
+    phase = hill(size, fringes, 0.2)
+    phase = phase + noise * torch.randn(size, generator=torch.Generator().manual_seed(0))
+    wrapped = torch.remainder(phase + 0.5, 1) - 0.5
+    with pytest.raises(InputError, match="expected an unwrapped phase in fringes, got one in fringes"):
+        check_phase(wrapped)
+    with pytest.raises(InputError, match=r"got one in radians .*unwrap_phase\(radians\) / 2 pi"):
+        check_phase(2 * torch.pi * wrapped)
+
+
+@pytest.mark.parametrize("size", [(500, 500), (60, 75), (1, 200)])
+@pytest.mark.parametrize("steepness", [1.0, 4.0])
+def test_small_phases_with_noise_and_steep_flanks_are_measured(size, steepness):
+    generator = torch.Generator().manual_seed(0)
+    for noise in (0.0, 0.05, 0.15):
+        phase = hill(size, 1.0, 0.2, steepness) + noise * torch.randn(size, generator=generator)
+        for spans in (0.85, 1.0, 0.95 * 2 * torch.pi):  # all that is there lies within about a fringe, or 2 pi
+            check_phase(phase / float(phase.max() - phase.min()) * spans)
+    pure = torch.randn(size, generator=generator)
+    check_phase(pure / float(pure.max() - pure.min()))
+
+
 def test_nothing_measured_is_refused():
     with pytest.raises(InputError, match="measurement: expected one of displacement, absorbance, radiance, fringes"):
         Measurement(RING.cameras(), None, BOX, 1.0)
