@@ -76,6 +76,18 @@ def test_members_that_are_there_are_not_done_again(measured, ensemble, tmp_path)
     assert not (out / "ensemble").exists()
 
 
+def test_members_that_are_there_are_of_what_was_measured(tmp_path):
+    out, more = tmp_path / "r", ["--technique", "emission", "--noise", "0.05", *RIG]
+    assert main(["simulate", "--phantom", "gaussians", "-o", str(tmp_path / "m.nc"), *more]) == 0
+    quick = [*QUICK, "--ensemble", "2", "--no-report"]
+    assert main(["reconstruct", str(tmp_path / "m.nc"), "-o", str(out), *quick]) == 0
+    before = read_volumes(out / "volume.nc")
+    assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
+    after = read_volumes(out / "volume.nc")
+    assert list(after) == list(before) == ["emission", "emission_mean", "emission_std"]
+    assert torch.equal(after["emission_std"].values, before["emission_std"].values)
+
+
 @pytest.mark.slow
 def test_members_of_other_settings_are_done_again(measured, tmp_path):
     """Resuming with a view left out, or another weight, must not take members that saw it, or had another weight."""

@@ -125,8 +125,8 @@ class Members:
         made_of = self._made_of(reconstructor, noisy)
         if directory.has(FIELD) and directory.has(ASKED) and (directory / ASKED).read_text() == made_of:
             try:
-                kept = Outcome("converged", "read from disc")
-                return Reconstruction(*directory.field(), [], kept, dataclasses.asdict(reconstructor), device="cpu")  # type: ignore[call-overload]
+                kept, settings = Outcome("converged", "read from disc"), dataclasses.asdict(reconstructor)  # type: ignore[call-overload]
+                return Reconstruction(*directory.field(), [], kept, settings, quantity=directory.quantity())
             except InputError as error:
                 self.monitor.say(f"{error}; this member is done again")
         out = "".join(f", without {name}" for name in self.ensemble.left_out(number, self.training))

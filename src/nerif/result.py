@@ -202,7 +202,7 @@ class ResultDirectory:
     # -- reading; each raises InputError where the file is missing or damaged --------------------------------------
 
     def field(self) -> tuple[Field, Box, float]:
-        """Return the field of index excess, its box (mm) and n_ambient."""
+        """Return the field, its box (mm) and n_ambient."""
         return read_field(self.path)
 
     def quantity(self) -> str:

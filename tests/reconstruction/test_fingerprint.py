@@ -15,6 +15,8 @@ from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.simulation import simulate
+from nerif.techniques.registry import technique
 
 NETWORK = NeRIF(
     network=NetworkShape(depth=1, width=8, octaves=1), points_per_batch=256, max_steps=2, device="cpu",
@@ -66,6 +68,14 @@ def test_resuming_refuses_other_data_and_says_which(measurement, states, method,
 def test_resuming_refuses_other_open_faces(measurement, states, method):
     with pytest.raises(InputError, match="got other open_faces"):
         replace(method, open_faces=("z+",))(measurement, resume=states[method])
+
+
+def test_what_the_forward_model_depends_on_is_data(ball, cameras, box):
+    kind = technique("interferometry")
+    m = simulate(ball, cameras, box, 1.0, steps=10, wavelength_nm=532.0, techniques=[kind])
+    state = VOXELS(m).state
+    with pytest.raises(InputError, match="got other wavelength_nm;"):
+        VOXELS(replace(m, wavelength_nm=633.0), resume=state)
 
 
 def test_resuming_takes_the_same_data_read_again(measurement, states, tmp_path):

@@ -114,6 +114,23 @@ def test_bounds_are_kept_and_the_solution_is_the_bounded_one(measurement):
     assert np.linalg.norm(iterate.x.numpy().ravel() - exact.x) < 1e-6 * np.linalg.norm(exact.x)
 
 
+@pytest.mark.parametrize("method", [Tikhonov(), TotalVariation(round=15)], ids=["tikhonov", "tv"])
+def test_what_is_told_of_a_bounded_iterate_is_of_the_field_that_is_given(measurement, method):
+    problem = make(measurement, bounds=(-4e-5, 1e-5))
+    low, high = problem.bounds
+    for iterate in itertools.islice(method.iterate(problem, problem.zero(), 1e-5), 40):
+        assert low <= float(iterate.x.min()) <= float(iterate.x.max()) <= high
+        misfit = float((problem.forward(iterate.x) - problem.data).square().sum())
+        assert iterate.residual == pytest.approx(misfit, rel=1e-9)
+
+
+def test_no_bounded_iterate_is_worse_than_the_one_before(measurement):
+    problem, weight = make(measurement, bounds=(-4e-5, 0.0)), 1e-5
+    path = [p.objective(weight) for p in itertools.islice(Tikhonov().iterate(problem, problem.zero(), weight), 200)]
+    assert all(b <= a for a, b in itertools.pairwise(path))
+    assert path[30] < 1.01 * path[-1]
+
+
 @pytest.mark.parametrize("momentum", [False, True])
 def test_landweber_comes_to_the_least_residual(problem, momentum):
     matrix = columns(problem.forward, SHAPE)

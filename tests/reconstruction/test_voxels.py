@@ -130,6 +130,26 @@ def test_bounds_hold_everywhere(measurement):
     assert float(values.max()) <= 1e-9
 
 
+def test_a_bounded_solution_goes_on_to_a_better_one(measurement):
+    result = replace(FIXED, upper=0.0, iterations=30, basis="linear", coarse_to_fine=False)(measurement)
+    assert (result.outcome.reason, len(result.history)) == ("iterations", 30)
+    assert result.history[-1]["objective"] < 0.95 * result.history[10]["objective"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Rising(Tikhonov):
+    """A method whose objective rises after a while."""
+
+    def iterate(self, problem, x, weight):
+        for residual in (1.0, 0.5, 0.4, 0.3, 0.6, 0.7, 0.8, 0.9):
+            yield Iterate(x, residual, 0.0)
+
+
+def test_an_objective_that_rises_has_not_converged(measurement):
+    result = Rising(voxels=12, device="cpu", regularisation=1e-3, iterations=8)(measurement)
+    assert (result.outcome.reason, len(result.history)) == ("iterations", 8)
+
+
 def test_open_faces_drop_rays(fixed, measurement):
     fewer = replace(FIXED, open_faces=("z+",))(measurement)
     assert not torch.equal(fixed.field.coefficients, fewer.field.coefficients)

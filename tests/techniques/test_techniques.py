@@ -16,23 +16,29 @@ from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls, Scaled
 from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Grid, Rays, Ring
 from nerif.measurement import Measurement, measurement_of
 from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import predict, reproject
+from nerif.reconstruction.base import State
+from nerif.reconstruction.files import read_state, write_state
+from nerif.reconstruction.losses import LossWeights, loss_terms
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.problem import Problem
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.training import Training
+from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import Simulation, simulate
 from nerif.techniques import registry
 from nerif.techniques.absorption import Absorption, absorbance
-from nerif.techniques.base import ForwardModel, Light, Weights
+from nerif.techniques.base import ForwardModel, Light, Weights, midpoints
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.emission import Emission
 from nerif.techniques.interferometry import Interferometry
@@ -128,11 +134,22 @@ def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp
 # -- what the pixels see ---------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Cubic(Knife):
+    """A toy whose profile is odd about the middle of the ray, but no line."""
+
+    name = "cubic"
+
+    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+        middle = 0.5 * (rays.near + rays.far)[:, None]
+        return Weights(((s - middle) / 10) ** 3 * step, value=step.new_ones(len(rays), 1))
+
+
 def rays_of(m: Measurement) -> Rays:
     return m.rays()[0].to(dtype=torch.float64)
 
 
-@pytest.mark.parametrize("kind", [*TECHNIQUES.values(), Knife], ids=lambda k: k.name)
+@pytest.mark.parametrize("kind", [*TECHNIQUES.values(), Knife, Cubic], ids=lambda k: k.name)
 @pytest.mark.parametrize("basis", ["linear", "cubic"])
 def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
     m = measured["deflection"]
@@ -223,6 +240,140 @@ def test_two_techniques_of_one_index_are_weighed_by_their_noise(balls):
     views = evaluate_views(reproject(result.field, both))
     assert [v["measured"] for v in views] == ["displacement"] * 5 + ["fringes"] * 5
     assert error(NETWORK(both), balls, Interferometry) < 0.3
+
+
+THREE = LossWeights(consistency=1, numerical=1, head=1, automatic=0)
+HEADS = NetworkShape(width=32, depth=2, gradient_head=True)
+
+
+def test_the_three_terms_of_the_paper_are_one_for_what_sees_no_gradient(measured, balls):
+    result = replace(NETWORK, network=HEADS, weights=THREE, max_steps=60)(measured["emission"])
+    assert result.history[-1]["loss"] < 0.5 * result.history[0]["loss"]
+    first = result.history[0]
+    assert first["loss"] == pytest.approx(first["head"] + first["numerical"])
+
+
+def test_fringes_count_beside_displacements_whatever_the_terms(balls):
+    kinds = [Deflection, Interferometry]
+    both = simulate(Scaled(balls, 1e-3), RING.cameras(), BOX, 1.00027, 0.3, 1, 60, 532.0, techniques=kinds)
+    network = Network(HEADS)
+    field, found = NeuralField(network, BOX, 1e-3), []
+    for part in Target.of(both).parts:
+        part, (s, step) = part[:30], midpoints(part.rays[:30], 20)
+        found.append(loss_terms(field, Plain(network), part, s, step, THREE, "squared"))
+    assert [set(terms) for terms in found] == [{"head", "consistency", "numerical"}, {"head", "numerical"}]
+    assert "automatic" not in replace(NETWORK, network=HEADS, weights=THREE, max_steps=1)(both).history[0]
+
+
+def test_rays_bend_alike_in_all_terms_and_in_the_path_integral(measured):
+    m = measured["deflection"]
+    model = forward_models(m.techniques, m, "curved")[0]
+    (part,) = Target.of(m, model="curved").parts
+    torch.manual_seed(0)
+    network = Network(NetworkShape(width=16, depth=2, octaves=1)).requires_grad_(False)
+    field = NeuralField(network, BOX, 2.0)
+    part, (s, step) = part[:40], midpoints(part.rays[:40], 50)
+    integral = PathIntegral(model, 50)(field, part.rays)
+    terms = loss_terms(field, Plain(network), part, s, step, LossWeights(numerical=1), "squared")
+    exact = float(part.residual(integral).square().mean())
+    straight = float(part.residual(PathIntegral(model.linear_twin, 50)(field, part.rays)).square().mean())
+    assert float(terms["automatic"]) == pytest.approx(exact, rel=1e-4)
+    assert abs(straight - exact) > 0.02 * exact
+    assert float(terms["numerical"]) == pytest.approx(exact, rel=0.005)
+
+
+class Plain:
+    """A network as the loss asks it."""
+
+    def __init__(self, network: Network) -> None:
+        self.value, self.network = network, network
+
+    def value_and_gradient(self, p, heads):
+        return self.network.value_and_gradient(p, heads)
+
+
+@dataclass(frozen=True)
+class Mirage(Knife):
+    """A toy that sees the field alone, somewhat beside the straight ray."""
+
+    straight, linear = False, False
+
+    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+        return Weights(step, value=step.new_ones(len(rays), 1))
+
+    def bend(self, value, gradient, rays, s, step):
+        return torch.ones_like(gradient), torch.zeros_like(gradient)
+
+
+def test_rays_that_bend_do_so_too_where_the_field_alone_is_seen(measured, balls):
+    rays = rays_of(measured["deflection"])[::9]
+    s, step = midpoints(rays, 40)
+    there = (step * balls(rays.at(s) + 1)).sum(dim=1, keepdim=True)
+    assert torch.allclose(PathIntegral(Mirage(), 40)(balls, rays), there)
+
+
+def test_a_run_that_began_from_another_scale_goes_on_as_if_it_had_not_stopped(measured, tmp_path):
+    m = measured["emission"]
+    (seen,) = m.observations
+    bright = m.observed({"emission": 3 * seen.values}, {"emission": seen.sigma})
+    settings = replace(NETWORK, max_steps=12, upper=0.5, precision="float32")
+    start = replace(settings, max_steps=3)(bright).field
+    whole = settings(m, start=start)
+    half = settings(m, lambda step: step.step == 5, start=start)
+    write_state(tmp_path, half.state)
+    again = settings(m, resume=read_state(tmp_path))
+    points = torch.rand(50, 3) * 6
+    assert torch.equal(again.field(points), whole.field(points))
+    with pytest.raises(InputError, match=r"the bounds that the run began with, 0 to 0\.5, got 0 to 0\.4"):
+        replace(settings, upper=0.4)(m, resume=half.state)
+    training = Training(settings, FrameData(settings, m), None, start)
+    bounds = training.field.bounds
+    training._fit(None)
+    training._restore(training.first)
+    assert training.field.bounds == bounds
+
+
+@pytest.mark.parametrize("method", [MLEM, MART])
+def test_multiplicative_iterations_are_all_taken_and_none_is_lost_by_resuming(method, measured):
+    m = measured["emission"]
+    quick = method(voxels=12, device="cpu", iterations=6, tolerance=0.0, basis="linear")
+    m = replace(m, maps={"radiance": m.maps["radiance"]})  # without sigma nothing stops it before
+    one = replace(quick, iterations=1)(m)
+    assert float(one.field.coefficients.std()) > 0.1 * float(one.field.coefficients.mean())
+    whole, half = quick(m), replace(quick, iterations=3)(m)
+    rest = quick(m, resume=half.state)
+    assert torch.equal(rest.field.coefficients, whole.field.coefficients)
+    x = half.state.tensors["x"]
+    empty = x < x.mean()
+    on = quick(m, resume=State({"x": torch.where(empty, 0, x)}, half.state.scalars))
+    assert float(on.state.tensors["x"][empty].abs().max()) == 0
+
+
+@pytest.mark.parametrize("name", ["emission", "both"])
+def test_memory_counts_the_operators_of_all_techniques_and_of_every_view(name, measured, balls):
+    m, kinds = measured["emission"], [Deflection, Interferometry]
+    if name == "both":
+        m = simulate(Scaled(balls, 1e-3), RING.cameras(), BOX, 1.00027, 0.3, 1, 60, 532.0, techniques=kinds)
+    target, grid = Target.of(m), Grid.of_resolution(BOX, 12)
+    problem = Problem([VoxelOperator(p.rays, grid, p.model, "linear") for p in target.parts], target)
+    one, held = Tikhonov(voxels=12, basis="linear"), sum(map(held_by, problem.operators))
+    assert one.operator_bytes(m, grid) > held
+    if name == "emission":
+        blocks = MART(voxels=12, basis="linear").blocks(problem)
+        more = sum(b.reach.nbytes + sum(map(held_by, b.operators)) for b in blocks)
+        few, many = (kind(voxels=12, basis="linear").memory_bytes(m, grid) for kind in (MLEM, MART))
+        assert many - few > more
+
+
+def held_by(operator: VoxelOperator) -> int:
+    return sum(t.nbytes for t in (*operator.path, *operator.matrices))
+
+
+@pytest.mark.parametrize("method", [NETWORK, Tikhonov(voxels=8, device="cpu")], ids=["network", "voxels"])
+def test_bounds_that_leave_nothing_with_those_of_the_technique_are_refused(method, measured):
+    with pytest.raises(InputError, match=r"upper: expected to leave a range around 0, got 0 to 0 .* of emission"):
+        replace(method, upper=0.0)(measured["emission"])
+    assert not replace(NETWORK, max_steps=1, upper=0.0)(measured["interferometry"]).outcome.failed
 
 
 def test_bounds_cannot_be_left(measured):

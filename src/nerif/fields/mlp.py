@@ -241,6 +241,12 @@ class NeuralField(Field):
         self.network, self.box, self.scale, self.offset = network, box, scale, offset
         self.half_edge = max(box.edges) / 2
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Lowest and highest value that the network can give, to six digits."""
+        low, high = (float(f"{limit * self.scale:.6g}") for limit in self.network.limits)
+        return low, high
+
     def to(self, device: torch.device | str) -> NeuralField:
         """Return the same field on a device: a copy of the network, or the field itself where it is there already."""
         if next(self.network.parameters()).device == torch.device(device):

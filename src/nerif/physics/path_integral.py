@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from nerif.fields.base import Field
 from nerif.geometry import Rays
 from nerif.techniques.base import ForwardModel, midpoints
 
-__all__ = ["PathIntegral", "Projector", "project"]
+__all__ = ["PathIntegral", "Projector", "places", "project"]
 
 
 class Projector(ABC):
@@ -52,14 +53,33 @@ class PathIntegral(Projector):
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]:
         model = self.model
         s, step = midpoints(rays, self.samples)
-        points, weights = rays.at(s), model.weights(rays, s, step)
+        points, tilt = places(model, rays, s, step, field.value_and_gradient)
+        weights = model.weights(rays, s, step)
         if weights.slope is None:
             return weights(field(points), None)
-        if model.straight:
-            return weights(*field.value_and_gradient(points))
-        offset, tilt = model.bend(*field.value_and_gradient(points), rays, s, step)
-        value, gradient = field.value_and_gradient(points + offset)
-        return weights(value, gradient - tilt)
+        value, gradient = field.value_and_gradient(points)
+        return weights(value, gradient if tilt is None else gradient - tilt)
+
+
+def places(
+    model: ForwardModel,
+    rays: Rays,
+    s: Float[Tensor, "n m"],
+    step: Float[Tensor, "n m"],
+    look: Callable[[Float[Tensor, "n m 3"]], tuple[Float[Tensor, "n m"], Float[Tensor, "n m 3"]]],
+) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"] | None]:
+    """Return where the samples of rays stand (mm), and what is to be taken off the gradient there; None for nothing.
+
+    Parameters
+    ----------
+    s, step : path lengths of the samples, and the length that each stands for, mm
+    look : gives the field and its gradient (1/mm) at points; asked only where rays are not straight
+    """
+    points = rays.at(s)
+    if model.straight:
+        return points, None
+    offset, tilt = model.bend(*look(points), rays, s, step)
+    return points + offset, tilt
 
 
 @torch.no_grad()

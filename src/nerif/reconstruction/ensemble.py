@@ -2,9 +2,9 @@
 
     mean = sum_k q_k / K,      std^2 = sum_k (q_k - mean)^2 / (K - 1)
 
-Each member sees the measured displacements with noise of their sigma added once more, and starts from another seed. The
-spread tells what noise and chance do. It does not tell what all members have in common: what the views do not see, and
-what the method smooths away.
+Each member sees what was measured with noise of its sigma added once more, and starts from another seed. The spread
+tells what noise and chance do. It does not tell what all members have in common: what the views do not see, and what
+the method smooths away.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.geometry import Camera
 from nerif.measurement import Measurement
+from nerif.techniques.registry import forward_model
 
 __all__ = ["check_fingerprint", "digest", "fingerprint"]
 
@@ -24,10 +25,13 @@ def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> d
     open_faces : faces whose rays are dropped
     """
     usable, seen = measurement.usable, {}
+    light: dict[str, list[Any]] = {}
     for o in measurement.observations:
         own = measurement.usable_for(o)
         seen[o.technique.measured] = digest([o.values[own]])
         seen[o.technique.sigma] = digest([None if o.sigma is None else o.sigma[own]])
+        for name, value in vars(forward_model(o.technique, measurement)).items():
+            light.setdefault(name, []).append(value)
     return {
         "views": digest(measurement.names),
         "cameras": digest(part for camera in measurement.cameras for part in _parts(camera)),
@@ -36,6 +40,7 @@ def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> d
         "flow_mask": digest([measurement.flow_mask]),
         "box": digest([measurement.box.lower, measurement.box.upper]),
         "n_ambient": digest([measurement.n_ambient]),
+        **{name: digest(values) for name, values in light.items()},
         "ambient_faces": digest(sorted(measurement.ambient_faces)),
         "open_faces": digest(sorted(open_faces)),
     }

@@ -4,7 +4,8 @@
 
 d_ND integrates central differences of n, d_net the gradient heads, d_AD the exact gradient of n; the first three
 terms are the paper's. The last but one is its noise-free twin, the last the gauge. What is integrated, and how the
-samples count, is the forward model's (techniques/); one that sees the field and not its gradient has w_a alone.
+samples count, is the forward model's (techniques/); one that sees the field and not its gradient has one prediction,
+weighed by w_n + w_h + w_a.
 """
 
 from __future__ import annotations
@@ -19,10 +20,14 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import NeuralField
+from nerif.physics.path_integral import places
 from nerif.reconstruction.target import Part
 from nerif.techniques.base import Weights
 
-__all__ = ["Evaluator", "LossWeights", "loss_terms"]
+__all__ = ["DATA", "Evaluator", "LossWeights", "loss_terms"]
+
+DATA = ("automatic", "head", "numerical")
+"""Names of the terms that compare a prediction with what was measured."""
 
 
 @dataclass(frozen=True)
@@ -82,18 +87,20 @@ def loss_terms(
     norm : "l2" (mean length of the residual vectors, the paper's) or "squared" (mean square)
     """
     rays, model, shape = part.rays, part.model, s.shape
-    points, tilt = rays.at(s), None
     unit = field.scale / field.half_edge  # 1/mm of one unit of network gradient
     integral = model.weights(rays, s, step).in_units(field.scale, unit)
-    if not model.straight:
-        with torch.no_grad():
-            value, slope, _ = network.value_and_gradient(field.normalise(points).reshape(-1, 3), False)
-            value, slope = value.float().reshape(shape) * field.scale, slope.float().reshape(*shape, 3) * unit
-            offset, tilt = model.bend(value, slope, rays, s, step)
-            points, tilt = points + offset, tilt / unit
+
+    @torch.no_grad()
+    def look(points: Float[Tensor, "n m 3"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m 3"]]:
+        value, slope, _ = network.value_and_gradient(field.normalise(points).reshape(-1, 3), False)
+        return value.float().reshape(shape) * field.scale, slope.float().reshape(*shape, 3) * unit
+
+    points, tilt = places(model, rays, s, step, look)
+    tilt = None if tilt is None else tilt / unit
     p = field.normalise(points).reshape(-1, 3)
-    if integral.slope is None:
-        return {"automatic": reduce(part.residual(integral(network.value(p).float().reshape(shape), None)), norm)}
+    if integral.slope is None:  # no gradient, so that what is asked in three ways is one
+        seen = reduce(part.residual(integral(network.value(p).float().reshape(shape), None)), norm)
+        return {name: seen for name in DATA if getattr(weights, name)}
 
     def data(value: Tensor | None, gradient: Float[Tensor, "p 3"]) -> Tensor:
         gradient = gradient.float().reshape(*shape, 3)
@@ -115,6 +122,8 @@ def loss_terms(
     if weights.numerical:
         reach = step / (2 * field.half_edge)
         seen = by_differences(network.value, integral, p.reshape(*shape, 3), reach)
+        if tilt is not None:
+            seen = seen - Weights(integral.profile, slope=integral.slope)(None, tilt)
         terms["numerical"] = reduce(part.residual(seen), norm)
     return terms
 

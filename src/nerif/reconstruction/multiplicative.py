@@ -8,6 +8,7 @@ Neither can leave x >= 0, and a voxel that any ray finds empty stays empty.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError
+from nerif.geometry import Grid
+from nerif.measurement import Measurement
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.voxels import VoxelReconstructor
@@ -34,14 +37,16 @@ class Multiplicative(VoxelReconstructor):
     """Start on a coarse grid and halve the voxels from solution to solution."""
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
-        check_positive(problem)
-        x = start(problem, x)
         blocks = self.blocks(problem)
         while True:
-            residual = float((problem.data - problem.forward(x)).square().sum())
-            yield Iterate(x, residual, 0.0)
             for block in blocks:
                 x = problem.clip(self.update(block, x))
+            residual = float((problem.data - problem.forward(x)).square().sum())
+            yield Iterate(x, residual, 0.0)
+
+    def begin(self, problem: Problem, x: Tensor) -> Tensor:
+        check_positive(problem)
+        return start(problem, x)
 
     @abstractmethod
     def blocks(self, problem: Problem) -> list[Block]:
@@ -90,6 +95,11 @@ class MART(Multiplicative):
         super().__post_init__()
         if not 0 < self.relaxation <= 1:
             raise InputError(f"relaxation: expected above 0 and at most 1, got {self.relaxation}")
+
+    def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
+        """Return what a run will need at most: of every view its own operator, and where its rays pass, as well."""
+        reach = len(measurement.cameras) * math.prod(grid.shape) * self.itemsize
+        return super().memory_bytes(measurement, grid, device) + self.operator_bytes(measurement, grid) + reach
 
     def blocks(self, problem: Problem) -> list[Block]:
         views = sorted({int(v) for part in problem.target.parts for v in part.rays.view.unique()})

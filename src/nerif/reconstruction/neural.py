@@ -1,4 +1,4 @@
-"""NeRIF: a coordinate network trained until the displacements it predicts match those measured (paper, Alg. 1)."""
+"""NeRIF: a coordinate network trained until what it predicts is what was measured (paper, Alg. 1)."""
 
 from __future__ import annotations
 

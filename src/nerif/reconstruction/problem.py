@@ -22,7 +22,10 @@ from nerif.geometry import Grid
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.target import Target
 
-__all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients"]
+__all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients", "minimise"]
+
+ROUND = 10  # iterations between looks at which bounds are met
+HALVINGS = 20  # of a step, after which it is no more than rounding
 
 Bounds = tuple[float, float]
 
@@ -41,6 +44,10 @@ class Iterate:
     x: Tensor
     residual: float
     penalty: float
+
+    def objective(self, weight: float) -> float:
+        """Return |F x - b|^2 + weight R(x)."""
+        return self.residual + weight * self.penalty
 
 
 class Differences:
@@ -191,14 +198,50 @@ class Penalty:
         return self.problem.differences.adjoint((y[0], y[1], y[2]))
 
 
+def minimise(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
+    """Minimise |F x - b|^2 + weight |L x|^2 within the bounds, without end; no iterate is worse than the one before.
+
+    A round takes conjugate gradients with the voxels at their bounds held, brings what passes a bound back to it, and
+    ends after ROUND iterations or where that makes the objective rise; a first step that does is halved until it falls.
+
+    Source: More & Toraldo, SIAM J. Optim. 1 (1991) 93, with a search along the path in place of one along a line.
+    """
+    x = problem.clip(x)
+    if problem.bounds is None:
+        yield from conjugate_gradients(problem, penalty, weight, x)
+    best = _within(problem, penalty, x)
+    while True:
+        begun = best
+        for _, beyond in zip(range(ROUND), conjugate_gradients(problem, penalty, weight, best.x), strict=False):
+            there = problem.clip(beyond.x)
+            found = beyond if torch.equal(there, beyond.x) else _within(problem, penalty, there)
+            if found.objective(weight) >= best.objective(weight):
+                break
+            best = found
+            yield best
+        step, halvings = beyond.x - begun.x, 0
+        while best is begun:
+            step, halvings = step / 2, halvings + 1
+            found = _within(problem, penalty, problem.clip(begun.x + step))
+            if found.objective(weight) < begun.objective(weight):
+                best = found
+            if best is found or halvings > HALVINGS:  # there is but rounding left
+                yield best
+
+
+def _within(problem: Problem, penalty: Penalty, x: Tensor) -> Iterate:
+    """The iterate at x."""
+    return Iterate(x, _square(problem.data - problem.forward(x)), sum(_square(a) for a in penalty(x)))
+
+
 def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
     """Minimise |F x - b|^2 + weight |L x|^2 by conjugate gradients on the least-squares problem (CGLS), without end.
 
         alpha = |s|^2 / (|F p|^2 + weight |L p|^2),    x <- x + alpha p,    r <- r - alpha F p
         s = F^T r - weight L^T L x,                    p <- s + (|s|^2 / |s_last|^2) p
 
-    Where bounds are given, voxels at a bound towards which the objective falls are held there; the others may pass a
-    bound, so the caller clips and begins anew.
+    Where bounds are given, voxels at a bound towards which the objective falls are held there; the others may pass
+    theirs.
 
     Source: Bjorck, Numerical Methods for Least Squares Problems (SIAM, 1996), Sec. 7.4.
     """

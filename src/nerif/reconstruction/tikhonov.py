@@ -12,12 +12,10 @@ from typing import Literal
 from torch import Tensor
 
 from nerif.conventions import InputError
-from nerif.reconstruction.problem import Iterate, Penalty, Problem, conjugate_gradients
+from nerif.reconstruction.problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels import WeightedVoxelReconstructor
 
 __all__ = ["Tikhonov"]
-
-ROUND = 10  # iterations between looks at which bounds are met
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Tikhonov(WeightedVoxelReconstructor):
     """
 
     penalty: Literal["identity", "gradient", "laplacian"] = "gradient"
-    """What is kept small: the index excess, its gradient, or its Laplacian."""
+    """What is kept small: the field, its gradient, or its Laplacian."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -36,11 +34,4 @@ class Tikhonov(WeightedVoxelReconstructor):
             raise InputError(f"penalty: expected one of {', '.join(Penalty.KINDS)}, got '{self.penalty}'")
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
-        penalty = Penalty(problem, self.penalty)
-        if problem.bounds is None:
-            yield from conjugate_gradients(problem, penalty, weight, x)
-        while True:  # active set: solve with the voxels at their bounds held, look again
-            x = problem.clip(x)
-            for _, iterate in zip(range(ROUND), conjugate_gradients(problem, penalty, weight, x), strict=False):
-                x = problem.clip(iterate.x)
-                yield Iterate(x, iterate.residual, iterate.penalty)
+        yield from minimise(problem, Penalty(problem, self.penalty), weight, x)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError
-from nerif.reconstruction.problem import Iterate, Penalty, Problem, conjugate_gradients
+from nerif.reconstruction.problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels import WeightedVoxelReconstructor
 
 __all__ = ["TotalVariation"]
@@ -54,8 +54,8 @@ class TotalVariation(WeightedVoxelReconstructor):
             # sqrt(g^2 + e^2) <= (g^2 + e^2) / (2 m) + m / 2 with equality at m = sqrt(g^2 + e^2) of this round
             magnitude = (_gradient_square(problem.differences(x)) + self.softness**2).sqrt()
             penalty = Penalty(problem, "gradient", _at_faces(0.5 / magnitude))
-            for _, iterate in zip(range(self.round), conjugate_gradients(problem, penalty, weight, x), strict=False):
-                x = problem.clip(iterate.x)
+            for _, iterate in zip(range(self.round), minimise(problem, penalty, weight, x), strict=False):
+                x = iterate.x
                 magnitude = (_gradient_square(problem.differences(x)) + self.softness**2).sqrt()
                 yield Iterate(x, iterate.residual, float(magnitude.mean()))
 

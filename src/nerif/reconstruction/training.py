@@ -23,10 +23,11 @@ from nerif.fields.base import Field
 from nerif.fields.mlp import UNBOUNDED
 from nerif.fields.space_time import AtTimes, with_time
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
+from nerif.reconstruction.bounds import check_resumed
 from nerif.reconstruction.budget import Budget
 from nerif.reconstruction.device import peak_memory
 from nerif.reconstruction.fingerprint import check_fingerprint
-from nerif.reconstruction.losses import Evaluator, loss_terms, reduce
+from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
 from nerif.reconstruction.optimiser import NetworkOptimiser
 from nerif.reconstruction.order import shuffled
 from nerif.reconstruction.parallel import Ranks
@@ -111,6 +112,7 @@ class Training:
         if resume is not None:
             check_fingerprint(resume.scalars.get("fingerprint"), data.fingerprint)
             self._restore(resume)
+            check_resumed(self.field.bounds, data.bounds)
         self.start = start if resume is None else None
         self.first = self.good = self._capture()
 
@@ -287,7 +289,7 @@ class Training:
     def _follow(self, values: dict[str, float], empty: float) -> None:
         """A running mean of the loss; squares are rooted so that ratios mean the same for both norms."""
         weights, squared = self.settings.weights, self.settings.norm == "squared"
-        data = {name: getattr(weights, name) for name in ("automatic", "head", "numerical") if name in values}
+        data = {name: getattr(weights, name) for name in DATA if name in values}
         residual = sum(weight * values[name] for name, weight in data.items()) / sum(data.values())
         power = 1 if squared else 2
         self.watch.follow(residual**power, empty**power, self.budget.step)
@@ -341,21 +343,22 @@ class Training:
             tensors["density"] = self.density.values.clone()
         names = ("retries", "rate", "initial_loss", "running", "settled")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
+        scalars |= {"scale": self.field.scale, "offset": self.field.offset}
         kept = {"budget": self.budget.used(), "history": list(self.history), "fingerprint": self.data.fingerprint}
         return State(tensors, {**scalars, **kept, "edge": self.edge, "watch": self.watch.kept()})
 
     def _restore(self, state: State) -> None:
-        tensors, scalars = state.tensors, dict(state.scalars)
+        tensors, scalars = state.tensors, {k: v for k, v in state.scalars.items() if k != "fingerprint"}
         try:
             network = {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}
             self.field.network.load_state_dict(network)
-        except RuntimeError:
+            self.field.scale, self.field.offset = float(scalars.pop("scale")), float(scalars.pop("offset"))
+        except (RuntimeError, KeyError):
             raise InputError("resume: the checkpoint is of another network; give the same settings") from None
         self.optimiser.restore({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser.")})
         self.generator.set_state(tensors["generator"])
         density = tensors.get("density")
         self.density.values = None if density is None else density.clone().to(self.device)
-        del scalars["fingerprint"]
         self.history = list(scalars.pop("history"))
         self.watch.restore(scalars.pop("watch"))
         edge = int(scalars.pop("edge"))

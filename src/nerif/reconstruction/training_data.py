@@ -39,6 +39,9 @@ class TrainingData(ABC):
     quantity : what the field is
     """
 
+    bounds: tuple[float, float]
+    """Lowest and highest value of the field."""
+
     def __init__(
         self, device: torch.device, box: Box, n_ambient: float, fingerprint: dict[str, str], open: bool, quantity: str
     ) -> None:

@@ -13,8 +13,6 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import torch
-import torch.nn.functional as functional
-from jaxtyping import Bool
 from torch import Tensor
 
 from nerif.conventions import InputError, parse_faces
@@ -28,6 +26,7 @@ from nerif.reconstruction.bounds import check_bounds, field_bounds
 from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
 from nerif.reconstruction.fingerprint import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import ambient_faces, check_gauge, visual_hull
+from nerif.reconstruction.levels import coarser, levels
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.target import Target
@@ -36,7 +35,6 @@ from nerif.techniques.registry import AUTO, check_model
 
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 
-COARSEST = 12  # voxels along the longest edge of the first grid, at least
 VOLUMES = 22  # arrays the size of the grid that the hungriest method holds at once (tests/reconstruction)
 DATA = 8  # arrays the size of the data
 COMPILER_BYTES = 1 << 28  # of Numba, whatever the grid (benchmarks/results/voxel-cost-cpu.md)
@@ -108,14 +106,30 @@ class VoxelReconstructor(Reconstructor):
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         """Yield one iterate after another, from x, without end."""
 
+    def begin(self, problem: Problem, x: Tensor) -> Tensor:
+        """Return what to iterate from, given a field to start from: that field within the bounds."""
+        return problem.clip(x)
+
+    @property
+    def itemsize(self) -> int:
+        """Bytes of a number."""
+        return 4 if self.precision == "float32" else 8
+
+    def operator_bytes(self, measurement: Measurement, grid: Grid) -> int:
+        """Return what the operators of all techniques hold."""
+        dtype = getattr(torch, self.precision)
+        return sum(
+            VoxelOperator.memory_bytes(int(measurement.usable_for(o).sum()), grid, self.basis, dtype)
+            for o in measurement.observations
+        )
+
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
         """Return what a run will need at most, beside what the process holds already."""
-        rays, size = int(measurement.usable.sum()), 4 if self.precision == "float32" else 8
-        dtype = torch.float32 if size == 4 else torch.float64
-        operator = VoxelOperator.memory_bytes(rays, grid, self.basis, dtype)
+        rays = sum(int(measurement.usable_for(o).sum()) for o in measurement.observations)
+        volumes, data = VOLUMES * math.prod(grid.shape) * self.itemsize, DATA * 2 * rays * self.itemsize
         preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
         around = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
-        return operator + VOLUMES * math.prod(grid.shape) * size + DATA * 2 * rays * size + preparing + around
+        return self.operator_bytes(measurement, grid) + volumes + data + preparing + around
 
     def __call__(
         self,
@@ -165,7 +179,7 @@ class _Run:
         self.device = resolve_device(settings.device)
         self.faces = ambient_faces(measurement, settings.ambient_faces)
         check_gauge(measurement, self.faces, settings.hull)
-        self.grids = _grids(measurement, settings)
+        self.grids = levels(measurement.box, settings.voxels, DEGREES[settings.basis], settings.coarse_to_fine)
         needed = settings.memory_bytes(measurement, self.grids[-1], self.device.type)
         there = available_memory(self.device)
         if needed > there:
@@ -233,9 +247,9 @@ class _Run:
         elif self.field_before is not None:
             field = self.field_before
         else:
-            return problem.zero()
+            return self.settings.begin(problem, problem.zero())
         values = field.sample(problem.operator.grid, self.device).to(problem.operator.device, problem.operator.dtype)
-        return problem.clip(values / self.target.scale)
+        return self.settings.begin(problem, values / self.target.scale)
 
     def _field(self, grid: Grid) -> VoxelField:
         """The field of the present solution, which is on that grid."""
@@ -249,7 +263,7 @@ class _Run:
             VoxelOperator(part.rays, grid, part.model, settings.basis, boundary, settings.step, self.device, dtype)
             for part in self.target.parts
         ]
-        return Problem(operators, self.target, None if self.free is None else _coarser(self.free, grid), self.bounds)
+        return Problem(operators, self.target, None if self.free is None else coarser(self.free, grid), self.bounds)
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -263,14 +277,14 @@ class _Run:
             self.chosen = ""
         self.x = x
         for iterate in settings.iterate(problem, x, weight):
-            objective = iterate.residual + weight * iterate.penalty
+            objective = iterate.objective(weight)
             if not math.isfinite(objective):
                 message = "the objective turned non-finite, the field before that was kept"
-                raise _Stop("diverged", f"{message}; look for extreme displacements or sigma")
+                raise _Stop("diverged", f"{message}; look for extreme values or sigma in the measurement")
             self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
             before, past = past[0], [*past[1:], objective]
             self._tell(problem, iterate, weight, objective)
-            converged = before - objective < tolerance * settings.patience * objective
+            converged = 0 <= before - objective < tolerance * settings.patience * objective
             if settings.weight == 0.0 and self.noise is not None and iterate.residual <= self.noise:
                 self.chosen, converged = "residual is the noise (discrepancy principle)", True
             if converged or self.done >= settings.iterations:
@@ -376,19 +390,3 @@ class _Run:
             state=self._capture(),
             quantity=self.measurement.quantity,
         )
-
-
-def _grids(measurement: Measurement, settings: VoxelReconstructor) -> list[Grid]:
-    """The grids to solve on, coarse to fine."""
-    least = (DEGREES[settings.basis] + 1) // 2  # what the basis needs along each edge, of a slice too
-    shape = [max(least, n) for n in Grid.of_resolution(measurement.box, settings.voxels).shape]
-    grids = [Grid(measurement.box, (shape[0], shape[1], shape[2]))]
-    while settings.coarse_to_fine and max(shape) >= 2 * COARSEST:
-        shape = [min(n, max(4, n // 2)) for n in shape]
-        grids.insert(0, Grid(measurement.box, (shape[0], shape[1], shape[2])))
-    return grids
-
-
-def _coarser(free: Bool[Tensor, "z y x"], grid: Grid) -> Bool[Tensor, "Z Y X"]:
-    """Return a mask on a coarser grid: a voxel is free where any in its place is."""
-    return functional.adaptive_max_pool3d(free[None, None].float(), grid.shape)[0, 0] > 0

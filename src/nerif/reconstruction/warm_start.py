@@ -29,7 +29,7 @@ def adopt(field: NeuralField, start: Field) -> bool:
     if start.network.shape != field.network.shape or start.box != field.box:
         return False
     bounded = (start.network.limits, field.network.limits) != (UNBOUNDED, UNBOUNDED)
-    if bounded and _limits(start) != _limits(field):
+    if bounded and start.bounds != field.bounds:
         return False
     field.network.load_state_dict(start.network.state_dict())
     if bounded:  # bounds bend what comes near them in units of the scale, so the scale goes over as well
@@ -45,11 +45,6 @@ def adopt(field: NeuralField, start: Field) -> bool:
         assert isinstance(value, nn.Linear)
         value.bias.sub_(start.offset * ratio)
     return True
-
-
-def _limits(field: NeuralField) -> tuple[float, ...]:
-    """Bounds of a field in its own unit, as far as single precision tells them apart."""
-    return tuple(float(f"{limit * field.scale:.6g}") for limit in field.network.limits)
 
 
 def fit_network(

@@ -95,7 +95,7 @@ def _upward(solve: Solve, first: Iterate, noise: float) -> Choice:
         if there.residual > noise:
             return _between(weight * FACTOR, there, weight, here, noise)
         weight, here = weight * FACTOR, there
-    return Choice(weight, here.x, "highest weight tried: the displacements are no more than the noise")
+    return Choice(weight, here.x, "highest weight tried: what was measured is no more than the noise")
 
 
 def _between(upper: float, above: Iterate, lower: float, below: Iterate, noise: float) -> Choice:
