@@ -138,7 +138,7 @@ def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp
 class Cubic(Knife):
     """A toy whose profile is odd about the middle of the ray, but no line."""
 
-    name = "cubic"
+    name, channels = "cubic", ("",)
 
     def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
         middle = 0.5 * (rays.near + rays.far)[:, None]
@@ -163,6 +163,12 @@ def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
     fine = VoxelOperator(rays, grid, model, basis, Boundary(), step=0.05, dtype=torch.float64)
     exact = PathIntegral(model, 600)(fine.field(c), rays)
     assert float((fine(c) - exact).norm() / exact.norm()) < 2e-2
+
+
+def test_weights_of_other_channels_than_named_never_reach_the_kernels(measured, monkeypatch):
+    monkeypatch.setattr(Cubic, "channels", ("one", "two"))
+    with pytest.raises(InputError, match="Cubic: expected weights of 2 channels a ray, got 1"):
+        VoxelOperator(rays_of(measured["deflection"])[::50], Grid(BOX, (5, 5, 5)), Cubic())
 
 
 @pytest.mark.parametrize("kind", OTHERS, ids=lambda k: k.name)
@@ -296,7 +302,7 @@ class Plain:
 class Mirage(Knife):
     """A toy that sees the field alone, somewhat beside the straight ray."""
 
-    straight, linear = False, False
+    straight, linear, channels = False, False, ("",)
 
     def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
         return Weights(step, value=step.new_ones(len(rays), 1))

@@ -121,6 +121,10 @@ class VoxelOperator:
         kept = [a.to(self.device, self.dtype).contiguous() for a in (start, stride, profile)]
         matrices = [] if weights.slope is None else [weights.slope / spacing]
         matrices += [] if weights.value is None else [weights.value[..., None]]
+        for matrix in matrices:  # by which the kernels walk through memory
+            if matrix.shape[1] != self.range_shape[1]:
+                what = f"expected weights of {self.range_shape[1]} channels a ray, got {matrix.shape[1]}"
+                raise InputError(f"{type(model).__name__}: {what}")
         path = (*kept, count.to(self.device, torch.int32))
         return path, [a.to(self.device, self.dtype).contiguous() for a in matrices]
 
