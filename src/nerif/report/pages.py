@@ -169,7 +169,7 @@ def _maps(seen: list[Seen], width: float) -> Figure:
                 add_colour_bar(list(line), label)
             else:
                 add_colour_bar(list(line[:2]), label)
-                add_colour_bar([line[2]], "difference [1]")
+                add_colour_bar([line[2]], f"difference [{o.technique.unit}]")
     return figure
 
 
