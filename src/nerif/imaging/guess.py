@@ -12,7 +12,7 @@ from nerif.conventions import InputError
 from nerif.imaging.bundle import Pose
 from nerif.imaging.targets import ViewPictures
 
-__all__ = ["DISAGREE", "Guess", "contradiction", "enough", "untied"]
+__all__ = ["DISAGREE", "Guess", "angles", "contradiction", "enough", "next_camera"]
 
 DISAGREE = 5.0  # degrees by which two guesses of a rotation may differ
 
@@ -44,14 +44,39 @@ def enough(view: ViewPictures, pictures: int) -> None:
         )
 
 
-def untied(views: Sequence[ViewPictures], missing: Collection[int], least: int) -> InputError:
-    """What to say of cameras that share fewer than one or two target poses with the others."""
-    number = "no target pose" if least == 1 else "fewer than two target poses"
-    names = ", ".join(f"'{views[i].name}'" for i in missing)
-    return InputError(
-        f"view {names}: {number} shared with the other cameras, so there is no common frame; take "
-        "pictures of one pose with neighbouring cameras at the same time, under the same number"
-    )
+def next_camera(
+    views: Sequence[ViewPictures], tied: Collection[int], targets: Collection[str], least: int
+) -> tuple[int, list[str]]:
+    """Return the camera, of those not tied to the others yet, that shares most target poses with them, and which.
+
+    Parameters
+    ----------
+    views : what was found in the pictures of each camera
+    tied : numbers of the cameras that are
+    targets : names of the target poses that these have seen
+    least : number of poses it has to share
+
+    Raises
+    ------
+    InputError
+        If there is none that shares as many.
+    """
+    shared = {i: [n for n in view.poses if n in targets] for i, view in enumerate(views) if i not in tied}
+    chosen = max(shared, key=lambda i: len(shared[i]))
+    if len(shared[chosen]) < least:
+        number = "no target pose" if least == 1 else "fewer than two target poses"
+        names = ", ".join(f"'{views[i].name}'" for i in shared)
+        raise InputError(
+            f"view {names}: {number} shared with the other cameras, so there is no common frame; take "
+            "pictures of one pose with neighbouring cameras at the same time, under the same number"
+        )
+    return chosen, shared[chosen]
+
+
+def angles(a: Float[np.ndarray, "*#n 3 3"], b: Float[np.ndarray, "*#n 3 3"]) -> Float[np.ndarray, "*n"]:
+    """Return the angles between rotations, degrees."""
+    cosine = ((a * b).sum(axis=(-2, -1)) - 1) / 2
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def contradiction(view: str, pose: str, degrees: float) -> InputError:

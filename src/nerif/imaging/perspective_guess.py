@@ -8,7 +8,7 @@ import numpy as np
 
 from nerif.conventions import InputError
 from nerif.imaging.bundle import Pose
-from nerif.imaging.guess import DISAGREE, Guess, contradiction, enough, untied
+from nerif.imaging.guess import DISAGREE, Guess, angles, contradiction, enough, next_camera
 from nerif.imaging.targets import ViewPictures
 
 __all__ = ["guess_perspective"]
@@ -81,13 +81,8 @@ def _tie_together(
     targets = {world: Pose(np.eye(3), np.zeros(3))}
     cameras: dict[int, Pose] = {}
     while len(cameras) < len(views):
-        counts = {
-            i: sum((n in targets) for n in view.poses) for i, view in enumerate(views) if i not in cameras
-        }  # fmt: skip
-        i = max(counts, key=lambda c: counts[c])
-        if not counts[i]:
-            raise untied(views, counts, 1)
-        guesses = {n: alone[i][1][n, False] @ targets[n].inverse for n in views[i].poses if n in targets}
+        i, shared = next_camera(views, cameras, targets, 1)
+        guesses = {n: alone[i][1][n, False] @ targets[n].inverse for n in shared}
         cameras[i] = _agreed(guesses, views[i].name)
         for n in views[i].poses:
             targets.setdefault(n, cameras[i].inverse @ alone[i][1][n, False])
@@ -97,7 +92,8 @@ def _tie_together(
 def _agreed(guesses: dict[str, Pose], name: str) -> Pose:
     """The guess that agrees best with the others, if they agree at all."""
     every = list(guesses.values())
-    distances = np.array([[_angle(a, b) for b in every] for a in every])
+    rotations = np.stack([guess.rotation for guess in every])
+    distances = angles(rotations[:, None], rotations)
     middle = int(np.argmin(np.median(distances, axis=1)))
     best = every[middle]
     far = np.array([np.linalg.norm(a.inverse.translation - best.inverse.translation) for a in every])
@@ -107,9 +103,3 @@ def _agreed(guesses: dict[str, Pose], name: str) -> Pose:
         worst = list(guesses)[int(np.argmax(distances[middle]))]
         raise contradiction(name, worst, float(distances[middle].max()))
     return best
-
-
-def _angle(a: Pose, b: Pose) -> float:
-    """Angle between two rotations, degrees."""
-    cosine = (np.trace(a.rotation @ b.rotation.T) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from nerif.conventions import InputError
 from nerif.imaging.bundle import Bundle, Pose
-from nerif.imaging.guess import DISAGREE, Guess, contradiction, enough, untied
+from nerif.imaging.guess import DISAGREE, Guess, angles, contradiction, enough, next_camera
 from nerif.imaging.targets import Detection, ViewPictures
 
 __all__ = ["guess_telecentric", "mirrored"]
@@ -109,20 +109,15 @@ def _tie_together(
     cameras = {first: np.eye(3)}  # the frame until all are tied together
     targets = dict(alone[first].turns)  # each with both rotations or, once another camera has seen it, one
     while len(cameras) < len(views):
-        shared = {
-            i: [n for n in view.poses if n in targets] for i, view in enumerate(views) if i not in cameras
-        }  # fmt: skip
-        i = max(shared, key=lambda c: len(shared[c]))
-        if len(shared[i]) < 2:
-            raise untied(views, shared, 2)
-        cameras[i], apart = _next_camera(alone[i].turns, targets, shared[i])
+        i, shared = next_camera(views, cameras, targets, 2)
+        cameras[i], apart = _turned_alike(alone[i].turns, targets, shared)
         if (apart > DISAGREE).sum() * 2 >= len(apart):
-            raise contradiction(views[i].name, shared[i][int(apart.argmax())], float(apart.max()))
+            raise contradiction(views[i].name, shared[int(apart.argmax())], float(apart.max()))
         for name, turns in alone[i].turns.items():
             if name not in targets:
                 targets[name] = cameras[i].T @ turns
             else:
-                left = _angles(cameras[i] @ targets[name][:, None], turns).min(axis=1)
+                left = angles(cameras[i] @ targets[name][:, None], turns).min(axis=1)
                 if left.min() < DISAGREE:
                     targets[name] = targets[name][[left.argmin()]]
     if len(views) > 1 and len(targets[world]) > 1:
@@ -132,7 +127,7 @@ def _tie_together(
     return {i: camera @ to_world.T for i, camera in cameras.items()}, turned
 
 
-def _next_camera(
+def _turned_alike(
     turns: Mapping[str, np.ndarray], targets: Mapping[str, np.ndarray], shared: Sequence[str]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " pose"]]:
     """The rotation under which a camera's targets are turned as the others see them, and by how much they are not."""
@@ -140,16 +135,10 @@ def _next_camera(
         (turns[n][:, None] @ targets[n].transpose(0, 2, 1)[None]).reshape(-1, 3, 3) for n in shared
     ])  # fmt: skip
     apart = np.stack([
-        _angles(tried[:, None, None] @ targets[n][None, :, None], turns[n][None, None]).min(axis=(1, 2)) for n in shared
+        angles(tried[:, None, None] @ targets[n][None, :, None], turns[n][None, None]).min(axis=(1, 2)) for n in shared
     ], axis=1)  # fmt: skip
     best = int(np.minimum(apart, FARTHEST).sum(axis=1).argmin())
     return tried[best], apart[best]
-
-
-def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles between rotations, degrees."""
-    cosine = ((a * b).sum(axis=(-2, -1)) - 1) / 2
-    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _places(
