@@ -78,7 +78,7 @@ def stage(name: str, folder: Path, views: int, pixels: int, steps: int) -> list[
         found = reproject(out.field()[0], data)
         rms = float(found.predicted.square().mean().sqrt())
         sigma = NOISE * rms
-        error = found.accuracy.error_px
+        error = found.accuracies[0].error
         note = f"error {error:.2g} px = {error / rms:.2%} of rms d = {error / sigma:.3f} sigma"
         torch.save(found.predicted, kept)
     elif name == "score" and views_seen is not None:

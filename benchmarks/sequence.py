@@ -72,7 +72,7 @@ def run(
     if joint:
         reconstruct_jointly(plan, 0, len(sequence))
     elif first is not None:
-        store.write_frame(0, Frame(first.field(0), [first.volume(0, "index_excess")], {}, {}, 0.0, 0))
+        store.write_frame(0, Frame(first.field(0), [first.volume(0, "index_excess")], [], 0.0, 0))
         reconstruct_frames(plan, 0, len(sequence))
     else:
         for i in last:

@@ -68,7 +68,7 @@ def best_mlem(data: Path, name: str) -> tuple[LineScan, float, np.ndarray, int]:
     for count in range(10, ITERATIONS["MLEM"] + 1, 10):
         method = MLEM(voxels=60, basis="linear", iterations=count, tolerance=0.0, device="cpu")
         scan, predicted, _, told = reconstruct(read(data, name), HELD_OUT, method)
-        found.append((relative_error(predicted[OUT], scan.readings[OUT]), count, scan, told["axis_mm"], predicted))
+        found.append((relative_error(predicted[OUT], scan.readings[OUT]), count, scan, told.axis, predicted))
     _, count, scan, axis, predicted = min(found, key=lambda f: f[0])
     return scan, axis, predicted, count
 
@@ -83,20 +83,21 @@ def main() -> None:
     add_write(parser)
     asked = parser.parse_args()
     columns = ("slice", "method", "on the axis", "as read", "as read, but one", "seconds")
-    table = Table("Spray: angles left out", columns, asked.write)
+    table, tells = Table("Spray: angles left out", columns, asked.write), []
     for name in asked.slices:
         start = time.perf_counter()
         tv = example.total_variation(read(asked.data, name), HELD_OUT)
         scan, predicted, _, told = reconstruct(read(asked.data, name), HELD_OUT, tv)
         seconds = time.perf_counter() - start
-        axis = told["axis_mm"]
+        axis = told.axis
+        tells.append(f"{name}: {told}")
         best, iteration = sart(scan, axis)
         table.row([name, f"SART, best iteration ({iteration})", f"{best:.4f}", "", "", ""])
         of_mlem = best_mlem(asked.data, name)
         table.row([name, f"MLEM, best iteration ({of_mlem[3]})", *errors(*of_mlem[:3]), ""])
         table.row([name, f"TV, weight {tv.regularisation:g}", *errors(scan, axis, predicted), f"{seconds:.0f}"])
         table.row([name, f"NeRIF, median of {asked.seeds}", *networks(asked, name)])
-    table.text("", *(f"{name}: {words(asked.data, name)}" for name in asked.slices))
+    table.text("", *tells)
 
 
 def networks(asked: argparse.Namespace, name: str) -> list[str]:
@@ -107,23 +108,9 @@ def networks(asked: argparse.Namespace, name: str) -> list[str]:
         start = time.perf_counter()
         scan, predicted, _, told = reconstruct(read(asked.data, name), HELD_OUT, method)
         seconds = time.perf_counter() - start
-        rows.append([*map(float, errors(scan, told["axis_mm"], predicted)), seconds])
+        rows.append([*map(float, errors(scan, told.axis, predicted)), seconds])
     middle = np.median(rows, axis=0)
     return [*(f"{m:.4f}" for m in middle[:3]), f"{middle[3]:.0f}"]
-
-
-def words(data: Path, name: str) -> str:
-    """What the scan tells of itself."""
-    kept = [i for i in range(len(read(data, name).angles)) if i not in OUT]
-    scan = read(data, name).select(kept)
-    offset, noise = scan.offset, scan.noise
-    scan = scan.without_offset()
-    bend, before, after = scan.bend()
-    axis = scan.unbent(bend).axis()
-    return (
-        f"offset {offset:.4f}, noise beside the medium {noise:.1e}, axis at {axis:.3f} mm, readings A - {bend:.3f} A²; "
-        f"totals of the angles scatter by {before:.1%}, {after:.1%} once that is undone"
-    )
 
 
 if __name__ == "__main__":

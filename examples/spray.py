@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from nerif import NeRIF, TotalVariation, reproject
-from nerif.imaging.line_scans import LineScan
+from nerif.imaging.line_scans import LineScan, Told
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 
 HELD_OUT = (2, 7, 12, 17)
@@ -34,21 +34,18 @@ def read(path: Path, name: str) -> LineScan:
 
 def reconstruct(
     scan: LineScan, held_out: tuple[int, ...], method: Reconstructor
-) -> tuple[LineScan, np.ndarray, Reconstruction, dict[str, float]]:
+) -> tuple[LineScan, np.ndarray, Reconstruction, Told]:
     """Return the scan without offset, what is predicted of all its angles, the field, and what the scan told.
 
     Nothing of the angles held out is used.
     """
     kept = [i for i in range(len(scan.angles)) if i not in held_out]
-    offset = scan.select(kept).offset
-    scan = replace(scan, readings=scan.readings - offset)
-    bend, before, after = scan.select(kept).bend()
-    axis = scan.select(kept).unbent(bend).axis()
-    whole = scan.unbent(bend).measurement(axis)
+    told = scan.select(kept).tell()
+    scan = scan.without_offset(told.offset)
+    whole = scan.unbent(told.bend).measurement(told.axis)
     training = whole.select([whole.names[i] for i in kept])
     found = method(replace(training, maps={"absorbance": training.maps["absorbance"]}))  # all readings count alike
-    predicted = LineScan.bent(reproject(found.field, whole).predicted[:, 0, :, 0].numpy(), bend)
-    told = {"offset": offset, "axis_mm": axis, "bend": bend, "scatter": before, "scatter_after": after}
+    predicted = LineScan.bent(reproject(found.field, whole).predicted[:, 0, :, 0].numpy(), told.bend)
     return scan, predicted, found, told
 
 
@@ -123,11 +120,7 @@ def main() -> None:
     if asked.method == "tv":
         methods["tv"] = total_variation(scan, held_out)
     scan, predicted, found, told = reconstruct(scan, held_out, methods[asked.method])
-    print(f"offset {told['offset']:.4f}, axis of rotation at {told['axis_mm']:.3f} mm")
-    print(
-        f"readings are A - {told['bend']:.3f} A^2 or so: totals of the angles scatter by {told['scatter']:.2%}, "
-        f"{told['scatter_after']:.2%} once that is undone"
-    )
+    print(told)
     kept = [i for i in range(len(scan.angles)) if i not in held_out]
     print(f"angles reconstructed from: relative rms error {relative_error(predicted[kept], scan.readings[kept]):.4f}")
     if held_out:

@@ -95,7 +95,7 @@ def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_p
     store = SequenceStore.begin(tmp_path / "r.zarr", sequence, grid, ("index_excess",), shape, {})
     field = NeuralField(Network(shape), measurement.box, 1e-4)
     excess = Volume(field.sample(grid), grid)
-    store.write_frame(0, Frame(field, [excess], {}, {}, 0.0, 0))
+    store.write_frame(0, Frame(field, [excess], [], 0.0, 0))
     truth = VolumeSequence.create(tmp_path / "t.zarr", [0.0], grid, ("index_excess",), 1.0)
     truth.write(0, [replace(excess, values=excess.values + (N_AMBIENT - 1))])
     assert evaluate_sequence(store.path, truth.path)["mean"]["l2_variation"] < 1e-3

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.geometry import Box, Camera, Ring
+from nerif.geometry import PROJECTIONS, Box, Camera, Ring
 from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
 from nerif.simulation import view_displacement
 
@@ -107,21 +107,42 @@ def test_movement_between_pixel_centres_is_that_of_rays_bent_one_by_one(camera, 
     assert float((each - between).std()) < 0.02 * float((between - reference).std())
 
 
-def test_a_lens_is_sharp_in_focus_and_blurs_by_its_circle_of_confusion(camera):
-    flat = dataclasses.replace(Ring(views=1, arc=(0.0, 0.0), image_size=(8, 60), pixel_pitch=0.04).cameras()[0])
+@pytest.mark.parametrize("projection", sorted(PROJECTIONS))
+def test_a_lens_is_sharp_in_focus_and_blurs_by_its_circle_of_confusion(projection):
+    flat = Ring(views=1, arc=(0.0, 0.0), image_size=(3, 60), pixel_pitch=0.04, projection=projection).cameras()[0]
     edge = torch.zeros(100, 600, dtype=torch.float64)
     edge[:, 300:] = 1.0
     texture = background_texture(flat, edge, 0.5)
     pinhole = render(flat, texture)
-    sharp = render(flat, texture, lens=Lens(diameter=10.0, points=31))
+    sharp = render(flat, texture, lens=Lens(diameter=10.0, points=9))
     assert float((pinhole - sharp).abs().max()) < 0.02
-    blurred = render(flat, texture, lens=Lens(diameter=10.0, focus=700.0, points=100))
-    spread = np.diff(blurred.numpy()[4])
+    blurred = render(flat, texture, lens=Lens(diameter=10.0, focus=700.0, points=40))
+    spread = np.diff(blurred.numpy()[1])
     columns = np.arange(len(spread))
     variance = np.average((columns - np.average(columns, weights=spread)) ** 2, weights=spread)
-    focal = float(flat.intrinsics[0, 0])
-    circle = 10.0 * abs(1 / 700 - 1 / 1200) * focal  # px
+    behind = flat.centre + 1200 * flat.rotation[2]
+    circle = 10.0 * abs(1200 / 700 - 1) / float(flat.pixel_size(behind))  # px
     assert variance == pytest.approx((circle / 4) ** 2 + 1 / 12, rel=0.1)  # of a disc, along one axis, and a pixel
+
+
+def test_where_a_telecentric_lens_is_along_its_axis_changes_no_picture(ball):
+    """Calibration lays z_cam = 0 through the flow: the rays of its aperture begin before it all the same."""
+    ring = Ring(views=1, arc=(20.0, 20.0), image_size=(12, 16), pixel_pitch=0.12, projection="telecentric")
+    far = ring.cameras()[0]
+    near = dataclasses.replace(far, translation=far.translation * torch.tensor([1.0, 1.0, 0.0]).double())
+    width, height = pattern_size(far)
+    noise = gaussian_filter(np.random.default_rng(0).standard_normal((round(height), round(width))), 1.5)
+    texture = background_texture(far, torch.from_numpy(0.5 + 0.15 * noise / noise.std()), 1.0)
+    strong, pictures, diameters = Times(ball, 30.0), [], []
+    for camera in (far, near):
+        lens = dataclasses.replace(Lens.stopped_down(camera, 0.12, 4.0), points=5)
+        diameters.append(lens.diameter)
+        still = render(camera, texture, samples=1, lens=lens)
+        pictures.append((still, render(camera, texture, strong, BOX, 1.00027, 1, lens, 60) - still))
+    assert diameters[0] / diameters[1] == pytest.approx(1200 / 500)  # one cone, cut elsewhere
+    for a, b in zip(*pictures, strict=True):
+        assert float(a.std()) > 1e-3
+        assert float((a - b).abs().max()) < 1e-4
 
 
 @pytest.mark.slow

@@ -18,8 +18,9 @@ def test_nothing_is_found(command: list[str]) -> None:
 
 
 def test_no_merge_was_left_half_done() -> None:
-    files = [file for folder in ("docs", "src", "tests", "examples", "benchmarks") for file in (ROOT / folder).rglob("*")]
-    texts = [file for file in [*files, *ROOT.glob("*.*")] if file.suffix in (".md", ".py", ".toml", ".txt", ".js", ".css")]
+    folders = ("docs", "src", "tests", "examples", "benchmarks")
+    files = [*(file for folder in folders for file in (ROOT / folder).rglob("*")), *ROOT.glob("*.*")]
+    texts = [file for file in files if file.suffix in (".md", ".py", ".toml", ".txt", ".js", ".css")]
     assert len(texts) > 300
     left = [str(f) for f in texts if any(line.startswith(("<" * 7, ">" * 7)) for line in f.read_text().splitlines())]
     assert not left

@@ -20,11 +20,12 @@ from nerif.measurement import Measurement
 from nerif.mistakes import everywhere, of_one_view
 from nerif.physics.quantities import GasSettings
 from nerif.report import packing
-from nerif.report.pages import error_of, figures_of, residuals_over_sigma
+from nerif.report.pages import error_of, figures_of, residuals_over_sigma, view
 from nerif.report.view_images import view_images
 from nerif.result import ResultDirectory
 from nerif.sequence.plan import SequenceSettings
 from nerif.symptoms import looks
+from nerif.techniques.absorption import Absorption
 from nerif.volume import INDEX, Volume, field_of
 from nerif.volume_file import read_volume, write_netcdf
 
@@ -113,6 +114,13 @@ def test_figures_have_the_labels_of_the_technique(absorption):
     assert "error of extinction coefficient [mm⁻¹]" in labels["comparison"]
     assert "absorbance [1]" in labels["view_0deg"]
     assert not any("displacement" in text or "kg" in text for text in labels.values())
+
+
+def test_a_difference_has_the_unit_of_its_technique(absorption, monkeypatch):
+    result = ResultDirectory(absorption).read()
+    monkeypatch.setattr(Absorption, "unit", "dB")
+    labels = [axes.get_ylabel() for axes in view(result.reprojection, 0, 190).axes]
+    assert "difference [dB]" in labels
 
 
 def test_a_plain_quantity_is_packed_as_it_is():

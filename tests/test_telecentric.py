@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
 
+from nerif.cli import main
 from nerif.consistency import binned
 from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
-from nerif.measurement import Measurement
+from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
+from nerif.measurement import Measurement, measurement_of
 from nerif.physics.path_integral import PathIntegral
+from nerif.physics.quantities import GasSettings, derive
 from nerif.physics.ray_tracing import background_points
 from nerif.prediction import _interpolated, reproject
 from nerif.reconstruction.bins import binned_rays
@@ -22,9 +27,13 @@ from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.report.rig_figure import draw_rig, picture_corners
+from nerif.report.scene import scene_of
+from nerif.result import Result
 from nerif.simulation import simulate, view_displacement
+from nerif.techniques.absorption import Absorption
 from nerif.techniques.deflection import LeverArm
 from nerif.techniques.registry import TECHNIQUES, forward_model
+from nerif.volume import Volume
 
 AMBIENT = 1.00027
 
@@ -102,6 +111,37 @@ def test_the_file_keeps_the_projection_of_each_view(seen, tmp_path):
     with pytest.raises(InputError, match="variable 'projection': expected one name a view, got dimensions"):
         Measurement.from_dataset(dataset)
     assert dataset.attrs["Conventions"] == "BOST-1.1"  # a reader of BOST-1.0 would take them for pinholes
+
+
+@pytest.mark.parametrize("characters", [True, False])
+def test_names_in_characters_or_of_fixed_length_are_read(seen, tmp_path, characters):
+    dataset = seen.to_dataset()
+    dataset["projection"] = (("view",), np.array([b"telecentric"] * len(CAMERAS)))
+    dataset["view"] = (("view",), np.array([c.name.encode() for c in CAMERAS]))
+    dataset.to_netcdf(tmp_path / "m.nc", engine="h5netcdf")  # as arrays of characters
+    if not characters:
+        with h5py.File(tmp_path / "m.nc", "r+") as file:
+            del file["projection"]
+            file["projection"] = np.array([b"telecentric   "] * len(CAMERAS), dtype="S14")
+            file["projection"].dims[0].attach_scale(file["translation"].dims[0][0])
+    again = Measurement.read(tmp_path / "m.nc")
+    assert [c.projection for c in again.cameras] == [TELECENTRIC] * len(CAMERAS)
+    assert again.names == tuple(c.name for c in CAMERAS)
+
+
+def test_scales_are_in_pixels_a_millimetre(seen):
+    dataset = seen.to_dataset()
+    assert dataset["intrinsics"].attrs["units"] == "px mm-1"
+    for unit in ("px", "px/mm"):
+        dataset["intrinsics"].attrs["units"] = unit
+        assert Measurement.from_dataset(dataset).cameras[0].projection == TELECENTRIC
+    dataset["intrinsics"].attrs["units"] = "px/m"
+    with pytest.raises(InputError, match="'intrinsics': expected units 'px or px mm-1', got 'px/m'"):
+        Measurement.from_dataset(dataset)
+    pinholes = dataset.drop_vars("projection")
+    pinholes["intrinsics"].attrs["units"] = "px/mm"
+    with pytest.raises(InputError, match="'intrinsics': expected units 'px', got 'px/mm'"):
+        Measurement.from_dataset(pinholes)
 
 
 def test_a_field_comes_back_and_is_seen_again(seen, ball, box):
@@ -185,3 +225,37 @@ def test_cameras_are_drawn_before_what_they_look_at(kind, background):
     axes = Figure().add_subplot(projection="3d")
     names = {text.get_text() for text in draw_rig(axes, cameras).texts}
     assert {c.name for c in cameras} < names
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_the_page_draws_beams_that_end(seen, tmp_path, background):
+    """What the 3-D view of the report is given: json that a browser reads, so no infinite number."""
+    m = seen
+    if not background:
+        cameras = tuple(replace(c, background=None) for c in seen.cameras)
+        m = measurement_of({Absorption: torch.zeros(5, 20, 26, 1)}, cameras, seen.box, AMBIENT)
+    values, grid = torch.linspace(-1e-4, 0, 4**3).reshape(4, 4, 4), Grid(seen.box, (4, 4, 4))
+    excess = Volume(values, grid, attributes={"n_ambient": AMBIENT})
+    volumes = {"index_excess": excess, "n": derive(excess, "n", GasSettings())}
+    scene, _ = scene_of(Result(tmp_path, measurement=m, volumes=volumes))
+    assert scene is not None
+    drawn = json.loads(json.dumps(scene, allow_nan=False))
+    assert drawn["backgrounds"] == background
+    assert len(drawn["cameras"]) == 5
+    for camera, own in zip(drawn["cameras"], m.cameras, strict=True):
+        starts, ends, directions = (np.array(camera[k]) for k in ("starts", "ends", "directions"))
+        axis = own.rotation[2].numpy()
+        assert np.allclose(directions, axis, atol=1e-5)  # a beam
+        assert np.ptp(starts, axis=0).max() > 20  # mm
+        assert (starts @ axis).max() < -20
+        assert ((ends - starts) @ axis).min() > 20
+        assert np.abs(np.array([starts, ends])).max() < 1e4
+
+
+def test_a_calibration_without_backgrounds_is_a_rig_that_is_drawn(tmp_path, capsys):
+    cameras = [CalibratedCamera.from_camera(replace(through_the_origin(c), background=None)) for c in CAMERAS]
+    write_cameras(tmp_path / "c.toml", cameras)
+    assert [c.camera().background for c in read_cameras(tmp_path / "c.toml")] == [None] * len(CAMERAS)
+    assert main(["calibrate", str(tmp_path / "c.toml"), "--check", "-o", str(tmp_path / "drawn.toml")]) == 0
+    assert "not drawn" not in capsys.readouterr().out
+    assert (tmp_path / "drawn.rig.png").stat().st_size > 20_000

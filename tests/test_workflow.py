@@ -35,7 +35,7 @@ def test_python_writes_the_whole_directory(made, measurement, capsys):
     found = out.read()
     assert not found.missing
     assert [v["name"] for v in found.metrics["views"] if v["held_out"]] == ["144deg"]
-    assert found.metrics["reprojection"]["error_px"] == 0
+    assert [r["error_px"] for r in found.metrics["reprojection"]] == [0]
     assert found.settings["method"] == "tikhonov"
     assert found.settings["voxels"] == 8
     field, box, n_ambient = out.field()

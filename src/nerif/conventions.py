@@ -27,6 +27,8 @@ __all__ = [
     "VoxelIndex",
     "ambient_index",
     "parse_faces",
+    "unit_shown",
+    "with_unit",
 ]
 
 COMPONENTS = ("u", "v")
@@ -71,6 +73,16 @@ def ambient_index(value: object, name: str = "n_ambient") -> float:
     if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < LARGEST_INDEX:
         raise InputError(f"{name}: expected a refractive index such as 1.00027, got {value}")
     return float(value)
+
+
+def unit_shown(unit: str) -> str:
+    """Return a unit as people see it: nothing for that of a pure number, 1."""
+    return "" if unit == "1" else unit
+
+
+def with_unit(value: object, unit: str) -> str:
+    """Return a number, or a text that ends with one, with its unit behind it."""
+    return f"{value} {unit_shown(unit)}".rstrip()
 
 
 def parse_faces(text: str | tuple[str, ...] | list[str], name: str = "ambient_faces") -> tuple[str, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.conventions import InputError, with_unit
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
+from nerif.gains import gains_of, with_gains
 from nerif.geometry import Box
 from nerif.measurement import Measurement
 from nerif.metrics import slice_metrics, view_metrics, volume_metrics
 from nerif.notebook import number
 from nerif.observation import Observation
-from nerif.prediction import reproject
+from nerif.prediction import check_sees, reproject
 from nerif.reprojection import Reprojection
 from nerif.result import VOLUME, ResultDirectory
 from nerif.techniques.registry import AUTO
@@ -43,6 +43,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Compare a result directory with a truth or with measured views; return the metrics, and add them to it.
 
+    Views whose gains were fitted with the field are divided by them, as they were then.
+
     Parameters
     ----------
     result : directory of a reconstruction
@@ -54,8 +56,8 @@ def evaluate(
     Raises
     ------
     InputError
-        If there is nothing to compare, the truth is of another quantity, over an unknown ambient or sticks out of the
-        box, or there is no such view.
+        If there is nothing to compare, truth or measurement are of another quantity, the truth is over an unknown
+        ambient or sticks out of the box, or there is no such view.
     """
     if truth is None and measurement is None:
         raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")
@@ -63,17 +65,21 @@ def evaluate(
     field, box, n_ambient = directory.field()
     quantity = directory.quantity()
     metrics: dict[str, Any] = {}
+    data = None if measurement is None else Measurement.read(measurement)
+    if data is not None:
+        check_sees(data.techniques, quantity, str(measurement))
     if truth is not None:
         compared = _truth(Path(truth), box, n_ambient, quantity)
         metrics |= evaluate_volume(field, compared, n_ambient) | _coverage(directory, compared)
         metrics["quantity"] = quantity
         metrics["truth"] = str(Path(truth).resolve())
-    if measurement is not None:
-        data, asked = Measurement.read(measurement), directory.settings()
+    if data is not None:
+        asked = directory.settings()
         held_out = _held_out(hold_out, asked, data)
+        data = with_gains(data, gains_of(asked))
         views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", AUTO)))
-        metrics |= {"views": evaluate_views(views), "reprojection": asdict(views.accuracy)}
-        metrics["measurement"] = str(Path(measurement).resolve())
+        metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
+        metrics["measurement"] = str(Path(str(measurement)).resolve())
         directory.write_reprojection(views)
     directory.add_metrics(metrics)
     return metrics
@@ -116,10 +122,9 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     return views
 
 
-def rms_text(view: dict[str, Any]) -> str:
+def rms_text(view: dict[str, Any], digits: int = 4) -> str:
     """Return the rms error of a view with its unit."""
-    unit = view.get("unit", "px")
-    return number(view["rms"]) + (f" {unit}" if unit != "1" else "")
+    return with_unit(number(view.get("rms"), digits), view["unit"])
 
 
 def score_lines(views: list[dict[str, Any]]) -> list[str]:

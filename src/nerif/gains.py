@@ -7,9 +7,11 @@ One iteration of MLEM for the field on coarse voxels and the best gains for it f
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from typing import Any
+
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.geometry import Grid
@@ -17,15 +19,16 @@ from nerif.measurement import Measurement
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.techniques.registry import forward_model
 
-__all__ = ["fit_gains", "with_gains"]
+__all__ = ["fit_gains", "gains_of", "with_gains"]
 
 VOXELS = 32  # along the longest edge
 ROUNDS = 200  # at most
 SETTLED = 1e-5  # change of a gain in a round
+DARK = 0.01  # of the median gain: a view that shows less shows nothing, and its gain is noise
 
 
-def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> Float[Tensor, " view"]:
-    """Return the gain of every view, their geometric mean 1.
+def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> dict[str, float]:
+    """Return the gain of every view by its name, their geometric mean 1.
 
     Parameters
     ----------
@@ -35,7 +38,7 @@ def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> Float[Tensor, "
     Raises
     ------
     InputError
-        If it is of another technique, or of one view.
+        If it is of another technique, of one view, or a view shows next to nothing of what the others see.
     """
     (observation, *others) = measurement.observations
     if others or not observation.technique.gains:
@@ -44,31 +47,54 @@ def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> Float[Tensor, "
     if len(measurement.cameras) < 2:
         raise InputError("fit_gains: expected two views or more, got one, whose gain nothing tells")
     rays, values, _ = measurement.rays(observation)
-    view, measured = rays.view.long(), values[:, 0].clamp_min(0)
+    view, measured = rays.view.long(), values[:, 0]
     grid, model = Grid.of_resolution(measurement.box, voxels), forward_model(observation.technique, measurement)
     operator = VoxelOperator(rays, grid, model)
     reach = operator.T(torch.ones_like(values)).clamp_min(1e-12)
     field, gains = torch.ones(operator.domain_shape), torch.ones(len(measurement.cameras))
-    field *= measured.sum() / operator(field).sum()
+    field *= measured.clamp_min(0).sum() / operator(field).sum()
     count = len(gains)
     for _ in range(ROUNDS):
         seen = operator(field)[:, 0].clamp_min(1e-12)
         product, square = (torch.zeros(count).index_add(0, view, x) for x in (seen * measured, seen * seen))
-        fresh = torch.where(square > 0, product / square.clamp_min(1e-30), torch.ones(count)).clamp_min(1e-6)
+        fresh = torch.where(square > 0, product / square.clamp_min(1e-30), torch.ones(count))
+        for name, gain in zip(measurement.names, (fresh / fresh.median()).tolist(), strict=True):
+            if not gain > DARK:
+                raise InputError(
+                    f"fit_gains: view '{name}' shows {gain:.2g} times what the others make expect, too little to tell "
+                    f"its gain by; leave it out (--hold-out {name})"
+                )
         fresh = fresh / fresh.log().mean().exp()
         settled = float((fresh - gains).abs().max()) < SETTLED
         gains = fresh
-        field = field * operator.T((measured / gains[view] / seen)[:, None]) / reach
+        field = field * operator.T((measured.clamp_min(0) / gains[view] / seen)[:, None]) / reach
         if settled:
             break
-    return gains
+    return dict(zip(measurement.names, gains.tolist(), strict=True))
 
 
-def with_gains(measurement: Measurement, gains: Float[Tensor, " view"]) -> Measurement:
-    """Return the measurement with the values and sigmas of every view divided by its gain."""
+def gains_of(run: Mapping[str, Any]) -> dict[str, float]:
+    """Return the gains of views that run.toml keeps, none where none were fitted.
+
+    Raises
+    ------
+    InputError
+        If one is no number above 0.
+    """
+    found = {str(name): gain for name, gain in run.get("about", {}).get("gains", {}).items()}
+    for name, gain in found.items():
+        if not isinstance(gain, int | float) or not 0 < gain < math.inf:
+            raise InputError(f"gains of run.toml: expected a number above 0 for view '{name}', got {gain!r}")
+    return found
+
+
+def with_gains(measurement: Measurement, gains: Mapping[str, float]) -> Measurement:
+    """Return the measurement with the values and sigmas of the views named divided by their gains."""
+    if not gains:
+        return measurement
     values, sigmas = {}, {}
     for o in measurement.observations:
-        own = gains[:, None, None, None]
+        own = torch.tensor([gains.get(name, 1.0) for name in measurement.names])[:, None, None, None]
         values[o.technique.name] = o.values / own
         sigmas[o.technique.name] = None if o.sigma is None else o.sigma / own
     return measurement.observed(values, sigmas)

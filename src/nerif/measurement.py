@@ -18,7 +18,7 @@ from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, 
 from nerif.geometry import Box, Camera, Rays
 from nerif.measurement_summary import as_html, summary
 from nerif.netcdf import opened
-from nerif.observation import Observation, check_observations
+from nerif.observation import Observation, arguments_of, check_maps, check_observations
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES
 
@@ -51,7 +51,7 @@ class Measurement:
     wavelength_nm : of the light, or None
     ambient_faces : faces of the box on which the index is ambient (the gauge)
     maps : (view, row, column) of other techniques, by their names in the file: absorbance, absorbance_sigma, radiance,
-        radiance_sigma, fringes, fringes_sigma; NaN where not measured
+        radiance_sigma, fringes, fringes_sigma; NaN where not measured; (view, row, column, c) of one with c channels
     about_views : (view, ...) what else is known of the views, by its name in the file, such as aperture_diameter
 
     Raises
@@ -70,7 +70,7 @@ class Measurement:
     flow_mask: Bool[Tensor, "view row column"] | None = None
     wavelength_nm: float | None = None
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
-    maps: Mapping[str, Float[Tensor, "view row column"]] = field(default_factory=dict)
+    maps: Mapping[str, Float[Tensor, "view row column *c"]] = field(default_factory=dict)
     about_views: Mapping[str, Float[Tensor, "view ..."]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -88,18 +88,12 @@ class Measurement:
         self._check_geometry()
 
     def _check_shapes(self) -> None:
-        if not self.observations:
-            names = ", ".join(kind.measured for kind in TECHNIQUES.values())
-            raise InputError(f"measurement: expected one of {names}, got none of them")
-        shape, name = self.shape, self.observations[0].technique.measured
-        if len(self.cameras) != shape[0] or not self.cameras:
-            raise InputError(f"{name}: expected one map a camera ({len(self.cameras)}), got {shape[0]}")
+        """Refuse maps of the wrong shape or name, before anything asks what was observed."""
+        check_maps(self)
+        shape = self.shape
         if len(set(self.names)) < len(self.names):
             raise InputError(f"view: expected different names, got {', '.join(self.names)}")
-        others = {"sigma": self.sigma, "valid": self.valid, "flow_mask": self.flow_mask, **self.maps}
-        for name, value in others.items():
-            if value is not None and tuple(value.shape)[:3] != shape:
-                raise InputError(f"{name}: expected (view, row, column) = {shape}, got {tuple(value.shape)[:3]}")
+        measurement_file.check_about_views(self.about_views, len(self.cameras))
         for camera in self.cameras:
             if camera.image_size[0] > shape[1] or camera.image_size[1] > shape[2]:
                 raise InputError(
@@ -145,15 +139,17 @@ class Measurement:
 
     @cached_property
     def observations(self) -> tuple[Observation, ...]:
-        """What was seen, technique by technique."""
-        maps: dict[str, Tensor | None] = {"displacement": self.displacement, "sigma": self.sigma}
-        maps |= {name: value[..., None] for name, value in self.maps.items()}
-        found = []
-        for kind in TECHNIQUES.values():
-            values = maps.get(kind.measured)
-            if values is not None:
-                found.append(Observation(kind, values, maps.get(kind.sigma)))
-        return tuple(found)
+        """What was seen, technique by technique; a technique by which no pixel measured anything is none of them."""
+        given = self.measured_maps
+        found = [Observation.of(kind, given) for kind in TECHNIQUES.values() if kind.measured in given]
+        some = [o for o in found if len(found) == 1 or bool(self.usable_for(o).any())]
+        return tuple(some or found)
+
+    @property
+    def measured_maps(self) -> dict[str, Tensor]:
+        """What has numbers for each pixel, by its name in the file."""
+        given = {"displacement": self.displacement, "sigma": self.sigma, **self.maps}
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def displacements(self) -> Float[Tensor, "view row column 2"]:
@@ -182,7 +178,7 @@ class Measurement:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Views, rows and columns of the maps."""
-        views, rows, columns = self.observations[0].values.shape[:3]
+        views, rows, columns, *_ = next(iter(self.measured_maps.values())).shape
         return views, rows, columns
 
     def observed(self, values: Mapping[str, Tensor], sigmas: Mapping[str, Tensor | None] | None = None) -> Measurement:
@@ -196,9 +192,7 @@ class Measurement:
             sigma = o.sigma if sigmas is None else sigmas.get(o.technique.name)
             if sigma is not None:
                 new[o.technique.sigma] = sigma
-        displacement, sigma = new.pop("displacement", None), new.pop("sigma", None)
-        maps = {name: value[..., 0] for name, value in new.items()}
-        return replace(self, displacement=displacement, sigma=sigma, maps=maps)
+        return replace(self, **arguments_of(new))
 
     @property
     def usable(self) -> Bool[Tensor, "view row column"]:
@@ -387,8 +381,7 @@ def measurement_of(
     maps = {kind.measured: value for kind, value in values.items()}
     if len(values) > 1:
         maps |= {kind.sigma: torch.ones_like(value) for kind, value in values.items()}
-    displacement, sigma = maps.pop("displacement", None), maps.pop("sigma", None)
     return Measurement(
-        tuple(cameras), displacement, box=box, n_ambient=n_ambient, sigma=sigma, wavelength_nm=wavelength_nm,
-        ambient_faces=ambient_faces, maps={name: value[..., 0] for name, value in maps.items()},
+        tuple(cameras), box=box, n_ambient=n_ambient, wavelength_nm=wavelength_nm, ambient_faces=ambient_faces,
+        **arguments_of(maps),
     )  # fmt: skip

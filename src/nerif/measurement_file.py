@@ -6,6 +6,7 @@ technique's. The rest is known of the rig.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +14,8 @@ import torch
 from torch import Tensor
 
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
-from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, projection_named
-from nerif.netcdf import values
+from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, Projection, projection_named
+from nerif.netcdf import reading, values
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.registry import TECHNIQUES, technique
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
 __all__ = [
-    "ABOUT_VIEWS", "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "known_conventions", "map_names", "to_dataset",
-    "variables",
+    "ABOUT_VIEWS", "CONVENTIONS", "PLAIN", "check_about_views", "encoding", "from_dataset", "known_conventions",
+    "map_names", "to_dataset", "variables",
 ]  # fmt: skip
 
 PLAIN, CONVENTIONS = "BOST-1.0", "BOST-1.1"
@@ -48,6 +49,9 @@ RIG = {
 }
 """Dimensions and unit of what is known of the rig."""
 
+SPELLED = {"px/mm": "px mm-1"}
+"""How units are written that may be read in either spelling."""
+
 MASKS = ("valid", "flow_mask")
 
 ABOUT_VIEWS = {
@@ -60,7 +64,7 @@ ABOUT_VIEWS = {
 
 NEEDED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
-SIZES = {"component": 2, "i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2, "parameter": 6}
+SIZES = {"i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2, "parameter": 6}
 MOST_PIXELS = 1 << 32
 """Of all views together; a damaged file may claim any number."""
 
@@ -69,9 +73,14 @@ def variables() -> dict[str, tuple[tuple[str, ...], str]]:
     """Return dimensions and unit of every variable that a file may have."""
     measured: dict[str, tuple[tuple[str, ...], str]] = {}
     for kind in TECHNIQUES.values():
-        dimensions = (*PIXELS, "component") if len(kind.channels) > 1 else PIXELS
+        dimensions = PIXELS if len(kind.channels) == 1 else (*PIXELS, _component(len(kind.channels)))
         measured |= {kind.measured: (dimensions, kind.unit), kind.sigma: (dimensions, kind.unit)}
     return {**measured, **RIG, **ABOUT_VIEWS}
+
+
+def _component(channels: int) -> str:
+    """The dimension that so many channels stand along: those of one size share one."""
+    return "component" if channels == len(COMPONENTS) else f"component_{channels}"
 
 
 def map_names() -> tuple[str, ...]:
@@ -82,6 +91,22 @@ def map_names() -> tuple[str, ...]:
 def known_conventions(found: object) -> bool:
     """Return whether an attribute Conventions is that of a measurement."""
     return isinstance(found, str) and found in (PLAIN, CONVENTIONS)
+
+
+def check_about_views(given: Mapping[str, Tensor], views: int) -> None:
+    """Refuse what is not known of views, and what is not of as many views as there are.
+
+    Raises
+    ------
+    InputError
+        Naming it.
+    """
+    for name, value in given.items():
+        if name not in ABOUT_VIEWS:
+            raise InputError(f"about_views: expected names out of {', '.join(ABOUT_VIEWS)}, got '{name}'")
+        whole = tuple(SIZES.get(dimension, views) for dimension in ABOUT_VIEWS[name][0])
+        if tuple(value.shape) != whole:
+            raise InputError(f"about_views: expected {name} of shape {whole}, got {tuple(value.shape)}")
 
 
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
@@ -117,12 +142,15 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         nowhere = torch.full((3,), torch.nan, dtype=torch.float64)
         data["background_normal"] = stack([nowhere if c.background is None else c.background.normal for c in cameras])
         data["background_offset"] = np.array([np.nan if c.background is None else c.background.offset for c in cameras])
-    maps = {"displacement": measurement.displacement, "sigma": measurement.sigma, **measurement.maps}
-    for name, value in {**maps, "valid": measurement.valid, "flow_mask": measurement.flow_mask}.items():
+    masks = {"valid": measurement.valid, "flow_mask": measurement.flow_mask}
+    for name, value in {**measurement.measured_maps, **masks}.items():
         if value is not None:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
     data |= {name: value.numpy() for name, value in measurement.about_views.items()}
     dataset = xr.Dataset({k: (known[k][0], v, {"units": known[k][1]}) for k, v in data.items()})
+    scales = {c.projection.unit for c in cameras}
+    if len(scales) == 1:
+        dataset["intrinsics"].attrs["units"] = _spelled(scales.pop())
     dataset = dataset.assign_coords(view=list(measurement.names))
     if measurement.displacement is not None:
         dataset = dataset.assign_coords(component=list(COMPONENTS))
@@ -187,6 +215,7 @@ def _check_variables(dataset: xr.Dataset) -> None:
     """Refuse missing variables and wrong dimensions, sizes, types and units, by name."""
     kinds = _techniques(dataset)
     needed = [*(kind.measured for kind in kinds), *NEEDED, *(BACKGROUND if any(k.background for k in kinds) else ())]
+    sizes = SIZES | {_component(n): n for n in (len(kind.channels) for kind in TECHNIQUES.values()) if n > 1}
     for name, (dimensions, unit) in variables().items():
         if name not in dataset:
             if name not in needed:
@@ -197,12 +226,15 @@ def _check_variables(dataset: xr.Dataset) -> None:
             got = tuple(map(str, variable.dims))
             raise InputError(f"variable '{name}': expected dimensions {dimensions}, got {got}")
         for dimension in dimensions:
-            size, given_size = SIZES.get(dimension), variable.sizes[dimension]
+            size, given_size = sizes.get(dimension), variable.sizes[dimension]
             if given_size == 0 or (size is not None and given_size != size):
                 raise InputError(f"variable '{name}': expected {size or 'some'} along {dimension}, got {given_size}")
-        given = variable.attrs.get("units", unit)
-        if not (isinstance(given, str) and given.replace(",", " ").split() == unit.split()):
-            raise InputError(f"variable '{name}': expected units '{unit}', got '{given}'")
+        given, units = variable.attrs.get("units", unit), [unit]
+        if name == "intrinsics":
+            units = list(dict.fromkeys([unit, *(_spelled(p.unit) for p in _projections(dataset))]))
+        words = " ".join(given.replace(",", " ").split()) if isinstance(given, str) else ""
+        if _spelled(words) not in units:
+            raise InputError(f"variable '{name}': expected units '{' or '.join(units)}', got '{given}'")
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
         shape = f"{views} x {rows} x {columns}"
@@ -242,19 +274,39 @@ def _box(dataset: xr.Dataset) -> Box:
     return Box(tuple(lower), tuple(upper))
 
 
+def _spelled(unit: str) -> str:
+    return SPELLED.get(unit, unit)
+
+
+def _texts(variable: xr.DataArray) -> list[str]:
+    """Texts of any kind: of variable or fixed length, in characters or bytes, padded or not."""
+    with reading(f"variable '{variable.name}': cannot be read; is the file damaged?"):
+        found = variable.values.ravel()
+    return [(v.decode(errors="replace") if isinstance(v, bytes) else str(v)).strip(" \0") for v in found]
+
+
+def _names(dataset: xr.Dataset) -> list[str]:
+    return _texts(dataset["view"]) if "view" in dataset.coords else [str(i) for i in range(dataset.sizes["view"])]
+
+
+def _projections(dataset: xr.Dataset) -> list[Projection]:
+    names = _names(dataset)
+    if "projection" not in dataset:
+        return [PERSPECTIVE] * len(names)
+    found = dataset["projection"]
+    if found.dims != ("view",):
+        raise InputError(f"variable 'projection': expected one name a view, got dimensions {found.dims}")
+    return [projection_named(p, f"projection of view '{n}'") for n, p in zip(names, _texts(found), strict=True)]
+
+
 def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
-    views = dataset.sizes["view"]
-    names = [str(n) for n in dataset["view"].values] if "view" in dataset.coords else [str(i) for i in range(views)]
+    views, names, projections = dataset.sizes["view"], _names(dataset), _projections(dataset)
     whole = torch.tensor([dataset.sizes["row"], dataset.sizes["column"]], dtype=torch.float64).expand(views, 2)
     sizes = _array(dataset, "image_size") if "image_size" in dataset else whole
     distortion = _array(dataset, "distortion") if "distortion" in dataset else torch.zeros(views, 5).double()
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
     nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64)
     normals, offsets = (_array(dataset, n, True) if n in dataset else nowhere for n in BACKGROUND)
-    kinds = dataset["projection"].values if "projection" in dataset else np.array([PERSPECTIVE.name] * views)
-    if kinds.shape != (views,):
-        got = dataset["projection"].dims
-        raise InputError(f"variable 'projection': expected one name a view, got dimensions {got}")
     cameras = []
     for i, name in enumerate(names):
         height, width = sizes[i].tolist()
@@ -267,7 +319,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 background=_plane(normals[i], offsets[i], name),
                 distortion=distortion[i],
                 name=name,
-                projection=projection_named(str(kinds[i]), f"projection of view '{name}'"),
+                projection=projections[i],
             )
         )
     return tuple(cameras)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from nerif.conventions import with_unit
 from nerif.notebook import PIXELS, number, panel, show_views
 from nerif.observation import Observation
 from nerif.techniques.deflection import Deflection
@@ -45,11 +46,11 @@ def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str
         if observation.sigma is not None:
             noise += float(observation.sigma[i][mask].double().square().sum())
     count = max(int(usable.sum()), 1) * len(kind.channels)
-    rms, sigma = (number((total / count) ** 0.5, 3) for total in (squares, noise))
-    unit = "" if kind.unit == "1" else f" {kind.unit}"
+    sizes = ((squares / count) ** 0.5, (noise / count) ** 0.5, largest)
+    rms, sigma, most = (with_unit(number(size, 3), kind.unit) for size in sizes)
     return [
-        (kind.measured.capitalize(), f"rms {rms}{unit}, up to {number(largest, 3)}{unit}"),
-        ("Noise σ", "not known" if observation.sigma is None else f"rms {sigma}{unit}"),
+        (kind.measured.capitalize(), f"rms {rms}, up to {most}"),
+        ("Noise σ", "not known" if observation.sigma is None else f"rms {sigma}"),
     ]
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from nerif.conventions import with_unit
 from nerif.drawing import (
     Drawable,
     add_colour_bar,
@@ -48,14 +49,15 @@ def percent(share: float) -> str:
     return "under 0.01%" if 0 < share < 1e-4 else f"{share:.2%}"
 
 
-def span(values: Float[np.ndarray, ...], unit: str = "", digits: int = 3) -> str:
+def span(values: Float[np.ndarray, ...], unit: str = "1", digits: int = 3) -> str:
     """Return lowest and highest value with their unit, and the share that is masked (NaN)."""
     known = values[np.isfinite(values)]
     if not known.size:
         return "masked everywhere"
     share = 1 - known.size / values.size
     masked = f"; {percent(share)} masked" if share else ""
-    return f"{number(float(known.min()), digits)} to {number(float(known.max()), digits)}{unit}{masked}"
+    low, high = (number(float(x), digits) for x in (known.min(), known.max()))
+    return f"{with_unit(f'{low} to {high}', unit)}{masked}"
 
 
 def panel(title: str, rows: Sequence[tuple[str, str]], *pictures: tuple[str, str]) -> str:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.conventions import InputError, unit_shown
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES, forward_model
 
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
-__all__ = ["Observation", "check_observations"]
+__all__ = ["Observation", "arguments_of", "check_maps", "check_observations"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,13 @@ class Observation:
     technique: type[ForwardModel]
     values: Float[Tensor, "view row column c"]
     sigma: Float[Tensor, "view row column c"] | None = None
+
+    @classmethod
+    def of(cls, technique: type[ForwardModel], maps: Mapping[str, Tensor]) -> Observation:
+        """Return the observation that maps hold, by their names in the file."""
+        values, sigma = maps[technique.measured], maps.get(technique.sigma)
+        whole = (*values.shape[:3], len(technique.channels))
+        return cls(technique, values.reshape(whole), None if sigma is None else sigma.reshape(whole))
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -53,7 +61,7 @@ class Observation:
         """What pictures of the views show."""
         kind = self.technique
         names = " and ".join(name for name in kind.channels if name)
-        unit = "" if kind.unit == "1" else f", in {kind.unit}"
+        unit = f", in {kind.unit}" if unit_shown(kind.unit) else ""
         return f"{kind.measured.capitalize()} {names}".rstrip() + f" of each view{unit}"
 
     def alone(self, measurement: Measurement) -> Measurement:
@@ -63,14 +71,8 @@ class Observation:
         kind = self.technique
         usable = measurement.usable_for(self).flatten(1).any(dim=1).tolist()
         some = measurement.select([name for name, seen in zip(measurement.names, usable, strict=True) if seen])
-        own = {kind.measured, kind.sigma}
-        return replace(
-            some,
-            cameras=tuple(kind.seen_by(c) for c in some.cameras),
-            displacement=some.displacement if "displacement" in own else None,
-            sigma=some.sigma if "sigma" in own else None,
-            maps={name: values for name, values in some.maps.items() if name in own},
-        )
+        own = {name: value for name, value in some.measured_maps.items() if name in (kind.measured, kind.sigma)}
+        return replace(some, cameras=tuple(kind.seen_by(c) for c in some.cameras), **arguments_of(own))
 
     def measured(self, view: int) -> Bool[Tensor, "row column"]:
         """Which pixels of a view have a value and, where it is known, a sigma within the limits of the technique."""
@@ -79,6 +81,39 @@ class Observation:
         if self.sigma is not None:
             mask &= ((self.sigma[view] >= least) & (self.sigma[view] <= most)).all(dim=-1)
         return mask
+
+
+def arguments_of(maps: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return maps, by their names in the file, as a Measurement takes them; one channel may have an axis of its own."""
+    plain = {name: value[..., 0] if value.shape[3:] == (1,) else value for name, value in maps.items()}
+    return {"displacement": plain.pop("displacement", None), "sigma": plain.pop("sigma", None), "maps": plain}
+
+
+def check_maps(measurement: Measurement) -> None:
+    """Refuse a measurement of nothing, maps that no technique has, and maps and masks of the wrong shape.
+
+    Raises
+    ------
+    InputError
+        Naming what is wrong.
+    """
+    given, known = measurement.measured_maps, {kind.measured: kind for kind in TECHNIQUES.values()}
+    first = next((name for name in known if name in given), None)
+    if first is None:
+        raise InputError(f"measurement: expected one of {', '.join(known)}, got none of them")
+    shape = given[first].shape[:3]
+    if len(measurement.cameras) != shape[0] or not measurement.cameras:
+        raise InputError(f"{first}: expected one map a camera ({len(measurement.cameras)}), got {shape[0]}")
+    expected = {"valid": tuple(shape), "flow_mask": tuple(shape)}
+    for kind in known.values():
+        whole = (*shape, len(kind.channels)) if len(kind.channels) > 1 else tuple(shape)
+        expected |= {kind.measured: whole, kind.sigma: whole}
+    for name, value in {**given, "valid": measurement.valid, "flow_mask": measurement.flow_mask}.items():
+        if name not in expected:
+            raise InputError(f"maps: expected names out of {', '.join(sorted(expected))}, got '{name}'")
+        if value is not None and tuple(value.shape) != expected[name]:
+            axes = "view, row, column" + ", component" * (len(expected[name]) - 3)
+            raise InputError(f"{name}: expected ({axes}) = {expected[name]}, got {tuple(value.shape)}")
 
 
 def check_observations(measurement: Measurement) -> None:
@@ -90,10 +125,6 @@ def check_observations(measurement: Measurement) -> None:
         Saying what is wrong, and what to do.
     """
     observations = measurement.observations
-    known = {name for kind in TECHNIQUES.values() for name in (kind.measured, kind.sigma)}
-    for name in measurement.maps:
-        if name not in known:
-            raise InputError(f"maps: expected names out of {', '.join(sorted(known))}, got '{name}'")
     names = " and ".join(o.technique.name for o in observations)
     if len({o.technique.quantity for o in observations}) > 1:
         raise InputError(f"technique: expected techniques of one field, got {names}; split them into two measurements")

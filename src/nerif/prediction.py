@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES, VoxelField
 from nerif.fields.mlp import NeuralField
@@ -19,8 +20,8 @@ from nerif.physics.ray_tracing import CurvedRays
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reprojection import Accuracy, Reprojection
 from nerif.techniques.base import ForwardModel
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.registry import AUTO, forward_model, forward_models
+from nerif.techniques.registry import ASSUMED, AUTO, TECHNIQUES, forward_model, forward_models
+from nerif.volume import name_of
 
 VOXEL_STEP = 0.25  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame
@@ -29,10 +30,25 @@ VOXELS, BEYOND = 100, 3  # along the longest edge of the box, and beyond each fa
 SPARSE_STEP = 2.0  # voxels between samples of SampledViews: as near to the network as half a voxel
 COMPARED = 1024  # pixels
 
-__all__ = ["TRACED", "SampledViews", "predict", "predict_view", "reproject"]
+__all__ = ["TRACED", "SampledViews", "check_sees", "predict", "predict_view", "reproject"]
 
 TRACED = "traced"
 """Name of the model of deflection that bends rays to every order."""
+
+
+def check_sees(techniques: Sequence[type[ForwardModel]], quantity: str, what: str) -> None:
+    """Refuse techniques that see another field than one of that quantity; `what` names the parameter or file.
+
+    Raises
+    ------
+    InputError
+        Naming those that see it.
+    """
+    for kind in techniques:
+        if kind.quantity != quantity:
+            names = ", ".join(k.name for k in TECHNIQUES.values() if k.quantity == quantity)
+            field = f"the field of {name_of(quantity)}"
+            raise InputError(f"{what}: expected a technique that sees {field} ({names}), got {kind.name}")
 
 
 def predict_view(
@@ -66,8 +82,9 @@ def predict(
     model: str = AUTO,
     samples: int = 200,
     on_view: Callable[[int, int], None] = lambda done, total: None,
-    technique: type[ForwardModel] = Deflection,
+    technique: type[ForwardModel] = ASSUMED,
     wavelength_nm: float | None = None,
+    quantity: str | None = None,
 ) -> Measurement:
     """Return the measurement that cameras would make of a field, without noise.
 
@@ -80,17 +97,20 @@ def predict(
     on_view : told how many views are done, out of how many
     technique : what a pixel measures
     wavelength_nm : of the light, for interferometry
+    quantity : what the field is (volume.QUANTITIES), if that is to be checked
 
     Raises
     ------
     InputError
-        If there is no such model, or the technique needs what is not given.
+        If there is no such model, the technique sees another quantity, or needs what is not given.
     """
+    if quantity is not None:
+        check_sees((technique,), quantity, "technique")
     shape = (len(cameras), *(max(c.image_size[i] for c in cameras) for i in (0, 1)), len(technique.channels))
     cameras, empty = tuple(technique.seen_by(c) for c in cameras), torch.zeros(shape)
     measurement = measurement_of({technique: empty}, cameras, box, n_ambient, wavelength_nm)
     projector: Projector
-    if model == TRACED and technique is Deflection:
+    if model == TRACED and technique.traced:
         projector = CurvedRays(samples, n_ambient)
     else:
         projector = PathIntegral(forward_models((technique,), measurement, model)[0], samples)
@@ -114,7 +134,7 @@ def reproject(
 
     A network is integrated along every ray where that takes some seconds only. Of larger pictures it is sampled on
     voxels, and the views are interpolated between rays through those (`SampledViews`); how far that is from the
-    integral through the network is measured on some pixels, and told as `accuracy`.
+    integral through the network is measured on some pixels, and told as `accuracies`.
 
     Parameters
     ----------
@@ -124,12 +144,14 @@ def reproject(
     """
     box, maps, accuracies, done = measurement.box, {}, [], 0
     many = _work(field, measurement.cameras) > EXACT_WORK[torch.device(device).type]
+    voxels = on_voxels(field, box, device) if many else None
+    total = sum(len(_seeing(kind, measurement.cameras)) for kind in measurement.techniques)
     for observation in measurement.observations:
         kind = observation.technique
         projector = PathIntegral(forward_model(kind, measurement, model), SAMPLES)
-        sampled = SampledViews.of(field, box, projector, device) if many else None
+        sampled = None if voxels is None else SampledViews(field, voxels, box, projector, device)
         predicted = torch.full_like(observation.values, float("nan"))
-        views = [(i, kind.seen_by(c)) for i, c in enumerate(measurement.cameras) if c.background or not kind.background]
+        views = [(i, kind.seen_by(measurement.cameras[i])) for i in _seeing(kind, measurement.cameras)]
         for i, camera in views:
             height, width = camera.image_size
             if sampled:
@@ -138,11 +160,18 @@ def reproject(
             else:
                 predicted[i, :height, :width] = predict_view(field, camera, projector, box, device)
             done += 1
-            on_view(done, len(views) * len(measurement.observations))
+            on_view(done, total)
         maps[kind.name] = predicted
+        found = Accuracy(kind)
         if sampled:
-            accuracies.append(sampled.accuracy([camera for _, camera in views], predicted[[i for i, _ in views]]))
-    return Reprojection(measurement, maps, tuple(held_out), accuracies[0] if accuracies else Accuracy())
+            found = sampled.accuracy(kind, [camera for _, camera in views], predicted[[i for i, _ in views]])
+        accuracies.append(found)
+    return Reprojection(measurement, maps, tuple(held_out), tuple(accuracies))
+
+
+def _seeing(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
+    """Which cameras can see by a technique: those with a background, where it needs one."""
+    return [i for i, camera in enumerate(cameras) if camera.background or not kind.background]
 
 
 def _work(field: Field, cameras: Sequence[Camera]) -> float:
@@ -153,19 +182,28 @@ def _work(field: Field, cameras: Sequence[Camera]) -> float:
     return float(weights) * SAMPLES * sum(c.image_size[0] * c.image_size[1] for c in cameras)
 
 
+def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> VoxelField:
+    """Return the cubic spline through a field's values on voxels that go on beyond the box: right up to its faces."""
+    inner = Grid.of_resolution(box, VOXELS)
+    lower = tuple(a - BEYOND * h for a, h in zip(box.lower, inner.spacing, strict=True))
+    upper = tuple(b + BEYOND * h for b, h in zip(box.upper, inner.spacing, strict=True))
+    nz, ny, nx = (n + 2 * BEYOND for n in inner.shape)
+    grid = Grid(Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])), (nz, ny, nx))
+    return VoxelField.through(field.sample(grid, device), grid)
+
+
 @dataclass(frozen=True)
 class SampledViews:
     """Views of a network by way of its values on voxels.
 
-    The network is sampled on a grid that goes on beyond the box, so that the cubic spline through the values is right
-    up to its faces. Rays of a lattice of pixels, about two a voxel, are integrated through the spline by the compiled
+    Rays of a lattice of pixels, about two a voxel, are integrated through the spline by the compiled
     operator, and the pixels between them are interpolated by bicubic splines. What bending adds (`curved`) is
     integrated through the network itself on a coarser lattice.
 
     Parameters
     ----------
     field : the network
-    voxels : spline through its values
+    voxels : spline through its values (`on_voxels`)
     box : where the rays are integrated, mm
     projector : the path integral through the network
     device : where the network is evaluated
@@ -176,16 +214,6 @@ class SampledViews:
     box: Box
     projector: PathIntegral
     device: torch.device | str = "cpu"
-
-    @classmethod
-    def of(cls, field: Field, box: Box, projector: PathIntegral, device: torch.device | str = "cpu") -> SampledViews:
-        """Sample a field."""
-        inner = Grid.of_resolution(box, VOXELS)
-        lower = tuple(a - BEYOND * h for a, h in zip(box.lower, inner.spacing, strict=True))
-        upper = tuple(b + BEYOND * h for b, h in zip(box.upper, inner.spacing, strict=True))
-        nz, ny, nx = (n + 2 * BEYOND for n in inner.shape)
-        grid = Grid(Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])), (nz, ny, nx))
-        return cls(field, VoxelField.through(field.sample(grid, device), grid), box, projector, device)
 
     def __call__(self, camera: Camera) -> Float[Tensor, "row column c"]:
         """Return what a camera would see; of no meaning where a ray misses the box."""
@@ -209,7 +237,9 @@ class SampledViews:
         bent, straight = (project(projector, self.field, rays, self.device) for projector in projectors)
         return bent - straight
 
-    def accuracy(self, cameras: Sequence[Camera], predicted: Float[Tensor, "view row column c"]) -> Accuracy:
+    def accuracy(
+        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Float[Tensor, "view row column c"]
+    ) -> Accuracy:
         """Compare what was predicted with the path integral through the network, on pixels picked at random."""
         generator = torch.Generator().manual_seed(0)
         apart = []
@@ -221,7 +251,7 @@ class SampledViews:
             apart.append((view[pixels[:, 1], pixels[:, 0]] - exact)[rays.crosses])
         difference = torch.cat(apart)
         how = f"a cubic spline through the network's values on {VOXELS} voxels along the longest edge of the box"
-        return Accuracy(how, float(difference.square().mean().sqrt()), len(difference))
+        return Accuracy(kind, how, float(difference.square().mean().sqrt()), len(difference))
 
 
 def _interpolated(

@@ -58,13 +58,14 @@ def binned(measurement: Measurement, longest: int) -> Measurement:
     rows, columns = (n // bins for n, bins in zip(measurement.shape[1:], (down, across), strict=True))
     inside = (slice(0, rows * down), slice(0, columns * across))
     seen = measurement.observations[0]
-    pixels = scale if seen.technique.unit == "px" else torch.ones(1)
+    pixels = scale if seen.technique.in_pixels() else torch.ones(1)
     maps = []
     for values, usable in zip(seen.values, measurement.usable, strict=True):
         good = usable[inside].reshape(rows, down, columns, across)
         parts = torch.where(good[..., None], values[inside].reshape(rows, down, columns, across, -1), 0.0)
         count = good.sum(dim=(1, 3))[..., None]
         mean = parts.sum(dim=(1, 3)) / count.clamp_min(1) / pixels.to(values)
+        mean = mean if seen.signed else mean.clamp_min(0)  # below it is noise, which without sigma would be refused
         maps.append(torch.where(count * 2 >= down * across, mean, torch.nan))
     return measurement_of(
         {seen.technique: torch.stack(maps)}, cameras, measurement.box, measurement.n_ambient, measurement.wavelength_nm,
@@ -78,8 +79,6 @@ def without_spikes(small: Measurement) -> Measurement:
     length = values.norm(dim=-1)
     limit = SPIKE * torch.nanquantile(length.flatten()[:: max(1, length.numel() // 1_000_000)], 0.95)
     return with_values(small, torch.where((length <= limit)[..., None], values, torch.nan))
-
-
 
 
 def fit(measurement: Measurement, voxels: int, weight: float = 0.0) -> tuple[Field, float]:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.conventions import InputError, with_unit
 from nerif.measurement import Measurement
 from nerif.measurement_file import encoding, from_dataset, to_dataset
 from nerif.netcdf import opened
 from nerif.techniques.base import ForwardModel
-from nerif.techniques.deflection import Deflection
+from nerif.techniques.registry import ASSUMED
 
 __all__ = ["Accuracy", "Reprojection"]
 
@@ -27,22 +28,33 @@ class Accuracy:
 
     Parameters
     ----------
+    technique : what a pixel measures
     how : in words
-    error_px : rms difference from that integral over the compared pixels, px; 0 where it is the integral
+    error : rms difference from that integral over the compared pixels, in the technique's unit; 0 where it is that
+        integral
     compared : pixels on which both were computed, or 0
     """
 
+    technique: type[ForwardModel]
     how: str = "the path integral through the field on every pixel"
-    error_px: float = 0.0
+    error: float = 0.0
     compared: int = 0
 
     @property
     def sentence(self) -> str:
         """What to tell of it."""
+        done = f"{self.technique.measured} re-projected by {self.how}"
         if not self.compared:
-            return f"re-projected by {self.how}"
-        apart = f"{self.error_px:.2g} px rms from the path integral through the network on {self.compared} pixels"
-        return f"re-projected by {self.how}; {apart}"
+            return done
+        apart = f"{with_unit(f'{self.error:.2g}', self.technique.unit)} rms"
+        return f"{done}; {apart} from the path integral through the network on {self.compared} pixels"
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """What metrics.json keeps of it; the error is also called error_px where that is its unit."""
+        kind = self.technique
+        found = {"measured": kind.measured, "unit": kind.unit, "how": self.how, "error": self.error}
+        return found | ({"error_px": self.error} if kind.in_pixels() else {}) | {"compared": self.compared}
 
 
 @dataclass(frozen=True)
@@ -54,13 +66,13 @@ class Reprojection:
     measurement : Measurement
     maps : (view, row, column, c) predicted, by the name of the technique; 0 where a ray misses the box
     held_out : names of the views that the reconstruction has not seen
-    accuracy : of the prediction
+    accuracies : of what is predicted, of each technique; none where that is not known, as of a file
     """
 
     measurement: Measurement
     maps: Mapping[str, Float[Tensor, "view row column c"]]
     held_out: tuple[str, ...] = ()
-    accuracy: Accuracy = Accuracy()
+    accuracies: tuple[Accuracy, ...] = ()
 
     @property
     def predicted(self) -> Float[Tensor, "view row column c"]:
@@ -82,7 +94,11 @@ class Reprojection:
         held = np.array([name in self.held_out for name in self.measurement.names], dtype=np.int8)
         about = {"units": "1", "long_name": "1 where the reconstruction has not seen it"}
         dataset["held_out"] = (("view",), held, about)
-        dataset.attrs |= {"predicted_by": self.accuracy.how, "predicted_error_px": self.accuracy.error_px}
+        for accuracy in self.accuracies:
+            dataset.attrs["predicted_by"] = accuracy.how
+            dataset[accuracy.technique.measured].attrs["predicted_error"] = accuracy.error
+            if accuracy.technique.in_pixels():
+                dataset.attrs["predicted_error_px"] = accuracy.error
         with atomic(path) as part:
             dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding(dataset))
 
@@ -115,4 +131,4 @@ class Reprojection:
 
 def _measured(kind: type[ForwardModel]) -> str:
     """Name of the variable that holds what was measured."""
-    return "measured" if kind is Deflection else f"measured_{kind.measured}"
+    return "measured" if kind is ASSUMED else f"measured_{kind.measured}"

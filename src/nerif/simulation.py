@@ -25,8 +25,7 @@ from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.ray_tracing import background_points
 from nerif.techniques.base import ForwardModel
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.registry import forward_model, technique
+from nerif.techniques.registry import ASSUMED, TECHNIQUES, forward_model, technique
 from nerif.volume import INDEX, Volume
 from nerif.volume_file import read_volume
 from nerif.volume_sequence import VolumeSequence
@@ -62,7 +61,7 @@ def view_of(
     kind: type[ForwardModel], field: Field, camera: Camera, measurement: Measurement, steps: int = STEPS
 ) -> Float[Tensor, "row column c"]:
     """Return what every pixel of a camera sees of a field by a technique; 0 where its ray misses the box."""
-    if issubclass(kind, Deflection):
+    if kind.traced:
         return view_displacement(field, camera, measurement.box, measurement.n_ambient, steps)
     projector = PathIntegral(forward_model(kind, measurement), steps)
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(measurement.box).to(dtype=torch.float32)
@@ -120,7 +119,7 @@ def simulate(
     wavelength_nm: float | None = None,
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
     on_view: Callable[[int], None] | None = None,
-    techniques: Sequence[type[ForwardModel]] = (Deflection,),
+    techniques: Sequence[type[ForwardModel]] = (ASSUMED,),
 ) -> Measurement:
     """Return what the cameras would measure of a field.
 
@@ -161,7 +160,7 @@ class Simulation:
 
     phantom: str = "flame"
     """One of gaussians, flame, octahedron, 1-7 (the paper's numbers), or a volume file (.nc, .vti) of your own."""
-    technique: tuple[str, ...] = (Deflection.name,)
+    technique: tuple[str, ...] = (ASSUMED.name,)
     """What a pixel measures: deflection, absorption, emission or interferometry; of one field also several."""
     peak: float = 0.0
     """Largest extinction or emission, 1/mm, that a phantom is scaled to; 0 for one that gives about 1 along a ray."""
@@ -187,11 +186,15 @@ class Simulation:
     """Runge-Kutta steps of a ray through the box."""
 
     def __post_init__(self) -> None:
-        for name in self.technique:
-            technique(name)
+        if not self.technique:
+            raise InputError(f"technique: expected one or more of {', '.join(TECHNIQUES)}, got none")
+        kinds = [technique(name) for name in self.technique]
         for name in ("peak", "counts"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if self.peak and (self._is_file or kinds[0].quantity == INDEX):
+            what = "a volume file, taken as it is" if self._is_file else f"{kinds[0].name}, of an index"
+            raise InputError(f"peak: expected for the extinction or emission of a phantom, got {what}; leave it out")
         if self.counts and self.noise:
             raise InputError("counts: expected without --noise, which it replaces")
         if self.truth_voxels < 1:
@@ -200,7 +203,7 @@ class Simulation:
     def __call__(
         self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None, frame: int = 0
     ) -> tuple[Measurement, Volume]:
-        """Return what the cameras would measure, and the truth as index excess; each frame has noise of its own.
+        """Return what the cameras would measure, and the field itself, the truth; each frame has noise of its own.
 
         Raises
         ------
@@ -246,10 +249,15 @@ class Simulation:
             on_frame(i + 1, len(times))
         return sequence, store
 
+    @property
+    def _is_file(self) -> bool:
+        """Whether the phantom is a volume file."""
+        return Path(self.phantom).suffix in (".nc", ".vti")
+
     def _field(self) -> tuple[Field, Box, float]:
         """The field that is seen, its box, and the ambient that an index is counted from."""
         path, quantity = Path(self.phantom), technique(self.technique[0]).quantity
-        if path.suffix not in (".nc", ".vti"):
+        if not self._is_file:
             box = Box.around_origin(self.box)
             n_ambient = AMBIENT_INDEX if self.n_ambient is None else self.n_ambient
             phantom = make_phantom(self.phantom, box, self.seed, self.time)

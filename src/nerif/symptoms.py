@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.conventions import FACES
@@ -12,6 +14,7 @@ from nerif.fields.base import Field
 from nerif.measurement import Measurement
 from nerif.prediction import predict_view
 from nerif.quick_views import path_integral, values_of
+from nerif.reconstruction.gauge import ambient_faces
 from nerif.techniques.base import ForwardModel
 
 __all__ = ["looks", "open_faces"]
@@ -19,14 +22,42 @@ __all__ = ["looks", "open_faces"]
 OPEN = (0.4, 2.0)  # flow goes on beyond a face: what is not explained of rays through it is at least this share of what
 # the others measured, and this many times theirs as a share of its own. Rays through an end cross a corner of the box
 # and carry little: flow that ends at the box leaves a large share of that unexplained, but of a small thing
+FEWEST = 20  # rays of which something can be said
 
 
 def open_faces(field: Field, small: Measurement) -> list[str]:
-    """Return a finding for each face beyond which the flow seems to go on: rays through it fit worse than others."""
+    """Return a finding for each face beyond which the flow seems to go on: rays through it fit worse than others.
+
+    The others are those through faces known to be ambient alone. Where no face is, they are those not through this one
+    nor through one that was found; the worst face comes first.
+    """
+    what, known = small.observations[0].technique.measured, ambient_faces(small)
+    squares, through = _through_faces(field, small)
+    suspects = [face for face in FACES if face not in known]
+    ambient, left = torch.ones(len(squares), dtype=torch.bool), torch.ones(len(squares), dtype=torch.bool)
+    for face in suspects:
+        ambient &= ~through[face]
+    found = {}
+    for face in sorted(suspects, key=lambda face: -_unexplained(squares[through[face]])):
+        own, usual = squares[through[face] & left], squares[ambient if known else ~through[face] & left]
+        if len(own) < FEWEST or len(usual) < FEWEST:
+            continue
+        share, share_usual = _unexplained(own), _unexplained(usual)
+        size = float((own[:, 0].mean() / (usual if known else squares[left])[:, 1].mean()).sqrt())
+        if size > OPEN[0] and share > OPEN[1] * share_usual:
+            left &= ~through[face]
+            found[face] = (
+                f"face {face}: {share:.0%} of the {what} of rays through it is not explained, {share_usual:.0%} of "
+                f"the others; the flow seems to go on beyond it: give --open-faces {face}, or a larger box"
+            )
+    return [found[face] for face in suspects if face in found]
+
+
+def _through_faces(field: Field, small: Measurement) -> tuple[Float[Tensor, "n 2"], dict[str, Bool[Tensor, " n"]]]:
+    """Of every ray that measured something the squares of what is not explained, and of it all; and its faces."""
     model, channels = path_integral(small), values_of(small).shape[-1]
-    what = small.observations[0].technique.measured
-    groups: dict[str, list[Tensor]] = {face: [] for face in (*FACES, "none")}
-    suspects = [face for face in FACES if face not in small.ambient_faces]
+    squares: list[Tensor] = []
+    through: dict[str, list[Tensor]] = {face: [] for face in FACES}
     for i, camera in enumerate(small.cameras):
         height, width = camera.image_size
         predicted = predict_view(field, camera, model, small.box).reshape(-1, channels)
@@ -34,25 +65,16 @@ def open_faces(field: Field, small: Measurement) -> list[str]:
         rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(small.box)
         good = torch.isfinite(measured).all(dim=-1) & rays.crosses
         both = torch.stack([(predicted - measured).square().sum(dim=-1), measured.square().sum(dim=-1)], dim=-1)
-        through = {face: rays.exit_faces(small.box, [face]) & good for face in suspects}
-        rest = good.clone()
-        for face, mask in through.items():
-            groups[face].append(both[mask])
-            rest &= ~mask
-        groups["none"].append(both[rest])
-    findings, usual = [], torch.cat(groups["none"])
-    for face in suspects:
-        own = torch.cat(groups[face])
-        if len(own) < 20 or len(usual) < 20:
-            continue
-        left, left_usual = (float((g[:, 0].sum() / g[:, 1].sum()).sqrt()) for g in (own, usual))
-        unexplained = float((own[:, 0].mean() / usual[:, 1].mean()).sqrt())
-        if unexplained > OPEN[0] and left > OPEN[1] * left_usual:
-            findings.append(
-                f"face {face}: {left:.0%} of the {what} of rays through it is not explained, {left_usual:.0%} of "
-                f"the others; the flow seems to go on beyond it: give --open-faces {face}, or a larger box"
-            )
-    return findings
+        squares.append(both[good])
+        for face in FACES:
+            through[face].append(rays.exit_faces(small.box, [face])[good])
+    return torch.cat(squares), {face: torch.cat(masks) for face, masks in through.items()}
+
+
+def _unexplained(squares: Float[Tensor, "n 2"]) -> float:
+    """The share of what rays measured that is not explained, 0 where they measured nothing."""
+    lost, all_of_it = squares.sum(dim=0).tolist()
+    return math.sqrt(lost / all_of_it) if all_of_it > 0 else 0.0
 
 
 def looks(measurement: Measurement, small: Measurement, valid: Sequence[float]) -> list[str]:

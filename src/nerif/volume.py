@@ -125,7 +125,7 @@ class Volume:
 
         shape = " × ".join(str(n) for n in self.grid.shape[::-1])
         edges = " × ".join(f"{e:g}" for e in self.grid.box.edges)
-        unit = "" if self.unit == "1" else f" {LABELS.get(self.quantity, ('', self.unit))[1]}"
+        _, unit = LABELS.get(self.quantity, ("", self.unit))
         name = "n − 1" if self.quantity == "n" else self.quantity.replace("_", " ").capitalize()
         rows = [(name, span(shown(self), unit)), ("Voxels", f"{shape} (x, y, z)"), ("Volume", f"{edges} mm (x, y, z)")]
         if self.n_ambient is not None:

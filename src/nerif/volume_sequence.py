@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,8 @@ from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Box, Grid
 from nerif.measurement_sequence import add_frames, require_zarr
 from nerif.netcdf import reading
+from nerif.techniques.base import ForwardModel
+from nerif.techniques.registry import ASSUMED, technique
 from nerif.volume import Volume, describe, field_of, name_of
 from nerif.volume_file import REFERENCES
 
@@ -19,7 +22,32 @@ if TYPE_CHECKING:
     import numpy as np
     import zarr
 
-__all__ = ["VolumeSequence"]
+__all__ = ["ViewScores", "VolumeSequence", "score_names"]
+
+
+@dataclass(frozen=True)
+class ViewScores:
+    """What the views measured by one technique against what is re-projected, on disc.
+
+    Parameters
+    ----------
+    technique : what a pixel measures
+    cc : (time, view) correlation (zarr.Array); NaN where a view measured nothing by it
+    rms : (time, view) rms difference in the technique's unit (zarr.Array), likewise
+    """
+
+    technique: type[ForwardModel]
+    cc: Any
+    rms: Any
+
+
+def score_names(kinds: Sequence[type[ForwardModel]]) -> dict[type[ForwardModel], tuple[str, str]]:
+    """Return the names of the arrays of correlation and rms difference: those after the first have what is measured."""
+    found: dict[type[ForwardModel], tuple[str, str]] = {}
+    for kind in kinds:
+        of = f"_{kind.measured}" if found else ""
+        found[kind] = f"cc{of}", f"{'rms_px' if kind.in_pixels() else 'rms'}{of}"
+    return found
 
 
 class VolumeSequence:
@@ -122,9 +150,12 @@ class VolumeSequence:
             return np.asarray(self.array(name)[index])
 
     @property
-    def view_rms(self) -> Any:
-        """The array (time, view) of rms differences to what the views measured; its attribute `units` has the unit."""
-        return self.array("rms_px" if "rms_px" in self.group else "rms")
+    def view_scores(self) -> list[ViewScores]:
+        """How what is re-projected compares with what the views measured, technique by technique; none of volumes."""
+        names = self.attributes.get("techniques", [ASSUMED.name])
+        named = score_names([technique(name) for name in names])
+        there = [(kind, cc, rms) for kind, (cc, rms) in named.items() if cc in self.group]
+        return [ViewScores(kind, self.array(cc), self.array(rms)) for kind, cc, rms in there]
 
     @property
     def quantities(self) -> tuple[str, ...]:

@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
@@ -18,7 +16,7 @@ from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import GasSettings, masked_lines
-from nerif.prediction import reproject
+from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
 from nerif.reconstruction.files import checkpoints
@@ -114,8 +112,10 @@ def reconstruct_into(
     if voxels < 1:
         raise InputError(f"voxels: expected at least 1, got {voxels}")
     training = measurement.without(run.hold_out)
-    if run.fit_gains:
-        measurement, training = _evened(measurement, training, monitor)
+    gains = fit_gains(training) if run.fit_gains else {}
+    if gains:
+        monitor.say("gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in gains.items()))
+        measurement, training = with_gains(measurement, gains), with_gains(training, gains)
     _check_ensemble(run, training)
     run = replace(run, gas=run.gas.for_measurement(measurement))
     if measurement.bad_pixels:
@@ -144,7 +144,7 @@ def reconstruct_into(
         callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
         result = reconstructor(training, compose(*callbacks), state, start if state is None else None)
     begin(None)
-    _write(out, measurement, result, run, settings, voxels, monitor)
+    _write(out, measurement, result, run, settings, gains, voxels, monitor)
     try:
         if run.ensemble and result.outcome.reason != "interrupted":
             ensemble, made_of = Ensemble(run.ensemble, run.leave_one_out), {"start_from": str(run.start_from)}
@@ -191,6 +191,7 @@ def _write(
     result: Reconstruction,
     run: Run,
     settings: dict[str, Any],
+    gains: dict[str, float],
     voxels: int,
     monitor: Monitor,
 ) -> None:
@@ -211,28 +212,20 @@ def _write(
         "measurement": settings.get("measurement"),
     }
     out.write_metrics(metrics)
-    out.write_settings(
-        settings, {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
-    )
+    about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
+    out.write_settings(settings, about | ({"gains": gains} if gains else {}))
     with monitor.counting("re-projecting") as bar:
         reprojection = reproject(result.field, measurement, run.hold_out, result.device, bar, result.model)
     views = evaluate_views(reprojection)
-    out.write_metrics({"views": views, "reprojection": asdict(reprojection.accuracy), **metrics})
+    out.write_metrics({"views": views, "reprojection": [a.entries for a in reprojection.accuracies], **metrics})
     out.write_reprojection(reprojection)
     for line in score_lines(views):
         monitor.say(line)
-    monitor.say(reprojection.accuracy.sentence)
+    for accuracy in reprojection.accuracies:
+        monitor.say(accuracy.sentence)
     monitor.say(
         f"{out.path}: result of {result.seconds:.0f} s on {result.device}; open {out / 'volume.vti'} in ParaView"
     )
-
-
-def _evened(measurement: Measurement, training: Measurement, monitor: Monitor) -> tuple[Measurement, Measurement]:
-    """Both with every training view divided by its gain."""
-    found = dict(zip(training.names, fit_gains(training).tolist(), strict=True))
-    monitor.say("gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in found.items()))
-    gains = torch.tensor([found.get(name, 1.0) for name in measurement.names])
-    return with_gains(measurement, gains), with_gains(training, torch.tensor(list(found.values())))
 
 
 def _check_ensemble(run: Run, training: Measurement) -> None:
@@ -257,7 +250,9 @@ def _start(run: Run, measurement: Measurement) -> Field | None:
     """The field to start from, if one is named."""
     if run.start_from is None:
         return None
-    start, box, _ = ResultDirectory(run.start_from).field()
+    directory = ResultDirectory(run.start_from)
+    start, box, _ = directory.field()
+    check_sees(measurement.techniques, directory.quantity(), f"start_from {run.start_from}")
     if box != measurement.box:
         raise InputError(
             f"{run.start_from}: expected a reconstruction in the box of the measurement, "

@@ -40,12 +40,17 @@ def measured() -> LineScan:
 def test_a_scan_tells_its_offset_axis_and_saturation(measured):
     assert measured.offset == pytest.approx(OFFSET, abs=5e-4)
     assert measured.noise == pytest.approx(1e-3, rel=0.3)
-    scan = measured.without_offset()
+    scan = measured.without_offset(measured.offset)
     assert len(scan.complete) == len(ANGLES)
     bend, before, after = scan.bend()
     assert bend == pytest.approx(BEND, abs=0.005)
     assert after < 0.3 * before
     assert scan.unbent(BEND).axis() == pytest.approx(AXIS, abs=0.01)
+    told = measured.tell()
+    assert (told.offset, told.noise) == (measured.offset, measured.noise)
+    assert (told.bend, told.scatter, told.scatter_after) == (bend, before, after)
+    assert told.axis == scan.unbent(bend).axis()
+    assert str(told).startswith(f"offset {told.offset:.4f}, noise beside the medium")
     absorbances = np.linspace(0, 4, 9)
     bent = LineScan.bent(absorbances, BEND)
     assert np.allclose(bent + BEND * bent**2, absorbances)
@@ -53,7 +58,7 @@ def test_a_scan_tells_its_offset_axis_and_saturation(measured):
 
 def test_the_slice_is_the_right_way_round():
     scan = true_scan()
-    result = METHOD(scan.measurement(AXIS, 0.01))
+    result = METHOD(scan.measurement(AXIS))
     assert result.quantity == "extinction"
     for x, y, _, extinction in BALLS:
         at = result.field(_point(x, y))

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from nerif.cli import main
 from nerif.conventions import InputError
-from nerif.fields.phantoms import make_phantom
+from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.imaging.masks import MaskSettings, drawn_masks, flow_mask, read_mask, with_flow_masks
 from nerif.measurement import Measurement
 from nerif.reconstruction.gauge import visual_hull
 from nerif.simulation import simulate
+from nerif.techniques.emission import Emission
 
 SHAPE = (60, 90)
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))
@@ -115,13 +117,55 @@ def test_drawn_masks_are_taken_as_they_are(four, tmp_path):
 
 
 def test_masks_need_noise_and_flow(four):
-    with pytest.raises(InputError, match=f"no noise to measure the displacements of view '{four.names[0]}' by"):
+    with pytest.raises(InputError, match=f"no noise to measure the displacement of view '{four.names[0]}' by"):
         with_flow_masks(replace(four, sigma=None))
     assert with_flow_masks(replace(four, sigma=None), sigma=0.02).flow_mask is not None
     valid = four.usable.clone()
     valid[0, 0, 0] = False  # unknown is no flow
     with pytest.raises(InputError, match=f"no flow is left in view '{four.names[0]}'; give less than 1000"):
         with_flow_masks(replace(four, valid=valid), MaskSettings(threshold=1000.0))
+
+
+@pytest.fixture(scope="module")
+def glowing() -> Measurement:
+    """A ball that gives off light."""
+    cameras = Ring(views=3, image_size=(40, 44), pixel_pitch=0.1).cameras()
+    field = make_phantom("gaussians", BOX, 1)
+    return simulate(Scaled(field, -1e3), cameras, BOX, 1.0, noise=0.02, seed=0, steps=20, techniques=[Emission])
+
+
+def test_every_technique_has_masks_by_threshold_or_drawn(glowing, tmp_path, capsys):
+    found = with_flow_masks(glowing).flow_mask
+    radiance = glowing.maps["radiance"]
+    assert bool(found[radiance > 0.1 * radiance.max()].all())
+    assert 0.02 < float(found.float().mean()) < 0.9
+    with pytest.raises(InputError, match=r"measure the radiance of view '0deg' by; give it, or drawn masks"):
+        with_flow_masks(replace(glowing, maps={"radiance": radiance}))
+    glowing.write(tmp_path / "m.nc")
+    folder = tmp_path / "drawn"
+    folder.mkdir()
+    for name, mask in zip(glowing.names, found.numpy(), strict=True):
+        iio.imwrite(folder / f"{name}.png", mask.astype(np.uint8) * 255)
+    assert main(["mask", str(tmp_path / "m.nc"), "-o", str(tmp_path / "k.nc"), "--drawn", str(folder)]) == 0
+    assert "the masks over |radiance|" in capsys.readouterr().out
+    assert (tmp_path / "k.masks.png").is_file()
+    assert torch.equal(Measurement.read(tmp_path / "k.nc").flow_mask, found)
+
+
+def test_of_two_techniques_either_shows_the_flow(four):
+    """Fringes that one view alone has, of something at its edge that the displacement does not show."""
+    fringes, rows = torch.full(four.shape, torch.nan), slice(0, 64)
+    fringes[0, rows] = 0.0
+    fringes[0, 4:20, 4:20] = 9.0
+    maps = {"fringes": fringes, "fringes_sigma": torch.full(four.shape, 0.1)}
+    combined = with_flow_masks(replace(four, maps=maps, wavelength_nm=532.0)).flow_mask
+    alone = with_flow_masks(four).flow_mask
+    assert bool(combined[alone].all())
+    assert bool(combined[0, 4:20, 4:20].all())
+    assert not bool(alone[0, 4:12, 4:12].any())
+    assert torch.equal(combined[1:], alone[1:])
+    with pytest.raises(InputError, match="sigma: expected none for displacement and fringes"):
+        with_flow_masks(replace(four, maps=maps, wavelength_nm=532.0), sigma=0.1)
 
 
 def test_drawn_masks_are_read(tmp_path):

@@ -60,6 +60,15 @@ def recording(tmp_path) -> Recording:
     return write_experiment(tmp_path)
 
 
+def test_a_view_without_a_background_shows_no_displacement(recording):
+    blind = replace(recording.cameras["0deg"], background=None)
+    lines: list[str] = []
+    found, _ = measure_instant(replace(recording, cameras={**recording.cameras, "0deg": blind}), say=lines.append)
+    assert found.names == ("60deg", "120deg")
+    assert any("'0deg' left out: view '0deg': its camera has no background plane" in line for line in lines)
+
+
+
 def test_a_film_of_one_instant_is_the_measurement(recording, tmp_path):
     single, noise = measure_instant(recording)
     film = measure_recording(recording, range(1), [0.0], tmp_path / "film.zarr")

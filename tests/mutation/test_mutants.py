@@ -122,7 +122,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     about = {"temporal": "warm"}
     result = SequenceStore.begin(folder / "r.zarr", film, grid, ("index_excess",), NETWORK.network, about)
     for i in range(2):
-        result.write_frame(i, Frame(reconstruction.field, [excess], {}, {}, seconds=1.0, steps=2))
+        result.write_frame(i, Frame(reconstruction.field, [excess], [], seconds=1.0, steps=2))
     return folder
 
 

@@ -12,10 +12,12 @@ from matplotlib.figure import Figure
 
 from nerif import drawing
 from nerif.cli import main
-from nerif.geometry import Box, Grid
+from nerif.geometry import Box, Grid, Ring
+from nerif.measurement import Measurement
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
-from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices
+from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, view
+from nerif.reprojection import Reprojection
 from nerif.result import Result, ResultDirectory
 from nerif.volume import Volume
 
@@ -53,6 +55,43 @@ def test_every_figure_is_whole(whole):
     expected = [f"slices_{q}" for q in quantities] + ["comparison"]
     expected += [f"isosurface_{q}" for q in ("n", "density", "temperature")] + [f"view_{v}" for v in views]
     assert names == [*expected, "residuals", "rig", "views", "history", "slice_scores"]
+
+
+def figure_of_a_view(size: tuple[int, int], sigma: bool) -> Figure:
+    """Of displacements on a small picture, of which the first pixel is not valid."""
+    ring = Ring(views=2, image_size=size, pixel_pitch=0.2)
+    generator = torch.Generator().manual_seed(0)
+    d = torch.randn(2, *size, 2, generator=generator)
+    d[:, 0, 0] = torch.nan
+    noise = torch.full_like(d, 0.3) if sigma else None
+    m = Measurement(ring.cameras(), d, Box((-9.0,) * 3, (9.0,) * 3), 1.00027, sigma=noise)
+    return view(Reprojection(m, {"deflection": d.nan_to_num() + 0.1}, (m.names[1],)), 1, 190)
+
+
+@pytest.mark.parametrize(("size", "lines"), [((1, 41), 1), ((2, 30), 2), ((41, 1), 1)])
+def test_pictures_of_few_rows_are_drawn_as_lines(size, lines):
+    figure = figure_of_a_view(size, sigma=size[0] != 2)
+    FigureCanvasAgg(figure).draw()
+    panels = figure.axes
+    assert len(panels) == 2 * 2 * lines  # u and v, the difference below each
+    for above, below in zip(panels[::2], panels[1::2], strict=True):
+        assert above.get_window_extent().height > 80  # px, at 100 an inch
+        assert below.get_window_extent().height > 40
+        assert not above.images
+    assert panels[-1].get_xlabel() == ("row [px]" if size[0] > 3 else "column [px]")
+    above, below = panels[:2]
+    assert (above.get_ylabel(), below.get_ylabel()) == ("u [px]", "difference [px]")
+    drawn = above.containers[0].lines[0].get_ydata()
+    assert np.isnan(drawn[0])
+    assert len(drawn) == max(size)
+    np.testing.assert_allclose(below.containers[0].lines[0].get_ydata()[1:], 0.1, atol=1e-5)
+    assert above.containers[0].has_yerr == (size[0] != 2)
+    assert above.get_title() == ("row 0" if lines == 2 else "")
+
+
+def test_pictures_of_more_rows_are_maps():
+    figure = figure_of_a_view((20, 30), sigma=True)
+    assert sum(len(axes.images) for axes in figure.axes) == 6
 
 
 def test_the_command_writes_pdf_and_png(copy, tmp_path, capsys):

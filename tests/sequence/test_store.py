@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NeuralField
 from nerif.fields.phantoms import Flame
-from nerif.geometry import Box, Grid
+from nerif.geometry import Box, Grid, Ring
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.report.movie import Movie
@@ -26,6 +27,7 @@ from nerif.sequence.frames import finished_frame
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.run import outcome_table
 from nerif.sequence.store import SequenceStore
+from nerif.simulation import Simulation
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
 from sequence_films import COLD, RIG, blank
@@ -208,7 +210,7 @@ def test_a_store_of_another_technique_says_what_it_holds(tmp_path):
         store.write_frame(i, finished_frame(plan, field, sequence.frame(i), "cpu"))
     assert store.quantities == ("emission",)
     assert store.attributes["title"] == "Fields of radiance per length over time"
-    assert store.view_rms.attrs["units"] == "1"
+    assert [of.rms.attrs["units"] for of in store.view_scores] == ["1"]
     assert torch.equal(store.field(1).sample(grid), store.volume(1, "emission").values)
     assert " px" not in outcome_table(store)
     metrics = evaluate_sequence(plan.out, tmp_path / "film.truth.zarr")
@@ -218,3 +220,28 @@ def test_a_store_of_another_technique_says_what_it_holds(tmp_path):
     assert "Radiance per length" in text
     assert " px" not in text
     assert Movie().quantity_of(store) == "emission"
+
+
+def test_views_of_a_combined_film_are_scored_by_every_technique(tmp_path):
+    """One that is an interferometer alone has its score; bad fringes show in the table and on the page."""
+    simulation = Simulation(technique=("deflection", "interferometry"), noise=0.05, steps=10, truth_voxels=8)
+    both, _ = simulation(Ring(views=3, image_size=(14, 16), pixel_pitch=0.3).cameras())
+    displacement, fringes = both.displacement.clone(), both.maps["fringes"].clone()
+    displacement[0], fringes[1] = torch.nan, torch.nan
+    fringes[2] += 40.0
+    like = replace(both, displacement=displacement, maps={**both.maps, "fringes": fringes})
+    sequence = MeasurementSequence.create(tmp_path / "film.zarr", [0.0], like)
+    sequence.write_frame(0, like)
+    plan = SequencePlan(sequence.path, tmp_path / "r.zarr", COLD, SequenceSettings(voxels=8).for_measurement(like))
+    grid = Grid.of_resolution(like.box, 8)
+    store = SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, COLD.network, plan.kept)
+    field = NeuralField(Network(COLD.network), like.box, 1e-5)
+    store.write_frame(0, finished_frame(plan, field, sequence.frame(0), "cpu"))
+    for names, unknown in ((("cc", "rms_px"), 0), (("cc_fringes", "rms_fringes"), 1)):
+        for name in names:
+            assert np.isnan(store.array(name)[0]).nonzero()[0].tolist() == [unknown]
+    assert store.array("rms_fringes")[0, 2] > 35
+    assert re.search(r"rms difference to the measured displacement \S+ px and fringes \S+$", outcome_table(store))
+    page = re.sub(r"<(script|style)\b.*?</\1>", "", render_sequence(store), flags=re.DOTALL)
+    for said in ("Training views, displacement", "Training views, fringes", "Every view over time, fringes"):
+        assert said in page

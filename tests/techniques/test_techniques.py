@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -87,10 +88,10 @@ def test_a_technique_is_one_file():
 
 @dataclass(frozen=True)
 class Knife(ForwardModel):
-    """A toy: deflection across the vertical, less and less the deeper, and a little of the field itself."""
+    """A toy of two edges and none: deflections, less and less the deeper, and a little of the field itself."""
 
     name, measured, sigma = "knife", "grey", "grey_sigma"
-    channels = ("",)
+    channels = ("across", "along", "open")
     unit = "1"
     limits = (1e-9, 1e9)
     quantity = "index_excess"
@@ -103,8 +104,9 @@ class Knife(ForwardModel):
         up = rays.direction.new_tensor([[0.0, 0.0, 1.0]]).expand_as(rays.direction)
         side = torch.linalg.cross(rays.direction, up)
         depth = (s - rays.near[:, None]) / 40
-        value = rays.near.new_full((len(rays), 1), 300.0)
-        return Weights(torch.exp(-depth) * step, value=value, slope=3e3 * side[:, None])
+        value = rays.near.new_tensor([300.0, 100.0, 200.0]).expand(len(rays), 3)
+        slope = 3e3 * torch.stack([side, torch.linalg.cross(side, rays.direction), 0 * side], dim=1)
+        return Weights(torch.exp(-depth) * step, value=value, slope=slope)
 
 
 def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp_path):
@@ -116,6 +118,7 @@ def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp
     back = Measurement.read(tmp_path / "knife.nc")
     assert back.techniques == (Knife,)
     assert torch.equal(back.maps["grey"].nan_to_num(), seen.maps["grey"].nan_to_num())
+    assert seen.maps["grey"].shape == (5, 18, 23, 3)
     clean = predict(field, cameras, BOX, 1.00027, technique=Knife)
     noise = (clean.maps["grey"] - seen.maps["grey"])[seen.sees_box] / seen.maps["grey_sigma"][seen.sees_box]
     assert 0.9 < float(noise.std()) < 1.1
@@ -386,20 +389,36 @@ def test_bounds_cannot_be_left(measured):
 def test_intensities_are_fitted_where_little_light_is_left(balls):
     dense = Scaled(balls, 12.0)  # absorbance up to some 6
     m = simulate(dense, RING.cameras(), BOX, 1.00027, 0.02, 1, 60, techniques=[Absorption])
-    (model,) = forward_models(m.techniques, m, "intensity")
-    values, sigma = model.reading(torch.tensor([[0.0], [3.0]]), torch.tensor([[0.1], [0.1]]))
-    assert values.flatten().tolist() == pytest.approx([1, 0.0497871], rel=1e-5)
-    assert sigma is not None
-    assert torch.allclose(model.read(torch.tensor([[0.0], [3.0]])), values)
-    assert not replace(NETWORK, max_steps=20, model="intensity")(m).outcome.failed
+    integral, noise = torch.tensor([[0.0], [3.0]]).double(), torch.full((2, 1), 0.1).double()
+    for name, power in (("intensity", 1.0), ("poisson", 0.5)):
+        (model,) = forward_models(m.techniques, m, name)
+        values, sigma = model.reading(integral, noise)
+        assert sigma is not None
+        assert values.flatten().tolist() == pytest.approx([1, 0.0497871**power], rel=1e-5)
+        nearby = model.read(integral + 1e-3 * noise)
+        assert torch.allclose((values - nearby) / 1e-3, sigma, rtol=1e-3)
+        assert torch.equal(model.read(integral), values)
+        result = replace(NETWORK, max_steps=20, model=name)(m)
+        assert not result.outcome.failed
     with pytest.raises(InputError, match="model: expected a linear one, got 'intensity'"):
         Tikhonov(model="intensity")(m)
 
 
+def test_bins_of_intensities_weigh_by_their_pixels_where_sigma_is_not_known(measured):
+    m = measured["absorption"]
+    target = Target.of(replace(m, maps={"absorbance": 20 * m.maps["absorbance"]}), edge=2, model="intensity")
+    (part,) = target.parts
+    weights = part.inverse_scale / part.inverse_scale.max()
+    whole = (weights - 1).abs() < 1e-6
+    assert float(whole.float().mean()) > 0.5  # most bins have all their pixels, whatever they saw
+    assert float(part.measured[whole].min()) < 0.2 < 0.9 < float(part.measured[whole].max())
+
+
 def test_gains_of_cameras_are_found(measured):
     even, gains = measured["emission"], torch.tensor([1.0, 1.3, 0.8, 1.1, 0.9])
-    found = fit_gains(with_gains(even, 1 / gains))
-    assert torch.allclose(found, gains / gains.log().mean().exp(), rtol=0.03)
+    found = fit_gains(with_gains(even, dict(zip(even.names, (1 / gains).tolist(), strict=True))))
+    assert [*found] == [*even.names]
+    assert torch.allclose(torch.tensor([*found.values()]), gains / gains.log().mean().exp(), rtol=0.03)
     with pytest.raises(InputError, match="fit_gains: expected emission"):
         fit_gains(measured["absorption"])
     with pytest.raises(InputError, match="fit_gains: expected two views or more"):
@@ -418,6 +437,29 @@ def test_absorbance_of_counts_and_its_sigma():
     assert float(found.std()) == pytest.approx(float(sigma.mean()), rel=0.05)
 
 
+def test_where_no_quantum_is_left_the_absorbance_is_large():
+    passed = torch.tensor([0.0, -0.3, 1.0, 50.0]).double().numpy()
+    found, sigma = absorbance(passed, 0 * passed + 100, reference_pictures=float("inf"))
+    assert found.tolist() == pytest.approx([math.log(200), math.log(200), math.log(100), math.log(2)])
+    assert sigma.tolist() == pytest.approx([2, 2, 1, 50**-0.5])
+    found, _ = absorbance(passed, torch.tensor([0.0, 100, 100, 100]).numpy())
+    assert math.isnan(found[0])
+    unseen = torch.tensor([[math.nan], [2.0]])
+    for kind in (Absorption, Emission):
+        values, _ = kind.detected(unseen, 1e4, torch.Generator().manual_seed(0))
+        assert values.isnan().flatten().tolist() == [True, False]
+
+
+def test_noise_alone_is_not_an_offset(measured):
+    """A member of an ensemble has noise added to that of the measurement, and no sigma."""
+    noisy = measured["emission"].maps["radiance"]
+    noise = torch.randn(noisy.shape, generator=torch.Generator().manual_seed(2))
+    noisy = noisy + 0.06 * noisy.nan_to_num().max() * noise
+    replace(measured["emission"], maps={"radiance": noisy})
+    with pytest.raises(InputError, match="radiance: expected 0 or more"):
+        replace(measured["emission"], maps={"radiance": noisy - 0.5 * noisy.nan_to_num().max()})
+
+
 def test_counts_that_cannot_be():
     bright, dim = torch.full((50,), 100.0).numpy(), torch.full((50,), 30.0).numpy()
     with pytest.raises(InputError, match="intensity: expected at most the reference"):
@@ -426,12 +468,14 @@ def test_counts_that_cannot_be():
         absorbance(dim - 90, bright)
     with pytest.raises(InputError, match="reference: expected pictures of shape"):
         absorbance(dim[:3], bright)
+    with pytest.raises(InputError, match="dark: expected pictures of shape"):
+        absorbance(dim, bright, dim[:3])
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_measurements_that_cannot_be(measured):
     m = measured["absorption"]
-    with pytest.raises(InputError, match="subtract the offset that pixels beside the medium show"):
+    with pytest.raises(InputError, match="subtract the offset of pixels beside the medium"):
         replace(m, maps={"absorbance": m.maps["absorbance"] - 0.6})
     with pytest.raises(InputError, match="radiance: expected 0 or more"):
         replace(measured["emission"], maps={"radiance": -measured["emission"].maps["radiance"]})
@@ -453,12 +497,72 @@ def test_measurements_that_cannot_be(measured):
         replace(fringes, maps={"fringes": torch.remainder(whole, 1)})
     with pytest.raises(InputError, match="mlem and mart take line integrals of what is never negative"):
         MLEM(voxels=8, device="cpu")(measured["deflection"])
-    with pytest.raises(InputError, match="model: expected one of auto, absorbance, intensity for absorption"):
+    with pytest.raises(InputError, match="model: expected one of auto, absorbance, intensity, poisson for absorption"):
         NeRIF(model="curved")(m)
     with pytest.raises(InputError, match="technique: expected one of deflection"):
         Simulation(technique=("schlieren",))
     with pytest.raises(InputError, match="counts: expected a technique that counts quanta"):
         Simulation(technique=("interferometry",), counts=100.0, truth_voxels=4)(RING.cameras())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_maps_and_notes_on_views_of_other_shapes_are_refused(measured):
+    m = measured["absorption"]
+    with pytest.raises(InputError, match=r"absorbance: expected \(view, row, column\) = .* got \(5, 18, 23, 1\)"):
+        replace(m, maps={"absorbance": m.maps["absorbance"][..., None]})
+    with pytest.raises(InputError, match="about_views: expected names out of aperture_diameter"):
+        replace(m, about_views={"aperture": torch.ones(5)})
+    with pytest.raises(InputError, match=r"about_views: expected pose_sigma of shape \(5, 6\), got \(5,\)"):
+        replace(m, about_views={"pose_sigma": torch.ones(5)})
+
+
+def test_a_technique_by_which_nothing_was_measured_is_none(balls):
+    """As when the only interferometer's view is held out, or a film's instant has no fringes."""
+    kinds = [Deflection, Interferometry]
+    both = simulate(Scaled(balls, 1e-3), RING.cameras(), BOX, 1.00027, 0.1, 1, 30, 532.0, techniques=kinds)
+    fringes = both.maps["fringes"].clone()
+    fringes[1:] = torch.nan
+    one = replace(both, maps={**both.maps, "fringes": fringes})
+    assert one.techniques == (Deflection, Interferometry)
+    rest = one.without([one.names[0]])
+    assert rest.techniques == (Deflection,)
+    assert len(Target.of(rest).parts) == len(Target.of(rest, edge=2).parts) == 1
+    assert rest.observed({"deflection": rest.displacements}).techniques == (Deflection,)
+
+
+def hill(shape: tuple[int, int], fringes: float, width: float, steepness: float = 1.0) -> Tensor:
+    """A phase of so many fringes, as wide as a share of the picture's shorter side."""
+    y, x = (torch.arange(n) - (n - 1) / 2 for n in shape)
+    radius = torch.sqrt(y[:, None] ** 2 + x**2) / (width * max(min(shape), 40))
+    return fringes * torch.exp(-(radius ** (2 * steepness)) / 2)
+
+
+def check_phase(values: Tensor) -> None:
+    Interferometry.check(values[..., None], None, torch.ones(values.shape, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("size", [(1024, 1024), (200, 200), (60, 75), (1, 200)])
+@pytest.mark.parametrize(("fringes", "noise"), [(0.6, 0.0), (0.8, 0.02), (2.4, 0.15)])
+def test_wrapped_phases_are_refused_whatever_the_size(size, fringes, noise):
+    phase = hill(size, fringes, 0.2)
+    phase = phase + noise * torch.randn(size, generator=torch.Generator().manual_seed(0))
+    wrapped = torch.remainder(phase + 0.5, 1) - 0.5
+    with pytest.raises(InputError, match="expected an unwrapped phase in fringes, got one in fringes"):
+        check_phase(wrapped)
+    with pytest.raises(InputError, match=r"got one in radians .*unwrap_phase\(radians\) / 2 pi"):
+        check_phase(2 * torch.pi * wrapped)
+
+
+@pytest.mark.parametrize("size", [(500, 500), (60, 75), (1, 200)])
+@pytest.mark.parametrize("steepness", [1.0, 4.0])
+def test_small_phases_with_noise_and_steep_flanks_are_measured(size, steepness):
+    generator = torch.Generator().manual_seed(0)
+    for noise in (0.0, 0.05, 0.15):
+        phase = hill(size, 1.0, 0.2, steepness) + noise * torch.randn(size, generator=generator)
+        for spans in (0.85, 1.0, 0.95 * 2 * torch.pi):  # all that is there lies within about a fringe, or 2 pi
+            check_phase(phase / float(phase.max() - phase.min()) * spans)
+    pure = torch.randn(size, generator=generator)
+    check_phase(pure / float(pure.max() - pure.min()))
 
 
 def test_nothing_measured_is_refused():

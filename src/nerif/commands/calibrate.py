@@ -138,7 +138,7 @@ def _draw(path: Path, cameras: Sequence[CalibratedCamera] | Sequence[Camera], bo
         except InputError as error:
             say(f"note: not drawn: {error}")
     if not whole:
-        say(f"note: {path} was not drawn; --background-distance and --image-size tell what is missing")
+        say(f"note: {path} was not drawn; --image-size tells what is missing")
         return
     save_rig(path, whole, box)
     say(f"{path}: the rig; look whether cameras and axes stand where they do in the laboratory")

@@ -8,16 +8,18 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from torch import Tensor
 
 from nerif.commands.output import say
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError
+from nerif.conventions import InputError, with_unit
 from nerif.evaluation import rms_text
 from nerif.measurement import Measurement
 from nerif.measurement_file import known_conventions
 from nerif.netcdf import opened
 from nerif.notebook import number
 from nerif.result import METRICS, ResultDirectory
+from nerif.techniques.registry import TECHNIQUES
 from nerif.volume import INDEX, Volume, name_of
 from nerif.volume_file import read_volume
 
@@ -47,7 +49,8 @@ def _is_measurement(path: Path) -> bool:
     """A volume says CF, a measurement BOST; what says nothing is left to the stricter reader."""
     try:
         with opened(path, "a measurement or a volume") as dataset:
-            said = known_conventions(dataset.attrs.get("Conventions")) or "displacement" in dataset
+            said = known_conventions(dataset.attrs.get("Conventions"))
+            said = said or any(kind.measured in dataset for kind in TECHNIQUES.values())
             return said or not {"x", "y", "z"} <= set(dataset.coords)
     except InputError:
         return True
@@ -55,6 +58,10 @@ def _is_measurement(path: Path) -> bool:
 
 def _corners(lower: tuple[float, ...], upper: tuple[float, ...]) -> str:
     return " x ".join(f"{a:g}..{b:g}" for a, b in zip(lower, upper, strict=True)) + " mm (x, y, z)"
+
+
+def _rms(values: Tensor, unit: str) -> str:
+    return with_unit(f"{float(values.square().mean().sqrt()):.4g}", unit)
 
 
 def _measurement(path: Path, m: Measurement) -> None:
@@ -65,15 +72,14 @@ def _measurement(path: Path, m: Measurement) -> None:
     say(f"  ambient faces  {' '.join(m.ambient_faces) or 'none'}")
     for o in m.observations:
         (rays, values, sigma), kind = m.rays(o), o.technique
-        unit = "" if kind.unit == "1" else f" {kind.unit}"
-        noise = "unknown" if sigma is None else f"rms {float(sigma.square().mean().sqrt()):.4g}{unit}"
-        rms = float(values.square().mean().sqrt())
-        say(f"  {kind.name:<14} {len(rays)} rays cross the box; rms {kind.measured} {rms:.4g}{unit}; sigma {noise}")
+        rms = _rms(values, kind.unit)
+        noise = "unknown" if sigma is None else f"rms {_rms(sigma, kind.unit)}"
+        say(f"  {kind.name:<14} {len(rays)} rays cross the box; rms {kind.measured} {rms}; sigma {noise}")
     say(f"  masked         {m.bad_pixels} pixels whose value or sigma is NaN, infinite or impossible")
     for name in m.about_views:
         say(f"  {name:<14} known of the views")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
-    columns = "".join(f"{f'rms {o.technique.measured}':>18}" for o in m.observations)
+    columns = "".join(f"{f'rms {o.label}':>24}" for o in m.observations)
     say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable{columns}")
     usable, masks = m.usable, [m.usable_for(o) for o in m.observations]
     for i, c in enumerate(m.cameras):
@@ -82,7 +88,7 @@ def _measurement(path: Path, m: Measurement) -> None:
         plane = c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
         good = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
-        sizes = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:18.4f}" for x in good)
+        sizes = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:24.4f}" for x in good)
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
         say(

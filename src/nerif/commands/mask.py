@@ -21,7 +21,7 @@ __all__ = ["Mask", "main", "run"]
 
 @dataclass(frozen=True)
 class Mask(Settings):
-    """Put flow masks into a measurement: by threshold on |d| / sigma, or drawn; tells what hull they leave.
+    """Put flow masks into a measurement: by threshold on value / sigma, or drawn; tells what hull they leave.
 
     Where a pixel is not valid nothing is known, so flow may be there: it is inside the mask.
     """
@@ -33,7 +33,7 @@ class Mask(Settings):
     drawn: Path | None = None
     """Folder with a picture VIEW.png of each view (white where the flow is); views without one keep the threshold."""
     sigma: float | None = None
-    """Noise where the measurement has none, px."""
+    """Noise where the measurement has none, in the unit of what was measured (px of displacements)."""
     remove: bool = False
     """Take the masks out instead."""
     force: bool = False
@@ -67,7 +67,8 @@ def run(settings: Mask) -> Measurement:
     from nerif.report.displacement_figure import save_masks
 
     save_masks(picture, measurement)
-    say(f"{picture}: the masks over |d|; cut off flow costs more than a mask that is too large")
+    measured = measurement.observations[0].technique.measured
+    say(f"{picture}: the masks over |{measured}|; cut off flow costs more than a mask that is too large")
     return measurement
 
 

@@ -102,10 +102,10 @@ class ReconstructMART(Reconstruct):
 
 
 RECORDS: dict[str, type[Reconstruct]] = {
-    "nerif": ReconstructNeRIF,
-    "tikhonov": ReconstructTikhonov,
-    "landweber": ReconstructLandweber,
-    "tv": ReconstructTotalVariation,
-    "mlem": ReconstructMLEM,
-    "mart": ReconstructMART,
-}
+    kind.method: kind
+    for kind in (
+        ReconstructNeRIF, ReconstructTikhonov, ReconstructLandweber, ReconstructTotalVariation, ReconstructMLEM,
+        ReconstructMART,
+    )
+}  # fmt: skip
+"""By the name that --method has for them."""

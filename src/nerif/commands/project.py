@@ -1,4 +1,4 @@
-"""nerif project: the displacement that any camera would see of a reconstruction."""
+"""nerif project: what any camera would see of a reconstruction."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError
+from nerif.conventions import InputError, with_unit
 from nerif.geometry import Ring
 from nerif.measurement import Measurement
 from nerif.prediction import predict
 from nerif.result import ResultDirectory
-from nerif.techniques.registry import AUTO, technique, technique_of
+from nerif.techniques.registry import AUTO, model_of, technique, technique_of
 
 __all__ = ["Project", "main", "run"]
 
@@ -33,11 +33,12 @@ class Project(Settings):
     names: tuple[str, ...] = ()
     """Names of the cameras of that file to use; none for all."""
     model: str | None = None
-    """Forward model: lever_arm, paraxial, curved, or traced (Runge-Kutta); default: that of the reconstruction."""
+    """Forward model: lever_arm, paraxial, curved, or traced (Runge-Kutta); default: that of the reconstruction,
+    where the technique has it."""
     technique: str | None = None
     """What a pixel measures: deflection, absorption, emission, interferometry; default: the first of such a field."""
     wavelength_nm: float | None = None
-    """Wavelength of the light, nm, for interferometry."""
+    """Wavelength of the light, nm, for interferometry; default: that of the file with the cameras."""
     samples: int = 200
     """Samples (or Runge-Kutta steps) along a ray."""
     force: bool = False
@@ -52,23 +53,26 @@ def run(settings: Project) -> Measurement:
     check_file(settings.out, settings.force)
     result = ResultDirectory(settings.result)
     index, box, n_ambient = result.field()
+    wavelength = settings.wavelength_nm
     if settings.cameras is not None:
         given = Measurement.read(settings.cameras)
+        wavelength = wavelength or given.wavelength_nm
         cameras = (given.select(settings.names) if settings.names else given).cameras
     elif settings.names:
         raise InputError("names: expected together with --cameras FILE, got no file")
     else:
         cameras = settings.ring.cameras()
-    model = settings.model or str(result.settings().get("model", AUTO))
     kind = technique(settings.technique) if settings.technique else technique_of(result.quantity())
+    model = settings.model or model_of(kind, str(result.settings().get("model", AUTO)))
     with counting_bar("projecting") as bar:
         predicted = predict(
-            index, cameras, box, n_ambient, model, settings.samples, bar, kind, settings.wavelength_nm
+            index, cameras, box, n_ambient, model, settings.samples, bar, kind, wavelength, result.quantity()
         )  # fmt: skip
     predicted.write(settings.out)
     for camera, values in zip(cameras, predicted.observations[0].values, strict=True):
         rms = float(values.nan_to_num().square().mean().sqrt())
-        say(f"{camera.name}: rms {kind.measured} {rms:.4g}{'' if kind.unit == '1' else f' {kind.unit} a component'}")
+        of = " a component" if len(kind.channels) > 1 else ""
+        say(f"{camera.name}: rms {kind.measured} {with_unit(f'{rms:.4g}', kind.unit)}{of}")
     say(f"{settings.out}: {len(cameras)} predicted views ({model})")
     return predicted
 

@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError
+from nerif.conventions import InputError, with_unit
 from nerif.geometry import Ring
 from nerif.simulation import Simulation
 from nerif.volume_file import write_netcdf
@@ -55,7 +55,7 @@ def run(settings: Simulate) -> None:
     for observation in measurement.observations:
         rays, values, _ = measurement.rays(observation)
         rms, kind = float(values.square().mean().sqrt()), observation.technique
-        size = f"rms {kind.measured} {rms:.3g}" + ("" if kind.unit == "1" else f" {kind.unit}")
+        size = f"rms {kind.measured} {with_unit(f'{rms:.3g}', kind.unit)}"
         say(f"{settings.out}: {len(cameras)} views, {len(rays)} rays cross the box, {size}")
     say(f"{truth}: the truth on {' x '.join(map(str, volume.grid.shape))} voxels (z, y, x)")
 

@@ -39,7 +39,6 @@ FORMAT = "nerif-calibration-1"
 KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotation", "translation", "background")
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
 """Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
-ANYWHERE = Plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.0)
 
 
 @dataclass(frozen=True)
@@ -68,21 +67,16 @@ class CalibratedCamera:
     projection: Projection = PERSPECTIVE
 
     def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
-        """Return the whole camera.
+        """Return the whole camera; without a background if none is known.
 
         Raises
         ------
         InputError
-            If image size or background plane are known neither here nor there.
+            If the image size is known neither here nor there.
         """
         image_size, background = image_size or self.image_size, background or self.background
         if image_size is None:
             raise InputError(f"view '{self.name}' has no image size in its calibration; give --image-size HEIGHT WIDTH")
-        if background is None:
-            raise InputError(
-                f"view '{self.name}' has no background plane: calibrate it with a target laid on the background, or "
-                "give nerif calibrate --background-distance"
-            )
         return Camera(
             self.intrinsics, self.rotation, self.translation, image_size, background, self.distortion, self.name,
             self.projection,
@@ -100,7 +94,7 @@ class CalibratedCamera:
 def checked(camera: CalibratedCamera, source: str) -> CalibratedCamera:
     """Return the camera if it can be one, else raise an InputError that names the source."""
     try:
-        camera.camera(camera.image_size or (1, 1), camera.background or ANYWHERE)
+        camera.camera(camera.image_size or (1, 1))
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
     return camera

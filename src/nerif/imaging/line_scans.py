@@ -25,13 +25,41 @@ from nerif.geometry.projection import TELECENTRIC
 from nerif.measurement import Measurement, measurement_of
 from nerif.techniques.absorption import Absorption
 
-__all__ = ["LineScan"]
+__all__ = ["LineScan", "Told"]
 
 ENDS = 3  # readings at either end of an angle that are beside the medium
 EMPTY = 0.02  # of the largest reading, below which an end is beside the medium
 LARGEST_BEND, BENDS = 0.3, 301  # tried
 DIGITS = 1e-4  # of the largest reading, to which no scan is better
 EVEN = 1e-3  # of a step: how far positions may be from evenly spaced
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a scan tells of itself.
+
+    Parameters
+    ----------
+    offset : reading beside the medium
+    noise : standard deviation of the readings there
+    bend : k of A + k A^2
+    scatter, scatter_after : of the totals of complete angles, as a share, before the bend is undone and after
+    axis : position of the axis of rotation, mm
+    """
+
+    offset: float
+    noise: float
+    bend: float
+    scatter: float
+    scatter_after: float
+    axis: float
+
+    def __str__(self) -> str:
+        return (
+            f"offset {self.offset:.4f}, noise beside the medium {self.noise:.1e}, axis at {self.axis:.3f} mm, readings "
+            f"A - {self.bend:.3f} A²; totals of the angles scatter by {self.scatter:.1%}, {self.scatter_after:.1%} "
+            "once that is undone"
+        )
 
 
 @dataclass(frozen=True)
@@ -78,9 +106,15 @@ class LineScan:
         """Reading beside the medium."""
         return float(np.median(np.concatenate([self.readings[:, :ENDS], self.readings[:, -ENDS:]])))
 
-    def without_offset(self) -> LineScan:
-        """Return the scan with readings of 0 beside the medium."""
-        return replace(self, readings=self.readings - self.offset)
+    def without_offset(self, offset: float) -> LineScan:
+        """Return the scan with readings that much less: 0 beside the medium."""
+        return replace(self, readings=self.readings - offset)
+
+    def tell(self) -> Told:
+        """Return offset, bend and axis, each once those before it are undone."""
+        scan = self.without_offset(self.offset)
+        bend, scatter, scatter_after = scan.bend()
+        return Told(self.offset, self.noise, bend, scatter, scatter_after, scan.unbent(bend).axis())
 
     @property
     def noise(self) -> float:
@@ -125,7 +159,7 @@ class LineScan:
         turn = np.stack([np.ones(len(chosen)), np.cos(self.angles[chosen]), np.sin(self.angles[chosen])], axis=1)
         return float(np.linalg.lstsq(turn, centre, rcond=None)[0][0])
 
-    def measurement(self, axis: float, relative_sigma: float = 0.0) -> Measurement:
+    def measurement(self, axis: float) -> Measurement:
         """Return the slice as a measurement of absorption: a telecentric camera of one row of pixels for every angle.
 
         The axis of rotation is the z axis, the slice as thick as a step between positions.
@@ -133,7 +167,6 @@ class LineScan:
         Parameters
         ----------
         axis : position of the axis of rotation, mm
-        relative_sigma : standard deviation as a share of the reading, beside the noise at the ends
         """
         half = float(np.abs(self.positions - axis).max()) + self.spacing / 2
         thickness = self.spacing / 2
@@ -143,8 +176,7 @@ class LineScan:
             {Absorption: values}, cameras, Box((-half, -half, -thickness), (half, half, thickness)), 1.0
         )
         least = max(self.noise, DIGITS * float(np.abs(self.readings).max()))
-        sigma = torch.sqrt(least**2 + (relative_sigma * values.clamp_min(0)) ** 2)
-        return measurement.observed({Absorption.name: values}, {Absorption.name: sigma})
+        return measurement.observed({Absorption.name: values}, {Absorption.name: torch.full_like(values, least)})
 
     def _camera(self, angle: float, axis: float) -> Camera:
         across, along = (np.cos(angle), np.sin(angle), 0.0), (-np.sin(angle), np.cos(angle), 0.0)

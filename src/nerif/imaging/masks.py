@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from nerif.conventions import InputError
+from nerif.conventions import InputError, unit_shown
 from nerif.imaging.readers import open_frames
 from nerif.measurement import Measurement
+from nerif.observation import Observation
 
 __all__ = ["MaskSettings", "drawn_masks", "flow_mask", "read_mask", "with_flow_masks"]
 
@@ -22,9 +23,9 @@ class MaskSettings:
     """How flow is told from noise."""
 
     threshold: float = 4.0
-    """Flow is where |d| exceeds this many sigma."""
+    """Flow is where what was measured (of displacements |d|) exceeds this many sigma."""
     smooth: float = 1.5
-    """Standard deviation of a Gaussian over d / sigma before the threshold, px."""
+    """Standard deviation of a Gaussian over the values / sigma before the threshold, px."""
     smallest: int = 64
     """Islands and holes of fewer pixels are removed."""
     grow: int = 3
@@ -40,29 +41,29 @@ STANDARD = MaskSettings()
 
 
 def flow_mask(
-    displacement: Float[np.ndarray, "row column 2"],
-    sigma: Float[np.ndarray, "row column 2"],
+    values: Float[np.ndarray, "row column c"],
+    sigma: Float[np.ndarray, "row column c"],
     settings: MaskSettings = STANDARD,
 ) -> Bool[np.ndarray, "row column"]:
-    """Return where |d| / sigma exceeds a threshold, cleaned up, and where that is not known.
+    """Return where |values| / sigma exceeds a threshold, cleaned up, and where that is not known.
 
     Parameters
     ----------
-    displacement : px; NaN where not known
-    sigma : px; NaN or not positive where not known
+    values : what was measured; NaN where not known
+    sigma : in the same unit; NaN or not positive where not known
     settings : of the threshold
     """
     from scipy.ndimage import binary_dilation, gaussian_filter
     from skimage.morphology import remove_small_holes, remove_small_objects
 
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = displacement / np.where(sigma > 0, sigma, np.nan)
+        ratio = values / np.where(sigma > 0, sigma, np.nan)
     known = np.isfinite(ratio).all(axis=-1)
     ratio[~known] = 0
     if settings.smooth:
         share = np.maximum(gaussian_filter(known.astype(np.float32), settings.smooth), 1e-6)
-        ratio = np.stack([gaussian_filter(ratio[..., k], settings.smooth) / share for k in range(2)], axis=-1)
-    flow = (np.hypot(ratio[..., 0], ratio[..., 1]) > settings.threshold) & known
+        ratio = gaussian_filter(ratio, (settings.smooth, settings.smooth, 0)) / share[..., None]
+    flow = (np.linalg.norm(ratio, axis=-1) > settings.threshold) & known
     if settings.smallest:  # an island may go on where nothing is known
         flow = known & remove_small_objects(flow | ~known, max_size=settings.smallest)
         flow = remove_small_holes(flow | ~known, max_size=settings.smallest) & known
@@ -117,39 +118,58 @@ def with_flow_masks(
 ) -> Measurement:
     """Return a measurement with a flow mask for each view: drawn where there is a drawing, else by threshold.
 
+    Flow is where one of the techniques of a measurement shows it.
+
     Parameters
     ----------
-    measurement : whose displacements are looked at; pixels that are not usable are in the mask
+    measurement : what was measured; pixels that are not usable are in the mask
     settings : of the threshold
-    sigma : noise, px, in the place of the measurement's own
+    sigma : noise, in the unit of what was measured, in the place of the measurement's own
     drawn : pictures of masks by the names of views
     on_view : called with the number of views done
 
     Raises
     ------
     InputError
-        If there is no noise to measure displacements by, or a mask holds no flow.
+        If there is no noise to measure by, or one for several techniques, or a mask holds no flow.
     """
     drawn = drawn or {}
-    usable = measurement.usable
-    masks = torch.zeros(usable.shape, dtype=torch.bool)
+    if sigma is not None and len(measurement.observations) > 1:
+        names = " and ".join(o.technique.measured for o in measurement.observations)
+        raise InputError(f"sigma: expected none for {names}, which have units and noise of their own, got {sigma:g}")
+    seen = [(o, measurement.usable_for(o)) for o in measurement.observations]
+    masks = torch.zeros(measurement.shape, dtype=torch.bool)
     for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
         height, width = camera.image_size
         inside = (slice(0, height), slice(0, width))
         if name in drawn:
             mask = read_mask(drawn[name], camera.image_size)
         else:
-            if sigma is None and measurement.sigma is None:
-                raise InputError(
-                    f"sigma: the measurement holds no noise to measure the displacements of view '{name}' by; give it "
-                    "in px, or drawn masks of all views"
-                )
-            known = usable[i][inside].numpy()
-            d = np.where(known[..., None], measurement.displacements[i][inside].numpy(), np.nan)
-            own = measurement.sigma[i][inside].numpy() if sigma is None and measurement.sigma is not None else sigma
-            mask = flow_mask(d, np.broadcast_to(np.asarray(own, dtype=np.float32), d.shape), settings)
-            if not (mask & known).any():
+            known, flow = np.zeros(camera.image_size, dtype=bool), np.zeros(camera.image_size, dtype=bool)
+            for o, usable in seen:
+                own = usable[i][inside].numpy()
+                flow |= _mask_by(o, (i, *inside), own, settings, sigma, name) & own
+                known |= own
+            if not flow.any():
                 raise InputError(f"threshold: no flow is left in view '{name}'; give less than {settings.threshold:g}")
+            mask = flow | ~known
         masks[i][inside] = torch.from_numpy(mask)
         on_view(i + 1)
     return replace(measurement, flow_mask=masks)
+
+
+def _mask_by(
+    observation: Observation, inside: tuple[int, slice, slice], known: Bool[np.ndarray, "row column"],
+    settings: MaskSettings, sigma: float | None, name: str,
+) -> Bool[np.ndarray, "row column"]:  # fmt: skip
+    """The mask of a view by one technique."""
+    kind = observation.technique
+    if sigma is None and observation.sigma is None:
+        unit = f" in {kind.unit}" if unit_shown(kind.unit) else ""
+        raise InputError(
+            f"sigma: the measurement holds no noise to measure the {kind.measured} of view '{name}' by; give it{unit}, "
+            "or drawn masks of all views"
+        )
+    values = np.where(known[..., None], observation.values[inside].numpy(), np.nan)
+    own = observation.sigma[inside].numpy() if sigma is None and observation.sigma is not None else sigma
+    return flow_mask(values, np.broadcast_to(np.asarray(own, dtype=np.float32), values.shape), settings)

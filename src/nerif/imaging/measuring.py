@@ -147,8 +147,13 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
     Raises
     ------
     InputError
-        If pictures and calibration do not fit.
+        If pictures and calibration do not fit, or the camera has no background to see displaced.
     """
+    if calibrated.background is None:
+        raise InputError(
+            f"view '{view.name}': its camera has no background plane, which displacements need; calibrate it with a "
+            "target laid on the background, or give nerif calibrate --background-distance"
+        )
     if calibrated.image_size in (None, shape):
         return calibrated.camera(image_size=shape)
     crop = view.crop

@@ -7,8 +7,8 @@ See kernels_torch.py for the same in plain PyTorch. Along ray r the samples m = 
 with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3)
 takes sum_m w_m grad f(x_m), a matrix (n, c, 1) takes sum_m w_m f(x_m). Arithmetic is in double precision.
 
-What is known before a ray is walked along goes by the length of a tuple, so that no branch is left in the compiled loops:
-`spline` has a number for each neighbour, `part` three for the gradient and one for the value.
+What is known before goes by the length of a tuple, so that no branch is left in the compiled loops: `spline` has a
+number for each neighbour, `part` three for the gradient and one for the value.
 """
 
 from __future__ import annotations

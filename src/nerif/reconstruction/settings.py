@@ -36,7 +36,8 @@ class TrainingSettings(Reconstructor):
     """Either "squared" residuals (maximum likelihood for Gaussian noise) or "l2", the paper's."""
     model: str = AUTO
     """Forward model: of displacements lever_arm (auto), paraxial, or curved (along the ray as the present field bends
-    it); of absorption absorbance (auto), or intensity (where little light is left, its logarithm is skewed)."""
+    it); of absorption absorbance (auto), or, where little light is left and its logarithm skewed, intensity (noise of
+    the detector, which is even) or poisson (counted quanta)."""
     lower: float | None = None
     """Lowest value that the field can have (of the index excess of hot gas: -2.7e-4); else that of the technique."""
     upper: float | None = None

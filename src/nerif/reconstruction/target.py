@@ -100,7 +100,8 @@ class Target:
         for forward, observation in zip(models, measurement.observations, strict=True):
             rays, values, sigma = _rays(measurement, observation, open_faces, edge)
             scales.append(forward.field_scale(rays, values))
-            read, noise = forward.reading(values, sigma)
+            read, noise = forward.reading(values, sigma if observation.sigma is not None else None)
+            noise = sigma if observation.sigma is None else noise  # of bins: by how many pixels they have
             inverse = torch.ones_like(read) if noise is None else 1 / noise
             parts.append(Part(forward, rays, read, inverse))
         empty = torch.cat([part.of_nothing.flatten() for part in parts])

@@ -1,4 +1,4 @@
-"""The displacements and flow masks of a measurement, view by view."""
+"""The displacements, or what else was measured, and flow masks of a measurement, view by view."""
 
 from __future__ import annotations
 
@@ -50,14 +50,13 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
 
 
 def save_masks(path: Path, measurement: Measurement) -> None:
-    """Write a picture with |d| (px) of every view and the outline of its flow mask."""
+    """Write a picture of how large the values of the first technique are in every view, and of its flow mask."""
     from matplotlib.figure import Figure
 
     assert measurement.flow_mask is not None
-    step = _step(measurement)
-    usable, components, masks = (
-        x[:, ::step, ::step].numpy() for x in (measurement.usable, measurement.displacements, measurement.flow_mask)
-    )
+    step, seen = _step(measurement), measurement.observations[0]
+    maps = measurement.usable_for(seen), seen.values, measurement.flow_mask
+    usable, components, masks = (x[:, ::step, ::step].numpy() for x in maps)
     d = np.where(usable, np.linalg.norm(components, axis=-1), np.nan)
     limit = float(np.nanpercentile(d, 99.5)) or 1.0
     count = len(measurement.cameras)
@@ -79,11 +78,12 @@ def save_masks(path: Path, measurement: Measurement) -> None:
         axes.tick_params(labelsize=6)
         axes.set_xlabel("column [px]", fontsize=7)
         axes.set_ylabel("row [px]" if i % columns == 0 else "", fontsize=7)
-    figure.colorbar(shown, ax=grid.ravel().tolist(), label="|d| [px]", shrink=0.6, extend="max")
+    label = f"|{seen.technique.measured}| [{seen.technique.unit}]"
+    figure.colorbar(shown, ax=grid.ravel().tolist(), label=label, shrink=0.6, extend="max")
     with atomic(path) as part:
         figure.savefig(part, dpi=120)
 
 
 def _step(measurement: Measurement) -> int:
     """Distance of the pixels that are drawn: more than MOST along an edge would not show."""
-    return max(1, -(-max(measurement.displacements.shape[1:3]) // MOST))
+    return max(1, -(-max(measurement.shape[1:]) // MOST))

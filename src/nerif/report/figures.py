@@ -14,7 +14,7 @@ from nerif.drawing import COLOURS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_history", "draw_residuals", "draw_slice_scores", "draw_view_scores"]
+__all__ = ["draw_history", "draw_line", "draw_residuals", "draw_slice_scores", "draw_view_scores"]
 
 TERMS = {
     "automatic": "views, exact gradient",
@@ -90,6 +90,26 @@ def draw_view_scores(axes: Axes, views: list[dict[str, Any]]) -> Axes:
     names = [f"{name}\nheld out" if v["held_out"] else name for name, v in zip(names, views, strict=True)]
     axes.set_xticks(list(places), names, rotation=90, parse_math=False)
     axes.set_ylabel("rms error / noise [1]" if in_sigma else f"rms error [{views[0]['unit']}]")
+    return axes
+
+
+def draw_line(
+    axes: tuple[Axes, Axes], measured: np.ndarray, predicted: np.ndarray, sigma: np.ndarray | None, label: str
+) -> tuple[Axes, Axes]:
+    """Draw what pixels along a line measured, with its standard deviation, and what is predicted; below, how far apart.
+
+    Pixels that measured nothing (NaN) are left out; the label stands at the first axes, with its unit in brackets.
+    """
+    above, below = axes
+    at, blue, orange = np.arange(len(measured)), COLOURS["blue"], COLOURS["orange"]
+    points: dict[str, Any] = {"fmt": ".", "color": blue, "markersize": 3.5, "elinewidth": 0.7}
+    above.errorbar(at, measured, sigma, label="measured" if sigma is None else "measured ± σ", **points)
+    above.plot(at, predicted, color=orange, linewidth=1, label="re-projected")
+    below.axhline(0, color=COLOURS["grey"], linewidth=0.6)
+    below.errorbar(at, predicted - measured, sigma, **points)
+    above.set_ylabel(label)
+    below.set_ylabel(f"difference [{label.rpartition('[')[2]}")
+    above.legend(frameon=False)
     return axes
 
 

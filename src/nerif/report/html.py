@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 from nerif import __version__
 from nerif.atomic import atomic
 from nerif.drawing import drawn_of, map_colours
+from nerif.evaluation import rms_text
 from nerif.notebook import number, picture
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
-from nerif.report.summary import came_out, headline, measured, rms_of, trust, trust_figures
+from nerif.report.summary import came_out, headline, measured, trust, trust_figures
 from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
 from nerif.techniques.registry import technique_of
@@ -103,7 +104,7 @@ def _template() -> jinja2.Template:
     environment.filters["number"] = number
     environment.filters["gradient"] = lambda limits: _gradient(map_colours(limits))
     environment.filters["ends"] = _ends
-    environment.filters["rms"] = rms_of
+    environment.filters["rms"] = partial(rms_text, digits=3)
     return environment.get_template("report.html.j2")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 
 from nerif.atomic import atomic
+from nerif.conventions import with_unit
 from nerif.drawing import (
     DIVERGING,
     add_colour_bar,
@@ -24,7 +26,8 @@ from nerif.drawing import (
     shown,
     style,
 )
-from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores, draw_view_scores
+from nerif.observation import Observation
+from nerif.report.figures import draw_history, draw_line, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.view_images import lattice_step
 from nerif.reprojection import Reprojection
@@ -40,6 +43,11 @@ JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature":
 """Widths of one and of two columns, mm, as the publishers' guides for authors give them."""
 
 NOT_IN_FILES = r"[^\w.+-]"
+
+FEW = 3  # rows or columns of pictures that are drawn as lines
+
+Seen = tuple[Observation, np.ndarray, np.ndarray, np.ndarray | None]
+"""What a view saw by one technique: measured, NaN where not; predicted; sigma, if known: (row, column, c)."""
 
 
 def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi: int = 300) -> list[Path]:
@@ -63,7 +71,7 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
     error = error_of(result)
     if error is not None and result.field is not None:
         yield "comparison", comparison(result.field, error, double)
-    for quantity in quantities:
+    for quantity in quantities if result.field is None or min(result.field.grid.shape) > 1 else ():
         yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
     if result.reprojection is not None:
         taken: set[str] = set()
@@ -119,23 +127,35 @@ def isosurface(volume: Volume, width: float) -> Figure:
     level = default_level(volume)
     draw_isosurface(axes, volume, level)
     name, unit = label_of(volume.quantity).removesuffix("]").split(" [")
-    figure.suptitle(f"{name} = {level:.4g} {'' if unit == '1' else unit}".rstrip(), y=0.97)
+    figure.suptitle(f"{name} = {with_unit(f'{level:.4g}', unit)}", y=0.97)
     return figure
 
 
 def view(reprojection: Reprojection, i: int, width: float) -> Figure:
-    """Measured, re-projected and difference of every component that view `i` measured."""
+    """What view `i` measured and what is predicted of it: as maps or, if it has but a few rows or columns, as lines."""
     measurement = reprojection.measurement
     height_px, width_px = measurement.cameras[i].image_size
     inside = i, slice(0, height_px), slice(0, width_px)
     usable = [(o, measurement.usable_for(o)[inside][..., None].numpy()) for o in measurement.observations]
-    seen = [(o, mask) for o, mask in usable if mask.any() or len(usable) == 1]
-    lines = sum(len(o.components) for o, _ in seen)
+    seen: list[Seen] = []
+    for o, mask in usable:
+        if mask.any() or len(usable) == 1:
+            sigma = None if o.sigma is None else np.where(mask, o.sigma[inside].numpy(), np.nan)
+            predicted = reprojection.maps[o.technique.name][inside].numpy()
+            seen.append((o, np.where(mask, o.values[inside].numpy(), np.nan), predicted, sigma))
+    figure = (_lines if min(height_px, width_px) <= FEW else _maps)(seen, width)
+    held = ", held out" if measurement.names[i] in reprojection.held_out else ""
+    figure.suptitle(f"view {measurement.names[i]}{held}", parse_math=False)
+    return figure
+
+
+def _maps(seen: list[Seen], width: float) -> Figure:
+    """Measured, re-projected and difference of every component."""
+    lines = sum(len(o.components) for o, *_ in seen)
+    height_px, width_px, _ = seen[0][1].shape
     figure = _page(width, min(1.2, 0.31 * lines * height_px / width_px + 0.08))
     grid = iter(figure.subplots(lines, 3, sharex=True, sharey=True, squeeze=False))
-    for o, mask in seen:
-        measured = np.where(mask, o.values[inside].numpy(), np.nan)
-        predicted = reprojection.maps[o.technique.name][inside].numpy()
+    for o, measured, predicted, _ in seen:
         limits = map_range(measured, o.signed)
         apart = limits if o.signed else map_range(predicted - measured, True)  # which has both signs, so other colours
         for c, (component, line) in enumerate(zip(o.components, grid, strict=False)):
@@ -150,9 +170,28 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
                 add_colour_bar(list(line), label)
             else:
                 add_colour_bar(list(line[:2]), label)
-                add_colour_bar([line[2]], "difference [1]")
-    held = ", held out" if measurement.names[i] in reprojection.held_out else ""
-    figure.suptitle(f"view {measurement.names[i]}{held}", parse_math=False)
+                add_colour_bar([line[2]], f"difference [{o.technique.unit}]")
+    return figure
+
+
+def _lines(seen: list[Seen], width: float) -> Figure:
+    """Every component along every row, or along every column if these are fewer: measured and re-projected, difference.
+
+    Rows (or columns) are numbered where there are several.
+    """
+    upright = seen[0][1].shape[0] > seen[0][1].shape[1]
+    along, across = ("row", "column") if upright else ("column", "row")
+    count = min(seen[0][1].shape[:2])
+    panels = [(k, c, s) for s in seen for k, c in itertools.product(range(count), range(len(s[0].components)))]
+    figure = _page(width, min(1.3, 0.34 * len(panels) + 0.06))
+    grid = figure.subplots(2 * len(panels), 1, sharex=True, height_ratios=[3, 1.6] * len(panels))
+    for (k, c, (o, measured, predicted, sigma)), above, below in zip(panels, grid[::2], grid[1::2], strict=True):
+        line = (slice(None), k, c) if upright else (k, slice(None), c)
+        own, label = None if sigma is None else sigma[line], f"{o.components[c]} [{o.technique.unit}]"
+        draw_line((above, below), measured[line], predicted[line], own, label)
+        above.set_title(f"{across} {k}" if count > 1 else "")
+    grid[-1].set_xlabel(f"{along} [px]")
+    figure.align_ylabels(grid)
     return figure
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerif.conventions import unit_shown
 from nerif.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, colour_range, drawn_of, shown
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive
@@ -94,7 +95,7 @@ def _quantity(name: str, volume: Volume, level: float) -> dict[str, Any]:
     return {
         "button": name_of(name).capitalize(),
         "label": label,
-        "unit": "" if unit == "1" else unit,
+        "unit": unit_shown(unit),
         "relation": packing.relation(name, volume.attributes),
         "colours": COLOUR_MAPS.get(name, SEQUENTIAL),
         "level": level,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.conventions import InputError, with_unit
 from nerif.notebook import number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import frames_there
@@ -15,7 +17,7 @@ from nerif.report.scene import scene_over_time
 from nerif.report.summary import Statement
 from nerif.techniques.registry import technique, technique_of
 from nerif.volume import field_of
-from nerif.volume_sequence import VolumeSequence
+from nerif.volume_sequence import ViewScores, VolumeSequence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,16 +104,17 @@ def _frames(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
 
 
 def _fit(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
-    if "cc" not in store.group:
+    scores = store.view_scores
+    if not scores:
         return [("Truth", "volumes as they are")]
-    cc, rms = (np.asarray(array[:])[there] for array in (store.array("cc"), store.view_rms))
-    unit = "" if store.view_rms.attrs["units"] == "1" else f" {store.view_rms.attrs['units']}"
     held = np.array([v in store.attributes.get("hold_out", ()) for v in store.attributes["views"]])
     rows = []
-    for name, which in (("Training views", ~held), ("Held-out views", held)):
-        if which.any():
-            least, most = float(np.nanmin(cc[:, which])), float(np.nanmax(rms[:, which]))
-            rows.append((name, f"CC at least {number(least, 4)}, rms error at most {number(most, 3)}{unit}"))
+    for (name, which), of in itertools.product((("Training views", ~held), ("Held-out views", held)), scores):
+        cc, rms = (np.asarray(array[:])[there][:, which] for array in (of.cc, of.rms))
+        if np.isfinite(rms).any():
+            least, most = number(float(np.nanmin(cc)), 4), number(float(np.nanmax(rms)), 3)
+            said = f"CC at least {least}, rms error at most {with_unit(most, of.technique.unit)}"
+            rows.append((name + _of(of, scores), said))
     seconds = np.asarray(store.array("seconds")[:])[there]
     rows.append(("Time for a frame", f"{number(float(np.median(seconds)), 3)} s (median)"))
     return rows
@@ -119,18 +122,22 @@ def _fit(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
 
 def _curves(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
     """How the frames went, over time."""
-    if "cc" not in store.group:
+    scores = store.view_scores
+    if not scores:
         return []
     times = np.array(store.times)[there] * 1e3
     names, held = store.attributes["views"], store.attributes.get("hold_out", ())
-    rms, seconds = (np.asarray(array[:])[there] for array in (store.view_rms, store.array("seconds")))
+    seconds = np.asarray(store.array("seconds")[:])[there]
 
-    def draw_rms(axes: Axes) -> None:
+    def draw_rms(of: ViewScores, axes: Axes) -> None:
+        rms = np.asarray(of.rms[:])[there]
         for i, name in enumerate(names):
+            if not np.isfinite(rms[:, i]).any():
+                continue
             out = name in held
             axes.plot(times, rms[:, i], lw=1.2, ls="--" if out else "-", label=f"{name} (held out)" if out else name)
         axes.set_xlabel("time [ms]")
-        axes.set_ylabel(f"rms difference from the measurement [{store.view_rms.attrs['units']}]")
+        axes.set_ylabel(f"rms difference from the measurement [{of.technique.unit}]")
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=7, ncols=2)
 
@@ -140,4 +147,10 @@ def _curves(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
         axes.set_ylabel("spent on the frame [s]")
         axes.set_ylim(bottom=0)
 
-    return [("Every view over time", svg(draw_rms)), ("Time spent on each frame", svg(draw_seconds))]
+    views = [(f"Every view over time{_of(of, scores)}", svg(partial(draw_rms, of))) for of in scores]
+    return [*views, ("Time spent on each frame", svg(draw_seconds))]
+
+
+def _of(one: ViewScores, scores: list[ViewScores]) -> str:
+    """What is measured, where that has to be said."""
+    return f", {one.technique.measured}" if len(scores) > 1 else ""

@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from nerif.conventions import with_unit
 from nerif.drawing import LABELS, drawn_of, shown
+from nerif.evaluation import rms_text
 from nerif.notebook import number, percent, span
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
 from nerif.report.packing import relation
 from nerif.result import METRICS, VOLUME, Result
-from nerif.techniques.deflection import Deflection
+from nerif.techniques.registry import TECHNIQUES
 from nerif.volume import INDEX, field_of, name_of
 
-__all__ = ["Statement", "came_out", "headline", "measured", "rms_of", "trust", "trust_figures"]
+__all__ = ["Statement", "came_out", "headline", "measured", "trust", "trust_figures"]
 
 VITAL = (FIELD, METRICS, VOLUME)
 """Without these nothing can be said of a result; without the others less can be shown."""
@@ -56,7 +58,6 @@ def came_out(result: Result) -> list[tuple[str, str]]:
     for quantity in drawn_of(result.volumes):
         volume = result.volumes[quantity]
         name, unit = LABELS.get(quantity, (quantity, volume.unit))
-        unit = "" if unit == "1" else f" {unit}"
         digits = 4 if quantity == "temperature" else 3
         rows.append((name if quantity == "n" else name.capitalize(), span(shown(volume), unit, digits)))
     ambient = _ambient_temperature(result)
@@ -92,7 +93,7 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
             name = f"{title}{'s' if views is held and len(own) > 1 else ''}{f', {measured}' if len(of) > 1 else ''}"
             noise = _largest(own, "rms_over_sigma")
             beside = "" if noise is None else f" = {noise:.2f} σ"
-            rms = rms_of(max(own, key=lambda v: v.get("rms") or 0.0))
+            rms = rms_text(max(own, key=lambda v: v.get("rms") or 0.0), 3)
             worst = "" if len(own) == 1 else "at least "
             rows.append((name, f"CC {worst}{number(_smallest(own, 'cc'), 5)}, rms error {rms}{beside}"))
         if not views:
@@ -112,7 +113,7 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
         base = spread.quantity.removesuffix("_std")
         size = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
         name, unit = LABELS.get(base, (base, spread.unit))
-        text = f"σ of {name} rms {number(size, 2)}{'' if unit == '1' else f' {unit}'}"
+        text = f"σ of {name} rms {with_unit(number(size, 2), unit)}"
         rows.append((f"Ensemble of {ensemble.get('members')}", text))
     coverage = result.metrics.get("coverage")
     if isinstance(coverage, dict):
@@ -142,12 +143,6 @@ def headline(statements: list[Statement]) -> Statement:
             "bad": "Not to be relied on as it stands; see below.",
         }[worst],
     )
-
-
-def rms_of(view: dict[str, Any]) -> str:
-    """Return the rms error of a view with its unit."""
-    unit = view.get("unit", "1")
-    return number(view.get("rms"), 3) + ("" if unit == "1" else f" {unit}")
 
 
 def _place(view: dict[str, Any], views: list[dict[str, Any]]) -> str:
@@ -223,7 +218,7 @@ def _of_residual(result: Result) -> list[Statement]:
     known = [v for v in seen if v.get("rms_over_sigma") is not None]
     if not known:
         text = "The noise of the measurement is not known, so there is no telling whether the residual is noise."
-        remedy = "nerif displacement writes sigma." if seen[0]["measured"] == Deflection.measured else "Give its sigma."
+        remedy = "nerif displacement writes sigma." if _of_pictures(seen[0]["measured"]) else "Give its sigma."
         return [Statement("note", f"{text} {remedy}")]
     lowest, highest = (f(known, key=lambda v: v["rms_over_sigma"]) for f in (min, max))
     low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
@@ -239,6 +234,11 @@ def _of_residual(result: Result) -> list[Statement]:
         text = "What the field leaves unexplained in the training views"
         found.append(Statement("good", f"{text} is {low:.2f} to {high:.2f} of the noise."))
     return found
+
+
+def _of_pictures(measured: str) -> bool:
+    """Whether nerif displacement measures it, from pictures of a background."""
+    return any(kind.background for kind in TECHNIQUES.values() if kind.measured == measured)
 
 
 def _of_truth(result: Result) -> list[Statement]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nerif.conventions import unit_shown
 from nerif.drawing import map_colours, map_range
 from nerif.measurement import Measurement
 from nerif.observation import Observation
@@ -128,7 +129,7 @@ def _scale(reprojection: Reprojection, observation: Observation) -> Scale:
     apart = reprojection.maps[kind.name][:, ::step, ::step][some] - values
     return Scale(
         kind.measured,
-        "" if kind.unit == "1" else kind.unit,
+        unit_shown(kind.unit),
         map_range(values.numpy(), observation.signed, 0.998),
         map_range(apart.numpy(), True, 0.995),
     )

@@ -11,7 +11,7 @@ from nerif.conventions import InputError
 from nerif.metrics import volume_errors
 from nerif.result import write_json
 from nerif.sequence.store import DONE, SequenceStore
-from nerif.techniques.registry import technique
+from nerif.techniques.registry import ASSUMED, technique
 from nerif.volume import INDEX
 from nerif.volume_sequence import VolumeSequence
 
@@ -39,7 +39,7 @@ def evaluate_sequence(
     store, true = SequenceStore(Path(result)), VolumeSequence(truth)
     if len(store) != len(true) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, true.times, strict=True)):
         raise InputError(f"{truth}: expected the instants of {result}, {len(store)} frames, got others")
-    quantity = technique(store.attributes.get("techniques", ["deflection"])[0]).quantity
+    quantity = technique(store.attributes.get("techniques", [ASSUMED.name])[0]).quantity
     frames: list[dict[str, Any]] = []
     done = [i for i, status in enumerate(store.status) if status == DONE]
     for i in done:

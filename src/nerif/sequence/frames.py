@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -111,25 +112,25 @@ def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurem
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
     found = Volume.of(field.sample(grid, device), grid, measurement.quantity, measurement.n_ambient)
     volumes = [derive(found, wanted, plan.settings.gas) for wanted in plan.settings.quantities]
-    cc, rms = _against_measured(plan.cold.model, field, measurement, device)
-    return Frame(field, volumes, cc, rms, seconds=0.0, steps=0)
+    scores = _against_measured(plan.cold.model, field, measurement, device)
+    return Frame(field, volumes, scores, seconds=0.0, steps=0)
 
 
-def _against_measured(
-    model: str, field: Field, measurement: Measurement, device: str
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Correlation and rms difference in every view, held-out ones included, over some of its pixels."""
-    cc, rms = {}, {}
-    observation = measurement.observations[0]
-    projector = PathIntegral(forward_model(observation.technique, measurement, model), SAMPLES)
-    rays, measured, _ = measurement.rays(observation)
-    for i, name in enumerate(measurement.names):
-        own = (rays.view == i).nonzero()[:, 0]
-        if not len(own):
-            continue
-        own = own[:: max(1, len(own) // PIXELS)]
-        predicted = project(projector, field, rays[own], device).numpy()
-        seen = measured[own].numpy()
-        cc[name] = correlation(seen, predicted)
-        rms[name] = float(np.sqrt(np.mean((seen - predicted) ** 2)))
-    return cc, rms
+def _against_measured(model: str, field: Field, measurement: Measurement, device: str) -> list[dict[str, Any]]:
+    """Correlation and rms difference in every view, held-out ones included, by every technique, over some pixels."""
+    scores = []
+    for observation in measurement.observations:
+        kind = observation.technique
+        projector = PathIntegral(forward_model(kind, measurement, model), SAMPLES)
+        rays, measured, _ = measurement.rays(observation)
+        for i, name in enumerate(measurement.names):
+            own = (rays.view == i).nonzero()[:, 0]
+            if not len(own):
+                continue
+            own = own[:: max(1, len(own) // PIXELS)]
+            predicted = project(projector, field, rays[own], device).numpy()
+            seen = measured[own].numpy()
+            rms = float(np.sqrt(np.mean((seen - predicted) ** 2)))
+            found = {"name": name, "measured": kind.measured, "cc": correlation(seen, predicted), "rms": rms}
+            scores.append(found)
+    return scores

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from nerif.conventions import with_unit
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.sequence.frames import ATTEMPTS, reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
@@ -156,14 +157,16 @@ def outcome_table(store: SequenceStore) -> str:
     """Return what was done, what failed and why, as lines of text."""
     status, reasons = store.status, store.reasons
     seconds = np.asarray(store.array("seconds")[:])
-    rms, unit = np.asarray(store.view_rms[:]), store.view_rms.attrs["units"]
     done = status == DONE
     lines = [f"{int(done.sum())} of {len(status)} frames done"]
     if done.any():
-        lines[0] += (
-            f", {float(np.median(seconds[done])):.1f} s a frame (median), "
-            f"rms difference to the measured {float(np.nanmean(rms[done])):.4g}{'' if unit == '1' else f' {unit}'}"
-        )
+        sizes = []
+        for of in (scores := store.view_scores):
+            rms = np.asarray(of.rms[:])[done]
+            size = f"{float(rms[np.isfinite(rms)].mean()):.4g}" if np.isfinite(rms).any() else "unknown"
+            sizes.append(f"{of.technique.measured} " * (len(scores) > 1) + with_unit(size, of.technique.unit))
+        lines[0] += f", {float(np.median(seconds[done])):.1f} s a frame (median), "
+        lines[0] += f"rms difference to the measured {' and '.join(sizes)}"
     if (status == FAILED).any():
         lines.append(f"{int((status == FAILED).sum())} failed:")
         lines += [f"  frame {i}: {reasons[i]}" for i in np.flatnonzero(status == FAILED)]

@@ -27,7 +27,7 @@ from nerif.measurement_sequence import MeasurementSequence, add_frames
 from nerif.netcdf import reading
 from nerif.reconstruction.bounds import in_units
 from nerif.volume import Volume
-from nerif.volume_sequence import VolumeSequence
+from nerif.volume_sequence import VolumeSequence, score_names
 
 __all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore", "chunk_tau"]
 
@@ -43,7 +43,7 @@ class Frame:
     ----------
     field : with its weights
     volumes : what is written of it
-    cc, rms : what was measured against what is re-projected, by the name of the view
+    scores : `name` of the view, `measured`, `cc` and `rms`: what it measured against what is re-projected
     seconds : spent on the frame
     steps : of training
     attempts : how many it took
@@ -51,8 +51,7 @@ class Frame:
 
     field: NeuralField
     volumes: Sequence[Volume]
-    cc: dict[str, float]
-    rms: dict[str, float]
+    scores: Sequence[dict[str, Any]]
     seconds: float
     steps: int
     attempts: int = 1
@@ -96,7 +95,6 @@ class SequenceStore(VolumeSequence):
         """
         like, frames = sequence.first_good(), len(sequence)
         shutil.rmtree(_checkpoints(path), ignore_errors=True)
-        compared = like.techniques[0]
         names = [kind.name for kind in like.techniques]
         about = {"kind": KIND, "network": vars(network), "views": list(like.names), "techniques": names, **attributes}
         with atomic(path) as part:
@@ -107,10 +105,10 @@ class SequenceStore(VolumeSequence):
                 add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
 
             nan, seen = float("nan"), ((views,), ("view",), "float64")
-            add_frames(group, "cc", frames, *seen, units="1", long_name="correlation with what the view measured")
-            meaning = f"rms difference to the {compared.measured} that the view measured"
-            rms = "rms_px" if compared.unit == "px" else "rms"
-            add_frames(group, rms, frames, *seen, units=compared.unit, long_name=meaning)
+            for kind, (cc, rms) in score_names(like.techniques).items():
+                what = f"the {kind.measured} that the view measured"
+                add_frames(group, cc, frames, *seen, units="1", long_name=f"correlation with {what}")
+                add_frames(group, rms, frames, *seen, units=kind.unit, long_name=f"rms difference to {what}")
             add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
             add("index_scale", "float64", nan, "field of one unit of network output")
             add("offset", "float64", nan, "network output that counts as ambient")
@@ -146,8 +144,10 @@ class SequenceStore(VolumeSequence):
         self.array("weights")[index] = torch.cat(weights).numpy()
         self.array("index_scale")[index] = frame.field.scale
         self.array("offset")[index] = frame.field.offset
-        for array, found in ((self.array("cc"), frame.cc), (self.view_rms, frame.rms)):
-            array[index] = np.array([found.get(view, np.nan) for view in self.attributes["views"]])
+        for of in self.view_scores:
+            own = {s["name"]: s for s in frame.scores if s["measured"] == of.technique.measured}
+            for name, array in (("cc", of.cc), ("rms", of.rms)):
+                array[index] = np.array([own.get(view, {}).get(name, np.nan) for view in self.attributes["views"]])
         for name in ("seconds", "steps", "attempts"):
             self.array(name)[index] = getattr(frame, name)
         self.array("reason")[index] = ""

@@ -2,14 +2,17 @@
 
     A = -ln(I / I0) = integral mu ds
 
-Where A is large few counts are left, and their logarithm is skewed: then transmittances exp(-A) are compared instead
-(`intensity`), whose noise is even.
+Where A is large few quanta are left, and their logarithm is skewed. Then what has even noise is compared instead of A:
+transmittances, where the noise is the detector's (`intensity`), or their square roots, where it is that of quanta
+(`poisson`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -19,12 +22,12 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.techniques.base import ForwardModel, Light
 from nerif.techniques.line_integral import LineIntegral
+from nerif.techniques.plausible import IMPOSSIBLE, share_below
 
 __all__ = ["Absorption", "Intensity", "absorbance"]
 
-IMPOSSIBLE = 5.0  # standard deviations beyond which an intensity is not below 0, or above I0, by noise
-TOLERATED = 0.01  # share of such pixels
-UNKNOWN_SIGMA = 0.05  # of absorbance, where none is given
+TOLERATED = 0.01  # share of pixels with what cannot be
+LEAST = -0.25  # absorbance by which light that varies from picture to picture leads below 0
 
 
 @dataclass(frozen=True)
@@ -54,15 +57,11 @@ class Absorption(LineIntegral):
         sigma: Float[Tensor, "row column c"] | None,
         usable: Bool[Tensor, "row column"],
     ) -> None:
-        if not bool(usable.any()):
-            return
-        seen = values[usable]
-        least = torch.full_like(seen, UNKNOWN_SIGMA) if sigma is None else sigma[usable].clamp_min(UNKNOWN_SIGMA)
-        share = float((seen < -IMPOSSIBLE * least).float().mean())
+        share = share_below(LEAST, values, sigma, usable)
         if share > TOLERATED:
             raise InputError(
-                f"absorbance: expected -ln(I / I0) of 0 or more, as I is at most I0; {share:.0%} of the pixels are far "
-                f"below (down to {float(seen.min()):.3g}): subtract the offset that pixels beside the medium show"
+                f"absorbance: expected -ln(I / I0) of 0 or more, as I is at most I0; {share:.0%} of the pixels are "
+                f"far below (to {float(values[usable].min()):.3g}): subtract the offset of pixels beside the medium"
             )
 
     @classmethod
@@ -72,31 +71,45 @@ class Absorption(LineIntegral):
         """Return absorbances of so many quanta a pixel without the medium; the reference has no noise."""
         passed = torch.poisson(counts * torch.exp(-values.nan_to_num()), generator)
         found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_pictures=math.inf)
-        return torch.from_numpy(found).to(values), torch.from_numpy(sigma).to(values)
+        seen = torch.where(values.isnan(), values, torch.from_numpy(found).to(values))
+        return seen, torch.from_numpy(sigma).to(values)
 
 
 @dataclass(frozen=True)
 class Intensity(Absorption):
-    """Transmittance exp(-A) instead of A: the noise of intensities is even, that of their logarithm is not."""
+    """A power of the transmittance, y = exp(-p A), instead of A, with sigma_y = p y sigma_A.
+
+    p = 1 has even noise where that is the detector's, p = 1/2 where it is that of counted quanta: the variance of the
+    square root of a Poisson variable is 1/4, however large it is (Bartlett, J. R. Stat. Soc. Suppl. 3, 1936).
+
+    Parameters
+    ----------
+    power : p
+    """
 
     linear = False
+    power: float = 1.0
 
     @property
     def linear_twin(self) -> ForwardModel:
         return Absorption()
 
     def read(self, prediction: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
-        return torch.exp(-prediction)
+        return torch.exp(-self.power * prediction)
 
     def reading(
         self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None
     ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
-        passed = torch.exp(-values)
-        return passed, None if sigma is None else sigma * passed
+        read = self.read(values)
+        return read, None if sigma is None else self.power * read * sigma
 
 
-MODELS: dict[str, type[Absorption]] = {"absorbance": Absorption, "intensity": Intensity}
-"""What is compared: absorbances, or the transmittances that they stand for."""
+MODELS: dict[str, Callable[[], Absorption]] = {
+    "absorbance": Absorption,
+    "intensity": Intensity,
+    "poisson": partial(Intensity, 0.5),
+}
+"""What is compared: absorbances, or the transmittances that they stand for, or their square roots."""
 
 
 def absorbance(
@@ -112,7 +125,8 @@ def absorbance(
         A = -ln((I - D) / (I0 - D)),    sigma^2 = var(I) / (I - D)^2 + var(I0) / (I0 - D)^2 / N,
         var(I) = (I - D) / g + r^2
 
-    Pixels from which no light is left are NaN: their absorbance is larger than can be measured.
+    Where no light is left half a quantum is taken, with the variance of a whole one: such a pixel says that the
+    absorbance is large, and without it the brighter ones beside it would be left. Pixels without a reference are NaN.
 
     Parameters
     ----------
@@ -127,15 +141,17 @@ def absorbance(
     InputError
         If shapes disagree, intensities are negative, or I exceeds I0, by more than their noise.
     """
-    if intensity.shape != reference.shape:
-        raise InputError(f"reference: expected pictures of shape {intensity.shape}, got {reference.shape}")
+    for name, picture in (("reference", reference), ("dark", np.asarray(dark))):
+        if picture.shape != intensity.shape and (name, picture.shape) != ("dark", ()):
+            raise InputError(f"{name}: expected pictures of shape {intensity.shape}, got {picture.shape}")
     if not (electrons_per_count > 0 and read_noise >= 0):
         raise InputError("electrons_per_count, read_noise: expected above 0 and 0 or more")
     passed, whole = (np.asarray(x, dtype=np.float64) - dark for x in (intensity, reference))
-    one, many = (np.clip(x, 0, None) / electrons_per_count + read_noise**2 for x in (passed, whole))
+    quantum = 1 / electrons_per_count
+    one, many = (np.maximum(x, quantum) * quantum + read_noise**2 for x in (passed, whole))
     noise = [one, many / reference_pictures]
     for name, x, variance in (("intensity", passed, noise[0]), ("reference", whole, noise[1])):
-        negative = float(np.mean(x < -IMPOSSIBLE * np.sqrt(np.maximum(variance, 1 / electrons_per_count**2))))
+        negative = float(np.mean(x < -IMPOSSIBLE * np.sqrt(variance)))
         if negative > TOLERATED:
             where = f"{negative:.0%} of the pixels"
             raise InputError(f"{name}: expected counts of 0 or more, got negative ones at {where}; is dark right?")
@@ -145,6 +161,5 @@ def absorbance(
             f"intensity: expected at most the reference I0, got more at {brighter:.0%} of the pixels; "
             "are the two exchanged, or did the light change? Scale them by pixels beside the medium"
         )
-    seen = (passed > 0) & (whole > 0)
-    passed, whole = np.where(seen, passed, np.nan), np.where(seen, whole, np.nan)
+    passed, whole = np.maximum(passed, 0.5 * quantum), np.where(whole > 0, whole, np.nan)
     return -np.log(passed / whole), np.sqrt(noise[0] / passed**2 + noise[1] / whole**2)

@@ -114,6 +114,8 @@ class ForwardModel(ABC):
     """Whether the cameras have to look at a background."""
     bounds: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     """Lowest and highest value that the field can have, in its unit."""
+    traced: ClassVar[bool] = False
+    """Whether rays can be followed through the field, bent to every order (physics/ray_tracing.py)."""
     straight: ClassVar[bool] = True
     """Whether samples stand on the straight ray."""
     additive: ClassVar[bool] = False
@@ -133,6 +135,11 @@ class ForwardModel(ABC):
     @abstractmethod
     def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
         """Return what samples at path lengths s (mm) count for, each of which stands for a length (mm)."""
+
+    @classmethod
+    def in_pixels(cls) -> bool:
+        """Return whether values are lengths in the picture, which shrink with it."""
+        return cls.unit == "px"
 
     @property
     def linear_twin(self) -> ForwardModel:

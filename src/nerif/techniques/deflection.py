@@ -44,6 +44,7 @@ class Deflection(ForwardModel):
     quantity = "index_excess"
     gauge = True
     background = True
+    traced = True
 
     n_ambient: float = 1.0
 

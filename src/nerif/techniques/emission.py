@@ -15,11 +15,11 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.techniques.base import ForwardModel, Light
 from nerif.techniques.line_integral import LineIntegral
+from nerif.techniques.plausible import share_below
 
 __all__ = ["Emission"]
 
-NEGATIVE = 0.05  # of the largest radiance, below which a pixel is not 0 by noise
-IMPOSSIBLE = 5.0  # standard deviations, likewise
+NEGATIVE = 0.05  # of the largest radiance, by which a dark picture may be a little off
 TOLERATED = 0.01  # share of such pixels
 
 
@@ -60,11 +60,8 @@ class Emission(LineIntegral):
         sigma: Float[Tensor, "row column c"] | None,
         usable: Bool[Tensor, "row column"],
     ) -> None:
-        if not bool(usable.any()):
-            return
-        seen = values[usable]
-        noise = torch.zeros_like(seen) if sigma is None else IMPOSSIBLE * sigma[usable]
-        share = float((seen < -NEGATIVE * seen.abs().max() - noise).float().mean())
+        largest = float(values[usable].abs().max()) if bool(usable.any()) else 0.0
+        share = share_below(-NEGATIVE * largest, values, sigma, usable)
         if share > TOLERATED:
             raise InputError(
                 f"radiance: expected 0 or more, got less at {share:.0%} of the pixels; "

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +19,10 @@ from nerif.techniques.line_integral import LineIntegral
 __all__ = ["Interferometry"]
 
 MM_PER_NM = 1e-6
-LEAST_FRINGES, JUMP, TOLERATED = 0.9, 0.6, 2e-3  # a whole fringe between neighbours, and the share of such pairs
+WITHIN = (0.8, 1.01)  # fringes from the least to the largest of a wrapped phase
+JUMP, LARGEST_JUMP, NOISE = 0.6, 0.8, 5.0  # fringes between neighbours; where there is noise, so many of its deviations
+ENOUGH = 100_000  # pixels to tell the noise from
+TOLERATED = 0.1  # jumps, times the shorter side of the picture: fewer than the outline of a small spot
 
 
 @dataclass(frozen=True)
@@ -56,13 +60,27 @@ class Interferometry(LineIntegral):
         usable: Bool[Tensor, "row column"],
     ) -> None:
         values = torch.where(usable[..., None], values, torch.nan)
-        known = values[usable]
-        if not len(known) or not LEAST_FRINGES < float(known.max() - known.min()) < 1.01:
-            return
-        steps = [d[d.isfinite()] for d in (values.diff(dim=0), values.diff(dim=1))]
-        jumps = sum(int((d.abs() > JUMP).sum()) for d in steps)
-        if jumps > TOLERATED * sum(len(d) for d in steps):
-            raise InputError(
-                "fringes: expected an unwrapped phase, got one that jumps by a whole fringe between neighbours and "
-                "stays within one; unwrap it (skimage.restoration.unwrap_phase(2 pi fringes) / 2 pi)"
-            )
+        for fringe, unit, remedy in (
+            (1.0, "fringes", "skimage.restoration.unwrap_phase(2 pi fringes) / 2 pi"),
+            (2 * math.pi, "radians", "skimage.restoration.unwrap_phase(radians) / 2 pi"),
+        ):
+            if _wrapped(values / fringe):
+                raise InputError(
+                    f"fringes: expected an unwrapped phase in fringes, got one in {unit} that jumps by a whole fringe "
+                    f"between neighbours and stays within one; unwrap it ({remedy})"
+                )
+
+
+def _wrapped(values: Float[Tensor, "row column c"]) -> bool:
+    """Whether a phase in fringes, NaN where it is not known, stays within one and jumps by nearly one along lines."""
+    known = values[values.isfinite()]
+    if not len(known) or not WITHIN[0] < float(known.max() - known.min()) < WITHIN[1]:
+        return False
+    tolerated = 1 + TOLERATED * min(values.shape[:2])
+    jumps = torch.cat([(d := values.diff(dim=dim).abs())[d > JUMP] for dim in (0, 1)])
+    if len(jumps) <= tolerated:
+        return False
+    bends = torch.cat([(d := values.diff(n=2, dim=dim).abs())[d.isfinite()] for dim in (0, 1)])
+    bends = bends[:: 1 + len(bends) // ENOUGH]  # where the phase is smooth they are noise alone
+    noise = 1.4826 / math.sqrt(3) * float(bends.median()) if len(bends) else 0.0  # of a step
+    return int((jumps > min(NOISE * noise, LARGEST_JUMP)).sum()) > tolerated

@@ -13,12 +13,15 @@ from nerif.techniques.emission import Emission
 from nerif.techniques.interferometry import Interferometry
 
 __all__ = [
-    "AUTO", "MODELS", "TECHNIQUES", "check_model", "forward_model", "forward_models", "technique",
-    "technique_of",
+    "ASSUMED", "AUTO", "MODELS", "TECHNIQUES", "check_model", "forward_model", "forward_models", "model_of",
+    "technique", "technique_of",
 ]  # fmt: skip
 
 TECHNIQUES: dict[str, type[ForwardModel]] = {c.name: c for c in (Deflection, Absorption, Emission, Interferometry)}
 """By the name that files have for them; a technique of your own is one entry more."""
+
+ASSUMED = Deflection
+"""The technique of what names none: versions 1.0 of files, and stores, knew no other."""
 
 AUTO = "auto"
 MODELS: dict[str, tuple[str, ...]] = {
@@ -51,6 +54,11 @@ def check_model(model: str) -> None:
     known = (AUTO, *(name for names in MODELS.values() for name in names))
     if model not in known:
         raise InputError(f"model: expected one of {', '.join(known)}, got '{model}'")
+
+
+def model_of(kind: type[ForwardModel], name: str) -> str:
+    """Return the name if the technique has a model of it, else auto."""
+    return name if name in MODELS.get(kind.name, ()) else AUTO
 
 
 def forward_model(kind: type[ForwardModel], light: Light, model: str = AUTO) -> ForwardModel:

@@ -1,0 +1,165 @@
+"""A field belongs to the techniques that see it: whatever takes both refuses those that see another."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerif.cli import main
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate
+from nerif.fields.phantoms import GaussianBalls
+from nerif.gains import fit_gains, with_gains
+from nerif.geometry import Box, Ring
+from nerif.measurement import Measurement
+from nerif.prediction import predict
+from nerif.quick_views import binned
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.result import REPROJECTION, ResultDirectory
+from nerif.simulation import Simulation, simulate
+from nerif.symptoms import open_faces
+from nerif.techniques.absorption import Absorption
+from nerif.techniques.emission import Emission
+from nerif.workflow import Run, reconstruct_into
+
+RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)
+QUICK = Tikhonov(voxels=8, basis="linear", iterations=5, regularisation=1e-3, device="cpu")
+
+
+def simulated(folder: Path, name: str) -> Path:
+    measurement, _ = Simulation("gaussians", (name,), noise=0.05, steps=20, truth_voxels=8)(RING.cameras())
+    measurement.write(folder / f"{name}.nc")
+    return folder / f"{name}.nc"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Measurements by technique, each with a result beside it of the same name; that of deflection by curved rays."""
+    folder = tmp_path_factory.mktemp("techniques")
+    found = {name: simulated(folder, name) for name in ("deflection", "emission", "interferometry")}
+    for name in ("deflection", "emission"):
+        reconstruct_into(folder / name, found[name], QUICK, Run(report=False))
+    return found
+
+
+def test_a_result_is_not_scored_by_a_technique_that_sees_something_else(files):
+    directory = ResultDirectory(files["emission"].with_suffix(""))
+    kept = (directory / REPROJECTION).read_bytes()
+    message = r"deflection.nc: expected a technique that sees the field of radiance per length \(emission\), got deflec"
+    with pytest.raises(InputError, match=message):
+        evaluate(directory.path, measurement=files["deflection"])
+    assert (directory / REPROJECTION).read_bytes() == kept
+
+
+def test_a_technique_sees_no_field_of_another_quantity(files, tmp_path, capsys):
+    out = tmp_path / "p.nc"
+    words = ["project", str(files["deflection"].with_suffix("")), "-o", str(out)]
+    assert main([*words, "--technique", "absorption"]) == 2
+    said = capsys.readouterr().err
+    assert "technique: expected a technique that sees the field of refractive index (deflection, interfero" in said
+    assert not out.exists()
+    field, box, n_ambient = ResultDirectory(files["deflection"].with_suffix("")).field()
+    with pytest.raises(InputError, match=r"technique: .*, got absorption"):
+        predict(field, RING.cameras(), box, n_ambient, technique=Absorption, quantity="index_excess")
+
+
+def test_a_reconstruction_starts_from_no_field_of_another_quantity(files, tmp_path):
+    run = Run(start_from=files["deflection"].with_suffix(""), report=False)
+    with pytest.raises(InputError, match=r"start_from .*deflection: expected a technique .*, got emission"):
+        reconstruct_into(tmp_path / "r", files["emission"], QUICK, run)
+    assert not (tmp_path / "r").exists()
+
+
+def test_what_the_reconstruction_knows_of_another_technique_is_not_forced_on_this_one(files, tmp_path, monkeypatch):
+    """The model of the run stays with its technique, and the wavelength comes with the cameras of a file."""
+    result, out = files["deflection"].with_suffix(""), tmp_path / "p.nc"
+    kept = ResultDirectory.settings
+    monkeypatch.setattr(ResultDirectory, "settings", lambda self: {**kept(self), "model": "curved"})
+    words = ["project", str(result), "-o", str(out), "--technique", "interferometry", "--force"]
+    assert main([*words, "--wavelength-nm", "532"]) == 0
+    assert main([*words, "--cameras", str(files["interferometry"])]) == 0
+    assert Measurement.read(out).wavelength_nm == Measurement.read(files["interferometry"]).wavelength_nm
+    assert main([*words, "--cameras", str(files["interferometry"]), "--model", "curved"]) == 2
+
+
+# -- gains of cameras ----------------------------------------------------------------------------------------------
+
+
+def test_gains_that_were_fitted_stay_with_the_result(files, tmp_path):
+    """Evaluated again from the same file, the scores are those of the run, and so are the views."""
+    even = Measurement.read(files["emission"])
+    gains = dict(zip(even.names, (0.5, 1.6, 1.0, 1.25), strict=True))
+    uneven = tmp_path / "uneven.nc"
+    with_gains(even, {name: 1 / gain for name, gain in gains.items()}).write(uneven)
+    out = ResultDirectory(tmp_path / "r")
+    reconstruct_into(out.path, uneven, QUICK, Run(fit_gains=True, report=False))
+    about = tomllib.loads((out / "run.toml").read_text())["about"]
+    assert about["gains"] == pytest.approx(fit_gains(Measurement.read(uneven)), rel=1e-6)
+    before, views = out.metrics()["views"], out.reprojection()
+    evaluate(out.path, measurement=uneven)
+    after = out.metrics()["views"]
+    assert [v["rms"] for v in after] == pytest.approx([v["rms"] for v in before], rel=1e-5)
+    torch.testing.assert_close(out.reprojection().measurement.maps["radiance"], views.measurement.maps["radiance"])
+    settings = {k: v for k, v in out.settings().items() if k != "about"}
+    out.write_settings(settings, {"gains": {"0deg": 0}})
+    with pytest.raises(InputError, match="expected a number above 0 for view '0deg', got 0"):
+        evaluate(out.path, measurement=uneven)
+    out.write_settings(settings)  # forgotten, the views are not what the field was fitted to
+    evaluate(out.path, measurement=uneven)
+    assert out.metrics()["views"][0]["rms"] > 1.5 * before[0]["rms"]
+
+
+@pytest.mark.parametrize("left", [0.0, 1e-3])
+def test_a_view_that_shows_nothing_is_refused_by_name(files, left):
+    even = Measurement.read(files["emission"])
+    radiance = even.maps["radiance"].clone()
+    radiance[2] *= left
+    with pytest.raises(InputError, match=rf"fit_gains: view '{even.names[2]}' .* leave it out"):
+        fit_gains(replace(even, maps={"radiance": radiance}))
+
+
+# -- what each technique is asked ----------------------------------------------------------------------------------
+
+
+def test_a_simulation_names_its_technique_and_takes_a_peak_only_where_it_counts(files, tmp_path, capsys):
+    assert main(["simulate", "--technique", "-o", str(tmp_path / "m.nc")]) == 2
+    assert "technique: expected one or more of deflection" in capsys.readouterr().err
+    with pytest.raises(InputError, match="peak: expected for the extinction or emission of a phantom, got deflection"):
+        Simulation(peak=0.1)
+    with pytest.raises(InputError, match=r"peak: .*, got a volume file"):
+        Simulation("mine.nc", ("emission",), peak=0.1)
+    measurement, truth = Simulation("gaussians", ("emission",), peak=0.1, steps=10, truth_voxels=16)(RING.cameras())
+    assert 0.05 < float(truth.values.max()) <= 0.1
+    assert float(measurement.maps["radiance"].nan_to_num().max()) > 0
+
+
+def test_columns_of_info_have_their_units(files, capsys):
+    for name, head in (("deflection", "rms displacement [px]"), ("emission", "rms radiance [1]")):
+        assert main(["info", str(files[name])]) == 0
+        assert head in capsys.readouterr().out
+
+
+def test_flow_that_leaves_through_a_face_is_told_where_no_gauge_names_the_face():
+    """The faces that a file names by default fix nothing of an emission: it may leave through them."""
+    wide, box = Box((-25.0, -10.0, -10.0), (15.0, 10.0, 10.0)), Box((-5.0, -10.0, -10.0), (15.0, 10.0, 10.0))
+    inside, outside = torch.tensor([[6.0, 1.0, 1.0]]), torch.tensor([[-8.0, 0.0, 0.0]])
+    ball = GaussianBalls(inside, torch.tensor([2.0]), torch.tensor([0.1]))
+    both = GaussianBalls(torch.cat([inside, outside]), torch.tensor([2.0, 2.0]), torch.tensor([0.1, 0.1]))
+    cameras = Ring(views=6, arc=(0.0, 150.0), image_size=(20, 36), pixel_pitch=0.16).cameras()
+    small = replace(simulate(both, cameras, wide, 1.00027, steps=30, techniques=[Emission]), box=box)
+    assert "x-" in small.ambient_faces
+    [said] = open_faces(ball, small)
+    assert said.startswith("face x-: ")
+    assert open_faces(both, replace(small, box=wide)) == []
+
+
+def test_noise_below_zero_is_no_mistake_in_a_check():
+    """Of a view that shows a few things only, most pixels are noise about 0; the small pictures have no sigma."""
+    simulation = Simulation("flame", ("emission",), noise=0.3, steps=10, truth_voxels=8)
+    measurement, _ = simulation(replace(RING, image_size=(36, 37), pixel_pitch=0.11).cameras())
+    assert float(measurement.maps["radiance"].min()) < 0
+    assert float(binned(measurement, 48).maps["radiance"].min()) == 0
