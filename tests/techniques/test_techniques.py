@@ -139,6 +139,7 @@ class Cubic(Knife):
     """A toy whose profile is odd about the middle of the ray, but no line."""
 
     name = "cubic"
+    channels = ("",)
 
     def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
         middle = 0.5 * (rays.near + rays.far)[:, None]
@@ -296,6 +297,7 @@ class Plain:
 class Mirage(Knife):
     """A toy that sees the field alone, somewhat beside the straight ray."""
 
+    channels = ("",)
     straight, linear = False, False
 
     def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:

@@ -117,6 +117,7 @@ class VoxelOperator:
         if not _even(model, rays, s, interval, last * interval):
             profile = _tabulated(model, rays, s, interval, int(count.max()))
         kept = [a.to(self.device, self.dtype).contiguous() for a in (start, stride, profile)]
+        assert all(a is None or a.shape[1] == len(model.channels) for a in (weights.slope, weights.value))
         matrices = [] if weights.slope is None else [weights.slope / spacing]
         matrices += [] if weights.value is None else [weights.value[..., None]]
         path = (*kept, count.to(self.device, torch.int32))
