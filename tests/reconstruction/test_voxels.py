@@ -278,11 +278,14 @@ def test_data_that_cannot_be_reconstructed(fixed, measurement, monkeypatch):
         FIXED(measurement)
 
 
-def test_memory_is_not_underestimated(measurement):
+@pytest.mark.parametrize("upper", [None, 0.0])
+def test_memory_is_not_underestimated(measurement, upper):
     """Arrays of the size of the grid that are alive at once, counted by torch, fit in the estimate."""
     from torch.profiler import ProfilerActivity, profile
 
-    method = TotalVariation(voxels=32, device="cpu", regularisation=1e-2, iterations=3, coarse_to_fine=False)
+    method = TotalVariation(
+        voxels=32, device="cpu", regularisation=1e-2, iterations=3, coarse_to_fine=False, upper=upper
+    )
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
         method(measurement)
     alive = highest = 0

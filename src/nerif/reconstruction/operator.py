@@ -110,13 +110,11 @@ class VoxelOperator:
         start, stride = start.masked_fill(missing, 1.0), stride.masked_fill(missing, 0.0)
         self._check_inside(start, start + (count - 1).clamp_min(0)[:, None] * stride)
         last = (count - 1).clamp_min(0)
-        shares = last.new_tensor(PROBES)
-        places = s[:, None] + shares * (last * interval)[:, None]
-        weights = model.weights(rays, places, interval[:, None].expand_as(places))
-        first, final = weights.profile[:, :1], weights.profile[:, -1:]
-        profile = torch.cat([first, (final - first) / last.clamp_min(1)[:, None]], dim=1)
-        away = (weights.profile - first - shares * (final - first)).abs()
-        if bool((away > EVEN * weights.profile.abs().amax()).any()):
+        ends = s[:, None] + torch.stack([0 * last, last * interval], dim=1)
+        weights = model.weights(rays, ends, interval[:, None].expand_as(ends))
+        first, final = weights.profile.unbind(1)
+        profile = torch.stack([first, (final - first) / last.clamp_min(1)], dim=1)
+        if not _even(model, rays, s, interval, last * interval):
             profile = _tabulated(model, rays, s, interval, int(count.max()))
         kept = [a.to(self.device, self.dtype).contiguous() for a in (start, stride, profile)]
         matrices = [] if weights.slope is None else [weights.slope / spacing]
@@ -193,6 +191,18 @@ class VoxelOperator:
         for n in grid.shape:
             padded *= n + 2 * layers
         return rays * ((8 + 3 * channels) * dtype.itemsize + 4) + 2 * padded * dtype.itemsize
+
+
+def _even(model: ForwardModel, rays: Rays, s: Tensor, interval: Tensor, length: Tensor) -> bool:
+    """Whether the profile of every ray is a line from its first sample to its last, a length (mm) apart."""
+    shares = s.new_tensor(PROBES)
+    for i in torch.arange(len(rays), device=s.device).split(CHUNK):
+        at = s[i, None] + shares * length[i, None]
+        profile = model.weights(rays[i], at, interval[i, None].expand_as(at)).profile
+        line = profile[:, :1] + shares * (profile[:, -1:] - profile[:, :1])
+        if bool(((profile - line).abs() > EVEN * profile.abs().amax()).any()):
+            return False
+    return True
 
 
 def _tabulated(model: ForwardModel, rays: Rays, s: Tensor, interval: Tensor, most: int) -> Float[Tensor, "n m 1"]:

@@ -119,14 +119,15 @@ class VoxelReconstructor(Reconstructor):
         """Return what the operators of all techniques hold."""
         dtype = getattr(torch, self.precision)
         return sum(
-            VoxelOperator.memory_bytes(int(measurement.usable_for(o).sum()), grid, self.basis, dtype)
-            for o in measurement.observations
+            VoxelOperator.memory_bytes(rays, grid, self.basis, dtype, channels)
+            for rays, channels in _seen(measurement)
         )
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
         """Return what a run will need at most, beside what the process holds already."""
-        rays = sum(int(measurement.usable_for(o).sum()) for o in measurement.observations)
-        volumes, data = VOLUMES * math.prod(grid.shape) * self.itemsize, DATA * 2 * rays * self.itemsize
+        seen = _seen(measurement)
+        rays, numbers = sum(n for n, _ in seen), sum(n * channels for n, channels in seen)
+        volumes, data = VOLUMES * math.prod(grid.shape) * self.itemsize, DATA * numbers * self.itemsize
         preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
         around = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
         return self.operator_bytes(measurement, grid) + volumes + data + preparing + around
@@ -158,6 +159,11 @@ class WeightedVoxelReconstructor(VoxelReconstructor):
     @property
     def weight(self) -> float | None:
         return None if self.regularisation == "auto" else float(self.regularisation)
+
+
+def _seen(measurement: Measurement) -> list[tuple[int, int]]:
+    """Rays and channels of each technique."""
+    return [(int(measurement.usable_for(o).sum()), len(o.technique.channels)) for o in measurement.observations]
 
 
 class _Stop(Exception):
