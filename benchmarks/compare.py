@@ -11,12 +11,14 @@ Tikhonov. The ratio of a turn is that of the two that follow one another; shown 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -25,12 +27,12 @@ from bench import N_AMBIENT, Table, add_write
 HERE = Path(__file__).resolve().parents[1]
 POINTS = {"NeRIF, 8192 points a step": 8192, "NeRIF, 1024 points a step": 1024}
 GRIDS: dict[str, Literal["linear", "cubic"]] = {"Tikhonov, linear, 64³": "linear", "Tikhonov, cubic, 64³": "cubic"}
-WARM = 20  # steps that are not counted
-COUNTED = {"steps": 150, "iterations": 20}
+COUNTED = 60
+"""Steps of a training; iterations are a third of them."""
 
 
-def once(work: str, data: Path) -> float:
-    """Seconds of a step or an iteration, in this process: median over steps, mean over iterations."""
+def once(data: Path) -> dict[str, float]:
+    """Seconds of a step or an iteration of each work, in this process: medians."""
     import time
 
     from nerif.measurement import Measurement
@@ -39,27 +41,30 @@ def once(work: str, data: Path) -> float:
     from nerif.reconstruction.tikhonov import Tikhonov
 
     keep_freed_memory()
-    measurement = Measurement.read(data)
-    ends: list[float] = []
-    if work in POINTS:
-        steps = WARM + COUNTED["steps"]
-        method = NeRIF(max_steps=steps, epochs=1e6, points_per_batch=POINTS[work], device="cpu")
-        method(measurement, lambda step: ends.append(time.perf_counter()))
-        return statistics.median(b - a for a, b in zip(ends[WARM:-1], ends[WARM + 1 :], strict=True))
-    tikhonov = Tikhonov(
-        voxels=64, basis=GRIDS[work], iterations=COUNTED["iterations"], tolerance=0.0, regularisation=1e-3,
-        coarse_to_fine=False, device="cpu",
-    )  # fmt: skip
-    tikhonov(measurement, lambda step: ends.append(time.perf_counter()))
-    return (ends[-1] - ends[0]) / (len(ends) - 1)
+    measurement, found = Measurement.read(data), {}
+    network = NeRIF(max_steps=COUNTED, epochs=1e6, device="cpu")
+    voxels = Tikhonov(
+        voxels=64, iterations=COUNTED // 3, tolerance=0.0, regularisation=1e-3, coarse_to_fine=False, device="cpu"
+    )
+    works = {name: replace(network, points_per_batch=points) for name, points in POINTS.items()}
+    for name, method in {**works, **{name: replace(voxels, basis=basis) for name, basis in GRIDS.items()}}.items():
+        ends: list[float] = []
+
+        def note(_: object, ends: list[float] = ends) -> None:
+            ends.append(time.perf_counter())
+
+        method(measurement, note)
+        first = len(ends) // 4  # compiling, and memory that is new
+        found[name] = statistics.median(b - a for a, b in itertools.pairwise(ends[first:]))
+    return found
 
 
-def seconds(checkout: Path, work: str, data: Path) -> float:
-    """Seconds of `work` by the code of a checkout."""
-    command = [sys.executable, str(Path(__file__).resolve()), str(checkout), "--once", work, "--data", str(data)]
+def seconds(checkout: Path, data: Path) -> dict[str, float]:
+    """Seconds of each work by the code of a checkout."""
+    command = [sys.executable, str(Path(__file__).resolve()), str(checkout), "--once", str(data)]
     where = {**os.environ, "PYTHONPATH": str(checkout / "src")}
-    done = subprocess.run(command, env=where, capture_output=True, text=True, check=True)
-    return float(json.loads(done.stdout.splitlines()[-1]))
+    done = subprocess.run(command, env=where, stdout=subprocess.PIPE, text=True, check=True)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
 def main() -> None:
@@ -67,12 +72,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("before", type=Path, help="another checkout of the repository")
     parser.add_argument("--turns", type=int, default=9)
-    parser.add_argument("--once", help=argparse.SUPPRESS)
-    parser.add_argument("--data", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--once", type=Path, help=argparse.SUPPRESS)
     add_write(parser)
     asked = parser.parse_args()
     if asked.once:
-        print(json.dumps(once(asked.once, asked.data)))
+        print(json.dumps(once(asked.once)))
         return
     from nerif.fields.phantoms import Flame
     from nerif.geometry import paper_rig
@@ -85,12 +89,12 @@ def main() -> None:
         data = Path(folder) / "m.nc"
         cameras, box = paper_rig(64)
         add_noise(simulate(Flame(box), cameras, box, N_AMBIENT), 0.05, seed=1).write(data)
-        for work in (*POINTS, *GRIDS):
-            both = [[seconds(path, work, data) for path in (asked.before, HERE)] for _ in range(asked.turns + 1)][1:]
-            ratios = [now / before for before, now in both]
-            low, middle, high = statistics.quantiles(ratios, n=4)
-            before, now = (f"{1e3 * statistics.median(column):.2f}" for column in zip(*both, strict=True))
-            table.row([work, before, now, f"{middle:.3f}", f"{low:.3f} to {high:.3f}"])
+        turns = [[seconds(path, data) for path in (asked.before, HERE)] for _ in range(asked.turns + 1)][1:]
+    for work in (*POINTS, *GRIDS):
+        before, now = ([turn[i][work] for turn in turns] for i in (0, 1))
+        low, middle, high = statistics.quantiles((b / a for a, b in zip(before, now, strict=True)), n=4)
+        times = (f"{1e3 * statistics.median(column):.2f}" for column in (before, now))
+        table.row([work, *times, f"{middle:.3f}", f"{low:.3f} to {high:.3f}"])
 
 
 def _commit(checkout: Path) -> str:
