@@ -1,82 +1,121 @@
-"""Two versions of the code side by side: seconds of a training step and of a voxel iteration, as ratios within a run.
+"""Two versions of the code side by side: a training step and a voxel iteration, as ratios within one run.
 
     git worktree add ../before COMMIT
     python benchmarks/compare.py ../before --write benchmarks/results/compare-cpu.md
 
-Each measurement is a process of its own that imports `nerif` from one of the two checkouts; they take turns, so that
-both meet the same neighbours on the machine. What is compared is public in both: steps of NeRIF, iterations of
-Tikhonov. The ratio of a turn is that of the two that follow one another; shown are the median ratio and its quartiles.
+Each version is a process of its own that imports `nerif` from its checkout. Both stand ready at once and take turns of
+some steps, half a second or so, while the other waits: both meet the same neighbours on the machine. What is compared
+is public in both: steps of NeRIF, iterations of Tikhonov. Shown are medians over turns, of the ratio with its quartiles.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
-import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import IO
 
 from bench import N_AMBIENT, Table, add_write
 
 HERE = Path(__file__).resolve().parents[1]
-POINTS = {"NeRIF, 8192 points a step": 8192, "NeRIF, 1024 points a step": 1024}
-GRIDS: dict[str, Literal["linear", "cubic"]] = {"Tikhonov, linear, 64³": "linear", "Tikhonov, cubic, 64³": "cubic"}
-COUNTED = 60
-"""Steps of a training; iterations are a third of them."""
+WORKS = {
+    "NeRIF, 8192 points a step": 6,
+    "NeRIF, 1024 points a step": 25,
+    "Tikhonov, linear, 64³": 8,
+    "Tikhonov, cubic, 64³": 3,
+}
+"""What is compared, and steps or iterations of a turn."""
+WARM = 3  # turns that are not counted
 
 
-def once(data: Path) -> dict[str, float]:
-    """Seconds of a step or an iteration of each work, in this process: medians."""
-    import time
-
+def take_turns(work: str, data: Path) -> None:
+    """Do the work in this process: wait for a line, do a turn, print its seconds a step, for ever."""
     from nerif.measurement import Measurement
+    from nerif.reconstruction.base import Reconstructor
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural import NeRIF
     from nerif.reconstruction.tikhonov import Tikhonov
 
     keep_freed_memory()
-    measurement, found = Measurement.read(data), {}
-    network = NeRIF(max_steps=COUNTED, epochs=1e6, device="cpu")
+    network = NeRIF(max_steps=10**7, epochs=1e9, device="cpu")
     voxels = Tikhonov(
-        voxels=64, iterations=COUNTED // 3, tolerance=0.0, regularisation=1e-3, coarse_to_fine=False, device="cpu"
+        voxels=64, iterations=10**7, tolerance=0.0, regularisation=1e-3, coarse_to_fine=False, device="cpu"
     )
-    works = {name: replace(network, points_per_batch=points) for name, points in POINTS.items()}
-    for name, method in {**works, **{name: replace(voxels, basis=basis) for name, basis in GRIDS.items()}}.items():
-        ends: list[float] = []
+    methods: dict[str, Reconstructor] = {
+        "8192": network,
+        "1024": replace(network, points_per_batch=1024),
+        "linear": replace(voxels, basis="linear"),
+        "cubic": voxels,
+    }
+    method = next(method for key, method in methods.items() if key in work)
+    done, start = 0, 0.0
 
-        def note(_: object, ends: list[float] = ends) -> None:
-            ends.append(time.perf_counter())
+    def note(_: object) -> None:
+        nonlocal done, start
+        if done % WORKS[work] == 0:
+            if done:
+                print((time.perf_counter() - start) / WORKS[work], flush=True)
+            sys.stdin.readline()
+            start = time.perf_counter()
+        done += 1
 
-        method(measurement, note)
-        first = len(ends) // 4  # compiling, and memory that is new
-        found[name] = statistics.median(b - a for a, b in itertools.pairwise(ends[first:]))
-    return found
+    method(Measurement.read(data), note)
 
 
-def seconds(checkout: Path, data: Path) -> dict[str, float]:
-    """Seconds of each work by the code of a checkout."""
-    command = [sys.executable, str(Path(__file__).resolve()), str(checkout), "--once", str(data)]
-    where = {**os.environ, "PYTHONPATH": str(checkout / "src")}
-    done = subprocess.run(command, env=where, stdout=subprocess.PIPE, text=True, check=True)
-    return dict(json.loads(done.stdout.splitlines()[-1]))
+class Worker:
+    """A version at work, which goes on when it is told."""
+
+    def __init__(self, checkout: Path, work: str, data: Path) -> None:
+        command = [sys.executable, str(Path(__file__).resolve()), str(checkout), "--work", work, "--data", str(data)]
+        where = {**os.environ, "PYTHONPATH": str(checkout / "src"), "OMP_WAIT_POLICY": "PASSIVE"}
+        self.process = subprocess.Popen(command, env=where, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def turn(self) -> float:
+        """Seconds a step of the next turn."""
+        go, told = self._pipe(self.process.stdin), self._pipe(self.process.stdout)
+        go.write("\n")
+        go.flush()
+        return float(told.readline())
+
+    @staticmethod
+    def _pipe(pipe: IO[str] | None) -> IO[str]:
+        assert pipe is not None
+        return pipe
+
+
+def turns(before: Path, work: str, data: Path, count: int) -> list[tuple[float, float]]:
+    """Seconds a step before and now, turn by turn; which goes first changes."""
+    workers = [Worker(path, work, data) for path in (before, HERE)]
+    try:
+        found = []
+        for i in range(WARM + count):
+            order = (0, 1) if i % 2 else (1, 0)
+            taken = {k: workers[k].turn() for k in order}
+            found.append((taken[0], taken[1]))
+        return found[WARM:]
+    finally:
+        for worker in workers:
+            worker.process.kill()
+            worker.process.communicate()
 
 
 def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("before", type=Path, help="another checkout of the repository")
-    parser.add_argument("--turns", type=int, default=9)
-    parser.add_argument("--once", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--turns", type=int, default=40)
+    parser.add_argument("--work", help=argparse.SUPPRESS)
+    parser.add_argument("--data", type=Path, help=argparse.SUPPRESS)
     add_write(parser)
     asked = parser.parse_args()
-    if asked.once:
-        print(json.dumps(once(asked.once)))
+    if asked.work:
+        take_turns(asked.work, asked.data)
         return
     from nerif.fields.phantoms import Flame
     from nerif.geometry import paper_rig
@@ -89,12 +128,11 @@ def main() -> None:
         data = Path(folder) / "m.nc"
         cameras, box = paper_rig(64)
         add_noise(simulate(Flame(box), cameras, box, N_AMBIENT), 0.05, seed=1).write(data)
-        turns = [[seconds(path, data) for path in (asked.before, HERE)] for _ in range(asked.turns + 1)][1:]
-    for work in (*POINTS, *GRIDS):
-        before, now = ([turn[i][work] for turn in turns] for i in (0, 1))
-        low, middle, high = statistics.quantiles((b / a for a, b in zip(before, now, strict=True)), n=4)
-        times = (f"{1e3 * statistics.median(column):.2f}" for column in (before, now))
-        table.row([work, *times, f"{middle:.3f}", f"{low:.3f} to {high:.3f}"])
+        for work in WORKS:
+            both = turns(asked.before, work, data, asked.turns)
+            low, middle, high = statistics.quantiles((now / before for before, now in both), n=4)
+            times = (f"{1e3 * statistics.median(column):.2f}" for column in zip(*both, strict=True))
+            table.row([work, *times, f"{middle:.3f}", f"{low:.3f} to {high:.3f}"])
 
 
 def _commit(checkout: Path) -> str:

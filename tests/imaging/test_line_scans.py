@@ -73,6 +73,16 @@ def _point(x: float, y: float):
     return torch.tensor([x, y, 0.0])
 
 
+def test_an_angle_read_beside_its_place_is_told():
+    scan = true_scan()
+    moved = scan.readings.copy()
+    moved[4] = np.interp(scan.positions - 0.05, scan.positions, moved[4])
+    shifts = replace(scan, readings=moved).shifts()
+    assert shifts.keys() == set(range(len(ANGLES)))
+    assert shifts[4] == pytest.approx(0.05, rel=0.2)  # but for what it draws the sinusoid along
+    assert max(abs(shift) for angle, shift in shifts.items() if angle != 4) < 0.01
+
+
 def test_angles_that_are_cut_off_are_not_counted_on():
     scan = true_scan()
     cut = scan.readings.copy()

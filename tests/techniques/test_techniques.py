@@ -48,7 +48,7 @@ PACKAGE = Path(registry.__file__).parents[1]
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
 RING = Ring(views=5, image_size=(18, 23), pixel_pitch=0.13, distance=400.0, background_distance=300.0)
 OTHERS = [Absorption, Emission, Interferometry]
-NETWORK = NeRIF(network=NetworkShape(width=48, depth=3), points_per_batch=2048, max_steps=200, device="cpu")
+NETWORK = NeRIF(network=NetworkShape(width=32, depth=3), points_per_batch=1536, max_steps=120, device="cpu")
 
 
 @pytest.fixture(scope="module")

@@ -151,13 +151,22 @@ class LineScan:
 
     def axis(self) -> float:
         """Return the position of the axis of rotation, mm."""
+        return self._sinusoid()[0]
+
+    def shifts(self) -> dict[int, float]:
+        """Return how far the centre of mass of each complete angle is from the sinusoid through them all, mm."""
+        return dict(zip(self.complete.tolist(), self._sinusoid()[1].tolist(), strict=True))
+
+    def _sinusoid(self) -> tuple[float, Float[np.ndarray, " c"]]:
+        """Its middle, and how far the complete angles are from it, mm."""
         chosen = self.complete
         if len(chosen) < 4:
             raise InputError(f"readings: expected four angles or more that hold all of the medium, got {len(chosen)}")
         total = self.readings[chosen].sum(axis=1)
         centre = (self.readings[chosen] * self.positions).sum(axis=1) / total
         turn = np.stack([np.ones(len(chosen)), np.cos(self.angles[chosen]), np.sin(self.angles[chosen])], axis=1)
-        return float(np.linalg.lstsq(turn, centre, rcond=None)[0][0])
+        fitted = np.linalg.lstsq(turn, centre, rcond=None)[0]
+        return float(fitted[0]), centre - turn @ fitted
 
     def measurement(self, axis: float) -> Measurement:
         """Return the slice as a measurement of absorption: a telecentric camera of one row of pixels for every angle.
