@@ -15,6 +15,7 @@ from dataclasses import replace
 
 from bench import Table, add_write
 from nerif.evaluation import evaluate_volume
+from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import Simulation
@@ -26,14 +27,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--views", type=int, default=9)
     parser.add_argument("--pixels", type=int, default=64, help="of an edge of each view")
-    parser.add_argument("--counts", type=float, nargs="+", default=[100, 1000, 10000], help="quanta of the reference")
+    parser.add_argument("--counts", type=float, nargs="+", default=[100, 1000], help="quanta of the reference")
     parser.add_argument("--peaks", type=float, nargs="+", default=[0.02, 0.1, 0.3], help="largest extinction, 1/mm")
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--seeds", type=int, default=3, help="of noise and training, whose median is shown")
     add_write(parser)
     asked = parser.parse_args()
     size = (asked.pixels, asked.pixels)
     cameras = Ring(views=asked.views, image_size=size, pixel_pitch=0.02 * 200 / asked.pixels).cameras()
+    network = NeRIF(
+        network=NetworkShape(width=64), points_per_batch=4096, max_steps=asked.steps, epochs=1e6, device="cpu"
+    )
     title = f"Extinction of a flame, {asked.views} views of {asked.pixels}² px, {asked.steps} steps"
     columns = ("counts", "largest absorbance", *(f"L2, {name}" for name in MODELS))
     table = Table(title, columns, asked.write)
@@ -45,7 +49,7 @@ def main() -> None:
                 measurement, truth = flame(cameras)
                 clean = replace(flame, counts=0.0)(cameras)[0].maps["absorbance"]
                 for name in MODELS:
-                    method = NeRIF(model=name, max_steps=asked.steps, epochs=1e6, seed=seed, device="cpu")
+                    method = replace(network, model=name, seed=seed)
                     errors[name].append(evaluate_volume(method(measurement).field, truth, 1.0)["l2"])
             medians = (f"{statistics.median(found):.2%}" for found in errors.values())
             table.row([f"{counts:g}", f"{float(clean.nan_to_num().max()):.2f}", *medians])

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 from bench import N_AMBIENT, Table, add_write
 from nerif.evaluation import evaluate_volume
+from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural import NeRIF
@@ -27,7 +28,9 @@ LOWEST = -2.7e-4
 
 def methods(steps: int, voxels: int) -> dict[str, Callable[[int], Reconstructor]]:
     """The methods by name, each for a seed."""
-    network = NeRIF(max_steps=steps, epochs=1e6, device="cpu")
+    network = NeRIF(
+        network=NetworkShape(width=64), points_per_batch=4096, max_steps=steps, epochs=1e6, device="cpu"
+    )
     tv = TotalVariation(voxels=voxels, device="cpu")
     return {
         "NeRIF": lambda seed: replace(network, seed=seed),
@@ -44,8 +47,8 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=[3, 9])
     parser.add_argument("--noise", type=float, nargs="+", default=[0.05, 0.15])
     parser.add_argument("--pixels", type=int, default=64, help="of an edge of each view")
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--voxels", type=int, default=48)
+    parser.add_argument("--steps", type=int, default=500)
+    parser.add_argument("--voxels", type=int, default=40)
     parser.add_argument("--seeds", type=int, default=3, help="of noise and training, whose median is shown")
     add_write(parser)
     asked = parser.parse_args()

@@ -4,8 +4,9 @@
     python benchmarks/compare.py ../before --write benchmarks/results/compare-cpu.md
 
 Each version is a process of its own that imports `nerif` from its checkout. Both stand ready at once and take turns of
-some steps, half a second or so, while the other waits: both meet the same neighbours on the machine. What is compared
-is public in both: steps of NeRIF, iterations of Tikhonov. Shown are medians over turns, of the ratio with its quartiles.
+some steps, half a second or so, while the other waits: both meet the same neighbours on the machine. Compared is what
+is public in both: steps of NeRIF, iterations of Tikhonov. Shown are medians over turns, of the ratio with its
+quartiles.
 """
 
 from __future__ import annotations

@@ -92,11 +92,15 @@ def main() -> None:
         axis = told.axis
         tells.append(f"{name}: {told}; {floor(scan)}")
         best, iteration = sart(scan, axis)
-        table.row([name, f"{GOALS[name]:g}", f"SART, best iteration ({iteration})", f"{best:.4f}", "", "", ""])
-        of_mlem = best_mlem(asked.data, name)
-        table.row([name, f"{GOALS[name]:g}", f"MLEM, best iteration ({of_mlem[3]})", *errors(*of_mlem[:3]), ""])
-        table.row([name, f"{GOALS[name]:g}", f"TV, weight {tv.regularisation:g}", *errors(scan, axis, predicted), f"{seconds:.0f}"])
-        table.row([name, f"{GOALS[name]:g}", f"NeRIF, median of {asked.seeds}", *networks(asked, name)])
+        at, middle, of_mlem, stopped = best_mlem(asked.data, name)
+        rows = {
+            f"SART, best iteration ({iteration})": [f"{best:.4f}", "", "", ""],
+            f"MLEM, best iteration ({stopped})": [*errors(at, middle, of_mlem), ""],
+            f"TV, weight {tv.regularisation:g}": [*errors(scan, axis, predicted), f"{seconds:.0f}"],
+            f"NeRIF, median of {asked.seeds}": networks(asked, name),
+        }
+        for method, cells in rows.items():
+            table.row([name, f"{GOALS[name]:g}", method, *cells])
     table.text("", *tells)
 
 

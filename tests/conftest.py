@@ -57,6 +57,18 @@ LONGEST = ("test_style", "pictures", "films", "report", "test_cluster", "test_co
 """Groups to begin with, so that both processes end at about the same time."""
 
 
+WHOLE = ("test_cli", "test_docs", "test_examples", "test_workflow", "sequence", "mutation", "benchmarks", "report")
+"""Files and folders of tests that run whole commands: what these call is checked call by call in the other tests."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Check shapes by annotation, but not where whole commands run: that takes a sixth of their time."""
+    whole = item.path.stem.startswith(WHOLE) or item.path.parent.name in WHOLE
+    jaxtyping.config.update("jaxtyping_disable", whole)
+    return (yield)
+
+
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the tests of a file, or of a costly fixture, in one process, where what takes long is made once."""
@@ -93,9 +105,10 @@ def checked_steps() -> Iterator[None]:
 @pytest.fixture
 def unchecked() -> Iterator[None]:
     """Shapes are not checked by annotation, as when users call: the error has to be ours."""
+    before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.fixture(scope="session")

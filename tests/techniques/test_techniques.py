@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,7 +49,7 @@ PACKAGE = Path(registry.__file__).parents[1]
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
 RING = Ring(views=5, image_size=(18, 23), pixel_pitch=0.13, distance=400.0, background_distance=300.0)
 OTHERS = [Absorption, Emission, Interferometry]
-NETWORK = NeRIF(network=NetworkShape(width=32, depth=3), points_per_batch=1536, max_steps=120, device="cpu")
+NETWORK = NeRIF(network=NetworkShape(width=48, depth=3), points_per_batch=2048, max_steps=200, device="cpu")
 
 
 @pytest.fixture(scope="module")
@@ -149,8 +150,11 @@ def rays_of(m: Measurement) -> Rays:
     return m.rays()[0].to(dtype=torch.float64)
 
 
-@pytest.mark.parametrize("kind", [*TECHNIQUES.values(), Knife, Cubic], ids=lambda k: k.name)
-@pytest.mark.parametrize("basis", ["linear", "cubic"])
+@pytest.mark.parametrize(
+    ("kind", "basis"),
+    [*itertools.product(TECHNIQUES.values(), ["linear", "cubic"]), (Knife, "cubic"), (Cubic, "cubic")],
+    ids=lambda x: x if isinstance(x, str) else x.name,
+)
 def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
     m = measured["deflection"]
     model, rays, grid = forward_model(kind, m), rays_of(m)[::3], Grid(BOX, (11, 9, 13))
