@@ -31,7 +31,7 @@ def methods(steps: int, voxels: int) -> dict[str, Callable[[int], Reconstructor]
     network = NeRIF(
         network=NetworkShape(width=64), points_per_batch=4096, max_steps=steps, epochs=1e6, device="cpu"
     )
-    tv = TotalVariation(voxels=voxels, iterations=40, device="cpu")
+    tv = TotalVariation(voxels=voxels, device="cpu")
     return {
         "NeRIF": lambda seed: replace(network, seed=seed),
         "NeRIF, upper 0": lambda seed: replace(network, seed=seed, upper=0.0),
@@ -45,7 +45,7 @@ def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--views", type=int, nargs="+", default=[3, 9])
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.05])
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.05, 0.15])
     parser.add_argument("--pixels", type=int, default=64, help="of an edge of each view")
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--voxels", type=int, default=40)
@@ -61,7 +61,7 @@ def main() -> None:
         for noise in asked.noise:
             errors: dict[str, list[float]] = {name: [] for name in tried}
             for seed in range(asked.seeds):
-                measurement, truth = Simulation(noise=noise, seed=seed, steps=60, truth_voxels=64)(cameras)
+                measurement, truth = Simulation(noise=noise, seed=seed)(cameras)
                 for name, method in tried.items():
                     result = method(seed)(measurement)
                     errors[name].append(evaluate_volume(result.field, truth, N_AMBIENT)["l2"])
