@@ -13,7 +13,7 @@ from nerif.techniques.emission import Emission
 from nerif.techniques.interferometry import Interferometry
 
 __all__ = [
-    "ASSUMED", "AUTO", "MODELS", "TECHNIQUES", "check_model", "forward_model", "forward_models", "model_of",
+    "AUTO", "MODELS", "TECHNIQUES", "check_model", "forward_model", "forward_models", "model_of",
     "technique", "technique_of",
 ]  # fmt: skip
 
