@@ -28,8 +28,8 @@ def experiment(tmp_path_factory):
     folder = tmp_path_factory.mktemp("experiment")
     code = main(
         ["render", "-o", str(folder / "pictures"), "--phantom", "gaussians", "--views", str(VIEWS), "--arc", "10",
-         "120", "--image-size", "120", "140", "--pixel-pitch", "0.034", "--background-distance", "900",
-         "--references", "3", "--poses", "14", "--backgrounds", "2", "--truth-voxels", "20"]
+         "120", "--image-size", "96", "112", "--pixel-pitch", "0.0425", "--background-distance", "900",
+         "--references", "3", "--poses", "10", "--backgrounds", "2", "--truth-voxels", "20"]
     )  # fmt: skip
     assert code == 0
     pictures, out = folder / "pictures", folder / "calibration.toml"
@@ -151,11 +151,11 @@ def test_calibration_of_other_views_or_sizes(copy, capsys):
     file.write_text(text.replace(f'name = "{name}"', 'name = "other"'))
     assert main(displacement(copy, "--force")) == 2
     assert f"no camera named '{name}'" in capsys.readouterr().err
-    sized = text.replace("    120,\n    140,\n", "    240,\n    280,\n")
+    sized = text.replace("    96,\n    112,\n", "    192,\n    224,\n")
     assert sized != text
     file.write_text(sized)
     assert main(displacement(copy, "--force")) == 2
-    assert "was calibrated with (240, 280)" in capsys.readouterr().err
+    assert "was calibrated with (192, 224)" in capsys.readouterr().err
 
 
 def test_masks_by_threshold_and_drawn(experiment, tmp_path, capsys):
@@ -170,7 +170,7 @@ def test_masks_by_threshold_and_drawn(experiment, tmp_path, capsys):
     assert iio.imread(tmp_path / "masked.masks.png").std() > 10
     drawn = tmp_path / "drawn"
     drawn.mkdir()
-    whole = np.full((120, 140), 255, np.uint8)
+    whole = np.full((96, 112), 255, np.uint8)
     whole[:10] = 0
     iio.imwrite(drawn / f"{masked.names[1]}.png", whole)
     again = tmp_path / "again.nc"
@@ -224,7 +224,7 @@ def test_other_programs_calibrations_are_taken_over(experiment, tmp_path, capsys
     words = ["calibrate", str(tmp_path), "-o", str(out), "--scale-mm", "1000"]
     assert main(words) == 0
     assert "was not drawn" in capsys.readouterr().out
-    more = ["--background-distance", "900", "--image-size", "120", "140", "--force"]
+    more = ["--background-distance", "900", "--image-size", "96", "112", "--force"]
     assert main([*words, *more]) == 0
     taken, known = read_cameras(out), read_cameras(experiment / "calibration.toml")
     assert torch.allclose(taken[0].translation, known[0].translation)

@@ -42,7 +42,7 @@ NETWORK = NeRIF(
     points_per_batch=64, device="cpu", precision="float32",
 )  # fmt: skip
 BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))
-QUICK = 24
+QUICK = 16
 """Mutants of each kind in `make test`."""
 MANY = {
     "m.nc": 3400, "v.nc": 1400, "v.vti": 800, "c.toml": 1000, "c.csv": 400, "c.json": 400, "c.yml": 400, "c.mat": 400,

@@ -51,7 +51,7 @@ def undisturbed(measurement: Measurement) -> Reconstruction:
 
 
 def test_finds_the_balls_without_seeing_them(measurement, ball):
-    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=250, points_per_batch=2048)(
+    result = replace(SMALL, network=NetworkShape(depth=3, width=64, octaves=3), max_steps=170, points_per_batch=2048)(
         measurement
     )
     grid = Grid.of_resolution(measurement.box, 30)
@@ -224,7 +224,7 @@ def test_networks_kept_without_gains_have_octaves_that_count_alike():
 def test_large_pictures_begin_with_bins_and_go_on_with_what_there_is_time_for(measurement, monkeypatch):
     """A run that can see all pixels ends with pixels, one that cannot stays with bins; a resumed one goes on alike."""
     monkeypatch.setattr(bins, "FEWEST", 8)  # 20 x 26 px are large
-    short, ample = (replace(SMALL, max_steps=n, points_per_batch=300)(measurement) for n in (12, 300))
+    short, ample = (replace(SMALL, max_steps=n, points_per_batch=300)(measurement) for n in (12, 150))
     assert not any("bin_edge" in record for record in short.history)
     (refined,) = (record["bin_edge"] for record in ample.history if "bin_edge" in record)
     assert refined == 1

@@ -159,6 +159,7 @@ def test_it_fits_on_a_phone(browser, whole):
     assert smallest >= 28  # px, for a thumb
 
 
+@pytest.mark.slow
 def test_a_finger_scrolls_past_the_stage_until_a_tap_gives_it_the_finger(browser, whole):
     browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
     try:

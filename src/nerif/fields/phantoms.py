@@ -55,16 +55,14 @@ class GaussianBalls(Field):
         return cls(centres, widths, amplitudes)
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
-        value = torch.zeros_like(points[..., 0])
-        gradient = torch.zeros_like(points)
-        for centre, width, amplitude in zip(
-            self.centres.to(points), self.widths.tolist(), self.amplitudes.tolist(), strict=True
-        ):
-            offset = points - centre
-            ball = amplitude * torch.exp(offset.square().sum(-1) * (-0.5 / width**2))
-            value += ball
-            gradient -= ball[..., None] * offset / width**2
-        return value, gradient
+        middle = self.centres.mean(dim=0)
+        centres, p = (self.centres - middle).to(points), (points - middle.to(points)).reshape(-1, 3)
+        inverse, amplitudes = self.widths.to(points) ** -2, self.amplitudes.to(points)
+        distance = torch.cdist(p, centres, compute_mode="donot_use_mm_for_euclid_dist")
+        ball = amplitudes * torch.exp(-0.5 * inverse * distance.square())
+        pull = ball * inverse
+        gradient = pull @ centres - pull.sum(dim=1, keepdim=True) * p
+        return ball.sum(dim=1).reshape(points.shape[:-1]), gradient.reshape(points.shape)
 
 
 class Flame(Field):
