@@ -19,7 +19,6 @@ from bench import N_AMBIENT, Table, add_write, alone
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.measurement import Measurement
-from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.device import keep_freed_memory, peak_memory, resolve_device
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov
@@ -66,7 +65,7 @@ def run(
         operator(x)
         float(operator.T(y).sum())
         times.append(time.perf_counter() - start)
-    samples = int(operator.path[-1].sum())
+    samples = operator.samples
     estimate = settings.memory_bytes(measurement, grid) / 2**30
     cells = [f"{samples / 1e6:.1f}", str(iterations), f"{result.seconds:.1f}"]
     cells += [f"{result.seconds / iterations / samples * 1e9:.1f}", f"{min(times) * iterations / result.seconds:.0%}"]
@@ -77,18 +76,17 @@ def plain(measurement: Measurement, voxels: int, basis: Basis, threads: int) -> 
     """Seconds of one application and its adjoint by the compiled and the plain kernels on the CPU."""
     torch.set_num_threads(threads)
     keep_freed_memory()
-    rays, displacement, _ = measurement.rays()
+    rays, _, _ = measurement.rays()
     grid = Grid.of_resolution(measurement.box, voxels)
     operator = VoxelOperator(rays, grid, LeverArm(N_AMBIENT), basis)
     x = torch.rand(grid.shape)
-    padded, out = operator.boundary.extend(x, operator.layers), torch.zeros_like(displacement)
     operator.T(operator(x))
     start = time.perf_counter()
     operator.T(operator(x))
     fast = time.perf_counter() - start
     start = time.perf_counter()
-    kernels_torch.forward(operator.degree, padded, operator.path, operator.matrices[0], out)
-    kernels_torch.adjoint(operator.degree, out, operator.path, operator.matrices[0], torch.zeros_like(padded))
+    operator.compiled = False
+    operator.T(operator(x))
     return fast, time.perf_counter() - start
 
 

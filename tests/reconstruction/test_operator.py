@@ -12,8 +12,6 @@ import torch
 from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays
-from nerif.physics.path_integral import PathIntegral
-from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.techniques.deflection import MODELS
 
@@ -72,23 +70,43 @@ def test_adjoint_is_exact(rays, box, dtype, limit, basis, model):
     assert float(forward.norm()) > 0
 
 
+def plane_by_plane(field, ray: Rays, model) -> torch.Tensor:
+    """One ray through a field: a sample on each of two planes a voxel across the axis it runs along most.
+
+    NaN where one lies beyond the grid, where a spline of a grid and a field of a box go on in different ways.
+    """
+    grid = field.grid
+    slow = [abs(float(d)) / h for d, h in zip(ray.direction[0], grid.spacing, strict=True)]
+    axis = slow.index(max(slow))
+    apart = grid.spacing[axis] / 2 / abs(float(ray.direction[0, axis]))
+    heights = grid.box.lower[axis] + grid.spacing[axis] / 2 * (torch.arange(2 * grid.shape[2 - axis]) + 0.5).double()
+    s = (heights - ray.origin[0, axis]) / ray.direction[0, axis]
+    begin, end = torch.maximum(s - apart / 2, ray.near), torch.minimum(s + apart / 2, ray.far)
+    s, share = s[end > begin][None], ((end - begin) / apart)[end > begin]
+    weights = model.weights(ray, s, torch.full_like(s, apart))
+    points = ray.origin + s[0, :, None] * ray.direction
+    lower, upper = (points.new_tensor(corner) for corner in (grid.box.lower, grid.box.upper))
+    if not bool(((points >= lower) & (points <= upper)).all()):
+        return torch.full((1, 2), math.nan, dtype=torch.float64)
+    gradient = field.value_and_gradient(points)[1]
+    return torch.einsum("nij,m,mj->ni", weights.slope, weights.profile[0] * share, gradient)
+
+
 @pytest.mark.parametrize("basis", ["linear", "cubic"])
 @pytest.mark.parametrize("model", ["lever_arm", "paraxial"])
 def test_agrees_with_the_readable_twin(rays, box, basis, model):
     """The forward model through the Field, ray by ray, and its gradient by autograd."""
-    some = rays[torch.arange(0, len(rays), 25)]
+    some = rays[torch.arange(0, len(rays), 25)].to(dtype=torch.float64)
     a = operator(some, box, dtype=torch.float64, basis=basis, model=model, step=0.7)
     small = 1e-9  # next to which the n of 1 / n is one
     c = (small * random(*a.domain_shape)).requires_grad_(True)
-    field, length = a.field(c), some.far - some.near
-    counts = (length.double() / (0.7 * min(a.grid.spacing))).ceil().int().tolist()
-    d = torch.cat([
-        PathIntegral(MODELS[model](), count)(field, some[i : i + 1].to(dtype=torch.float64))
-        for i, count in enumerate(counts)
-    ])  # fmt: skip
-    d_fast, d_twin = a(c.detach()), d.detach()
+    d = torch.cat([plane_by_plane(a.field(c), some[i : i + 1], MODELS[model]()) for i in range(len(some))])
+    within = ~d[:, 0].isnan()
+    assert float(within.double().mean()) > 0.9
+    d = torch.where(within[:, None], d, torch.zeros_like(d))
+    d_fast, d_twin = a(c.detach()) * within[:, None], d.detach()
     assert torch.allclose(d_fast, d_twin, rtol=1e-6, atol=1e-8 * float(d_twin.abs().max()))
-    weights = random(*a.range_shape, seed=2)
+    weights = random(*a.range_shape, seed=2) * within[:, None]
     (gradient,) = torch.autograd.grad((weights * d).sum(), c)
     assert float((a.T(weights) - gradient).norm() / gradient.norm()) < 1e-6
 
@@ -97,16 +115,10 @@ def test_agrees_with_the_readable_twin(rays, box, basis, model):
 def test_compiled_and_plain_kernels_agree(rays, box, basis):
     a = operator(rays, box, dtype=torch.float64, basis=basis)
     c, d = random(*a.domain_shape), random(*a.range_shape, seed=1)
-    padded = a.boundary.extend(c, a.layers)
-    plain = torch.zeros_like(d)
-    kernels_torch.forward(a.degree, padded, a.path, a.matrices[0], plain)
-    assert torch.allclose(plain, a(c), rtol=1e-12, atol=1e-12 * float(plain.abs().max()))
-    spread = torch.zeros_like(padded)
-    kernels_torch.adjoint(a.degree, d, a.path, a.matrices[0], spread)
-    adjoint = a.T(d)
-    assert torch.allclose(
-        a.boundary.fold(spread, a.layers), adjoint, rtol=1e-12, atol=1e-12 * float(adjoint.abs().max())
-    )
+    compiled, adjoint = a(c), a.T(d)
+    a.compiled = False
+    assert torch.allclose(a(c), compiled, rtol=1e-12, atol=1e-12 * float(compiled.abs().max()))
+    assert torch.allclose(a.T(d), adjoint, rtol=1e-12, atol=1e-12 * float(adjoint.abs().max()))
 
 
 def test_sum_does_not_depend_on_the_number_of_threads(rays, box):
@@ -173,9 +185,14 @@ def test_a_constant_moves_nothing_and_a_slope_all_alike(rays, box):
 
 def test_memory_is_estimated_from_below_by_what_is_held(rays, box):
     a = operator(rays, box, basis="cubic")
-    held = sum(t.numel() * t.element_size() for t in (*a.path, *a.matrices))
-    padded = math.prod(n + 4 for n in GRID) * 4
-    assert VoxelOperator.memory_bytes(len(rays), a.grid, "cubic") == held + 2 * padded
+    padded = math.prod(n + 4 for n in GRID)
+    assert VoxelOperator.memory_bytes(len(rays), a.grid, "cubic") == held(a) + 2 * 4 * padded + 4 * 8 * padded
+
+
+def held(a: VoxelOperator) -> int:
+    """Bytes of the tensors of an operator."""
+    tensors = [t for bundle in a.bundles for t in vars(bundle).values() if isinstance(t, torch.Tensor)]
+    return sum(t.nbytes for t in tensors)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -207,9 +224,7 @@ def test_rays_that_miss_the_box_see_nothing(rays, box, basis):
     a = operator(both, box, basis=basis, dtype=torch.float64)
     c = random(*a.domain_shape)
     assert torch.equal(a(c)[30:], torch.zeros(10, 2, dtype=torch.float64))
-    plain = torch.zeros(40, 2, dtype=torch.float64)
-    kernels_torch.forward(a.degree, a.boundary.extend(c, a.layers), a.path, a.matrices[0], plain)
-    assert torch.allclose(plain, a(c), atol=1e-12 * float(plain.abs().max()))
+    assert torch.allclose(a(c)[:30], operator(rays[:30], box, basis=basis, dtype=torch.float64)(c))
 
 
 @pytest.mark.cuda

@@ -12,12 +12,12 @@ from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
-from nerif.reconstruction import kernels_torch
-from nerif.reconstruction import operator as operator_module
+from nerif.reconstruction import descent, kernels_torch
 from nerif.reconstruction import voxels as voxels_module
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.files import read_field, read_state, write_field, write_state
 from nerif.reconstruction.landweber import Landweber
+from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
@@ -273,7 +273,7 @@ def test_data_that_cannot_be_reconstructed(fixed, measurement, monkeypatch):
         replace(FIXED, open_faces=("x-", "x+", "y-", "y+", "z-", "z+"))(measurement)
     with pytest.raises(InputError, match="resume: the checkpoint is of another method or grid"):
         replace(FIXED, voxels=30)(measurement, resume=fixed.state)
-    monkeypatch.setattr(voxels_module, "available_memory", lambda device: 1 << 16)
+    monkeypatch.setattr(descent, "available_memory", lambda device: 1 << 16)
     with pytest.raises(InputError, match=r"would need [\d.]+ GiB on cpu, which has 0.0 GiB free; give fewer --voxels"):
         FIXED(measurement)
 
@@ -297,25 +297,11 @@ def test_memory_is_not_underestimated(measurement, upper):
     assert 0 < highest < method.memory_bytes(measurement, grid) - voxels_module.COMPILER_BYTES < 8 * highest
 
 
-class PlainKernels:
-    """What CUDA runs, in the place of what the CPU runs."""
-
-    @staticmethod
-    def forward(degree, padded, path, matrix, seen):
-        arrays = [torch.from_numpy(a) for a in (matrix, seen)]
-        kernels_torch.forward(degree, torch.from_numpy(padded), [torch.from_numpy(a) for a in path], *arrays)
-
-    @staticmethod
-    def adjoint(degree, seen, path, matrix, padded):
-        arrays = [torch.from_numpy(a) for a in (matrix, padded)]
-        kernels_torch.adjoint(degree, torch.from_numpy(seen), [torch.from_numpy(a) for a in path], *arrays)
-
-
 @pytest.mark.parametrize("basis", ["linear", "cubic"])
 def test_run_on_the_kernels_of_cuda_agrees(measurement, monkeypatch, basis):
     settings = replace(FIXED, basis=basis, precision="float64", iterations=4, voxels=16)
     compiled = settings(measurement)
-    monkeypatch.setattr(operator_module, "_numba", PlainKernels)
+    monkeypatch.setattr(VoxelOperator, "_kernels", lambda self: (kernels_torch.integrate, kernels_torch.spread))
     plain = settings(measurement)
     assert torch.allclose(plain.field.coefficients, compiled.field.coefficients, rtol=1e-6, atol=1e-12)
 

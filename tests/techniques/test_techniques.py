@@ -377,7 +377,7 @@ def test_memory_counts_the_operators_of_all_techniques_and_of_every_view(name, m
 
 
 def held_by(operator: VoxelOperator) -> int:
-    return sum(t.nbytes for t in (*operator.path, *operator.matrices))
+    return sum(t.nbytes for b in operator.bundles for t in vars(b).values() if isinstance(t, torch.Tensor))
 
 
 @pytest.mark.parametrize("method", [NETWORK, Tikhonov(voxels=8, device="cpu")], ids=["network", "voxels"])

@@ -3,7 +3,7 @@
     d = sum d_i / sigma_i^2 / sum 1 / sigma_i^2,      sigma^-2 = sum sigma_i^-2,      over the usable pixels of a bin
 
 The ray of a bin is the exact ray through the mean of its pixels, weighted alike. Bins at the rim of the box, some of
-whose rays miss it, are left out.
+whose rays miss it, are left out; a view that has no others keeps its pixels.
 """
 
 from __future__ import annotations
@@ -48,20 +48,22 @@ def binned_rays(
         if not bool(mask.any()):
             continue
         camera = observation.technique.seen_by(camera)
+        keep = _inside(camera, measurement.box, edge, open_faces)
+        own = edge if bool(keep.any()) else 1
         known = None if observation.sigma is None else observation.sigma[i, :height, :width]
         weight = mask[..., None].expand(height, width, channels).double()
         if known is not None:
             weight = torch.where(mask[..., None], known.double().pow(-2), 0.0)
         d = torch.where(mask[..., None], observation.values[i, :height, :width], 0.0)
-        total = _sums(weight, edge)
+        total = _sums(weight, own)
         mean = total.mean(-1, keepdim=True)
-        moment = _sums(weight.mean(-1, keepdim=True) * camera.pixel_grid(), edge)
-        keep = (mean[..., 0] > 0) & _inside(camera, measurement.box, edge, open_faces)
+        moment = _sums(weight.mean(-1, keepdim=True) * camera.pixel_grid(), own)
+        keep = (mean[..., 0] > 0) & (keep if own == edge else True)
         pixels = (moment / mean)[keep].to(camera.intrinsics.dtype)
         rays = camera.rays(pixels, view=i).clip(measurement.box)
         crosses = rays.crosses
         parts.append(rays[crosses].to(dtype=torch.float32))
-        values.append((_sums(weight * d, edge)[keep] / total[keep])[crosses].float())
+        values.append((_sums(weight * d, own)[keep] / total[keep])[crosses].float())
         sigma.append(total[keep][crosses].rsqrt().float())
     return Rays.concatenate(parts), torch.cat(values), torch.cat(sigma)
 

@@ -1,11 +1,6 @@
-"""The path integral through a voxel grid and its adjoint in plain PyTorch: for CUDA, and to compare with.
+"""Sums over the planes that rays cross, and their adjoint, in plain PyTorch: for CUDA, and to compare with.
 
-See kernels_numba.py for the same on all cores of a CPU. Along ray r the samples m = 0 ... count - 1 stand at
-
-    x_m = start + m stride  (in voxels, 0 at the first coefficient of the padded array)
-
-with the weight w_m = profile_0 + m profile_1 of a profile (n, 2), or profile_m of one (n, m, 1). A matrix (n, c, 3)
-takes sum_m w_m grad f(x_m), a matrix (n, c, 1) takes sum_m w_m f(x_m).
+See kernels_numba.py for the same on all cores of a CPU, and planes.py for what a path is.
 """
 
 from __future__ import annotations
@@ -18,7 +13,7 @@ from torch import Tensor
 
 from nerif.fields.grid import spline_weights
 
-__all__ = ["adjoint", "forward"]
+__all__ = ["integrate", "spread"]
 
 POINTS = {"cpu": 1 << 14, "cuda": 1 << 22}
 """Samples taken at a time: what stays in the cache of a CPU, and fills a GPU."""
@@ -26,73 +21,73 @@ POINTS = {"cpu": 1 << 14, "cuda": 1 << 22}
 CHUNK_BYTES = 1 << 30  # of the arrays that a chunk on a GPU takes, some 60 numbers a sample
 
 
-def forward(
-    degree: int, padded: Tensor, path: Sequence[Tensor], matrix: Tensor, seen: Float[Tensor, "n c"]
-) -> None:
-    """Add to `seen` what the matrix of each ray makes of the padded coefficients (z, y, x)."""
-    flat, shape = padded.reshape(-1), padded.shape
-    for part, (start, stride, profile, count) in _chunks(path):
-        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, profile, count)
-        gx, gy, gz = (torch.zeros_like(w) for _ in range(3))
-        for k in range(degree + 1):
-            for j in range(degree + 1):
-                line = flat[_line(index, k, j, shape, degree)]
-                along = (line * bx).sum(-1)
-                if matrix.shape[-1] == 1:
-                    gx += along * by[..., j] * bz[..., k]
-                    continue
-                gx += (line * sx).sum(-1) * by[..., j] * bz[..., k]
-                gy += along * sy[..., j] * bz[..., k]
-                gz += along * by[..., j] * sz[..., k]
-        q = torch.stack([(w * g).sum(-1) for g in (gx, gy, gz)[: matrix.shape[-1]]], dim=-1)
-        seen[part] += torch.einsum("nij,nj->ni", matrix[part], q)
+def integrate(
+    degree: int, value: Float[Tensor, "k v u"], slope: Float[Tensor, "k v u"] | None, path: Sequence[Tensor]
+) -> Float[Tensor, "n q"]:
+    """Return (n, 3), the integrals of the slopes along u, v and the axis, or (n, 1), that of the value, of each ray."""
+    found = []
+    for some in _chunks(path):
+        place, (bu, bv), (su, sv), w = _samples(degree, some, value.shape)
+        sums = [torch.zeros_like(w) for _ in range(1 if slope is None else 3)]
+        for j in range(degree + 1):
+            row = _row(place, j, value.shape, degree)
+            line = value.reshape(-1)[row]
+            if slope is None:
+                sums[0] += (line * bu).sum(-1) * bv[..., j]
+                continue
+            sums[0] += (line * su).sum(-1) * bv[..., j]
+            sums[1] += (line * bu).sum(-1) * sv[..., j]
+            sums[2] += (slope.reshape(-1)[row] * bu).sum(-1) * bv[..., j]
+        found.append(torch.stack([(w * g).sum(-1) for g in sums], dim=-1))
+    return torch.cat(found)
 
 
-def adjoint(
-    degree: int, seen: Float[Tensor, "n c"], path: Sequence[Tensor], matrix: Tensor, padded: Tensor
-) -> None:
-    """Add to the padded coefficients (z, y, x) what the adjoint makes of `seen`."""
-    flat, shape = padded.reshape(-1), padded.shape
-    for part, (start, stride, profile, count) in _chunks(path):
-        index, (bx, by, bz), (sx, sy, sz), w = _samples(degree, start, stride, profile, count)
-        q = torch.einsum("nij,ni->nj", matrix[part], seen[part])
-        for k in range(degree + 1):
-            for j in range(degree + 1):
-                ax, *others = (w * a[:, None] for a in q.unbind(-1))
-                if not others:
-                    share = (ax * by[..., j] * bz[..., k])[..., None] * bx
-                else:
-                    ay, az = others
-                    along = ay * sy[..., j] * bz[..., k] + az * by[..., j] * sz[..., k]
-                    share = (ax * by[..., j] * bz[..., k])[..., None] * sx + along[..., None] * bx
-                flat.index_add_(0, _line(index, k, j, shape, degree).reshape(-1), share.reshape(-1))
+def spread(degree: int, seen: Float[Tensor, "n q"], path: Sequence[Tensor], shape: Sequence[int]) -> list[Tensor]:
+    """Return what the adjoint makes of integrals (n, 3) or (n, 1): planes of the value and, of three, of the slope."""
+    planes = [seen.new_zeros(*shape) for _ in range(1 if seen.shape[1] == 1 else 2)]
+    done = 0
+    for some in _chunks(path):
+        place, (bu, bv), (su, sv), w = _samples(degree, some, planes[0].shape)
+        q = seen[done : done + len(w)]
+        done += len(w)
+        for j in range(degree + 1):
+            row = _row(place, j, planes[0].shape, degree).reshape(-1)
+            if len(planes) == 1:
+                share = (w * q[:, :1] * bv[..., j])[..., None] * bu
+            else:
+                share = (w * q[:, :1] * bv[..., j])[..., None] * su + (w * q[:, 1:2] * sv[..., j])[..., None] * bu
+                across = (w * q[:, 2:] * bv[..., j])[..., None] * bu
+                planes[1].reshape(-1).index_add_(0, row, across.reshape(-1))
+            planes[0].reshape(-1).index_add_(0, row, share.reshape(-1))
+    return planes
 
 
-def _chunks(path: Sequence[Tensor]) -> Iterator[tuple[slice, list[Tensor]]]:
+def _chunks(path: Sequence[Tensor]) -> Iterator[list[Tensor]]:
     count = path[-1]
-    longest = max(1, int(count.max())) if len(count) else 1
-    size = max(1, POINTS.get(count.device.type, 1 << 14) // longest)
+    size = max(1, POINTS.get(count.device.type, 1 << 14) // max(1, int(count.max())))
     for first in range(0, len(count), size):
-        part = slice(first, first + size)
-        yield part, [a[part] for a in path]
+        yield [a[first : first + size] for a in path]
 
 
 def _samples(
-    degree: int, start: Tensor, stride: Tensor, profile: Tensor, count: Tensor
+    degree: int, path: Sequence[Tensor], shape: torch.Size
 ) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
-    """First neighbour, weights and slopes along x, y, z, and w of every sample; w = 0 beyond a ray's own count."""
-    m = torch.arange(max(1, int(count.max())), device=start.device)
-    step = torch.minimum(m, (count[:, None] - 1).clamp_min(0)).to(start)
-    x = start[:, None] + step[..., None] * stride[:, None]
-    cell = x.floor()
-    weights, slopes = spline_weights(x - cell, degree)
-    even = profile.ndim == 2
-    w = profile[:, :1] + step * profile[:, 1:] if even else profile[..., 0].gather(1, step.long())
-    w = w * (m < count[:, None])
-    return cell.long(), weights.unbind(-2), slopes.unbind(-2), w
+    """First neighbour (plane, v, u), weights and slopes along u and v, and w of every sample; w = 0 beyond the last."""
+    start, stride, profile, lost, first, count = path
+    last = count[:, None] - 1
+    m = torch.arange(int(count.max()), device=start.device)
+    step = torch.minimum(m, last)
+    position = start[:, None] + step[..., None].to(start) * stride[:, None]
+    most = torch.tensor([shape[2], shape[1]], device=start.device) - (degree + 1)
+    cell = torch.minimum(position.floor().long().clamp_min(0), most)
+    weights, slopes = spline_weights(position - cell, degree)
+    w = profile[:, :1] + step * profile[:, 1:] if profile.ndim == 2 else profile[..., 0].gather(1, step.long())
+    w = w * (1 - (m == 0) * lost[:, :1] - (m == last) * lost[:, 1:]) * (m <= last)
+    place = torch.cat([(first[:, None] + step)[..., None].long(), cell.flip(-1)], dim=-1)
+    return place, weights.unbind(-2), slopes.unbind(-2), w
 
 
-def _line(index: Tensor, k: int, j: int, shape: torch.Size, degree: int) -> Tensor:
-    """Flat indices of the neighbours along x, k planes and j rows on from the first."""
-    first = ((index[..., 2] + k) * shape[1] + index[..., 1] + j) * shape[2] + index[..., 0]
-    return first[..., None] + torch.arange(degree + 1, device=index.device)
+def _row(place: Tensor, j: int, shape: torch.Size, degree: int) -> Tensor:
+    """Flat indices of the neighbours along u, j rows on from the first."""
+    first = (place[..., 0] * shape[1] + place[..., 1] + j) * shape[2] + place[..., 2]
+    return first[..., None] + torch.arange(degree + 1, device=place.device)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.geometry import Grid, Rays
+from nerif.reconstruction.planes import Bundle
 from nerif.techniques.base import ForwardModel
 
 __all__ = ["STEPS", "VoxelOperator", "operator_norm"]
@@ -20,20 +21,15 @@ __all__ = ["STEPS", "VoxelOperator", "operator_norm"]
 STEPS = {"linear": 0.5, "cubic": 1.0}
 """Voxels between samples: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
 
-EVEN = 1e-9  # of the largest weight: how far one may be from the line between those at the ends of a ray
-PROBES = (0.0, 0.0931, 0.2718, 0.3819, 0.5, 0.6543, 0.8191, 0.9397, 1.0)  # shares of a ray; no profile repeats there
-CHUNK = 1 << 15  # rays whose weights are looked at a time, sample by sample
-
 
 class VoxelOperator:
     """What rays see of a B-spline on a voxel grid by a linear forward model; c are the spline's coefficients.
 
         (A c)_r = sum_m w_rm [A_r f(x_rm) + B_r grad f(x_rm)],    f(x) = sum_ijk c_ijk b_ijk(x)
 
-    Profile w, A and B are the model's (techniques/base.py); samples stand at the middles of equal intervals between
-    near and far, no longer than `step` voxels. The kernels take the profile of a ray as first value and increment; one
-    that does not grow evenly is kept sample by sample. `A(c)` applies the operator, `A.T(y)` its exact adjoint. On a
-    CPU it runs on all cores (Numba), on CUDA in PyTorch.
+    Profile w, A and B are the model's (techniques/base.py); samples stand where rays cross evenly spaced planes
+    (planes.py). `A(c)` applies the operator, `A.T(y)` its exact adjoint. On a CPU it runs on all cores (Numba), on CUDA
+    in PyTorch.
 
     Parameters
     ----------
@@ -42,7 +38,7 @@ class VoxelOperator:
     model : linear ForwardModel
     basis : "linear" (coefficients are the values at voxel centres) or "cubic"
     boundary : how the coefficients go on beyond the box
-    step : longest distance between samples, in edges of a voxel; None for that of STEPS
+    step : longest distance between planes, in edges of a voxel; None for that of STEPS
     device, dtype : where and in which precision c and y are
 
     Raises
@@ -52,7 +48,7 @@ class VoxelOperator:
         named.
 
     Source: docs/conventions.md (forward model); Joseph, IEEE Trans. Med. Imaging 1 (1982), for projection by
-    interpolation.
+    interpolation in planes; Lacroute & Levoy, SIGGRAPH (1994), for the resampling along the axis.
     """
 
     def __init__(
@@ -79,6 +75,8 @@ class VoxelOperator:
         self.degree = DEGREES[basis]
         self.layers = (self.degree + 1) // 2
         self.device, self.dtype = torch.device(device), dtype
+        self.compiled = self.device.type == "cpu"  # or False: in plain PyTorch, to compare with
+        self.inner = torch.float64 if self.compiled else dtype
         self.domain_shape = grid.shape
         self.range_shape = (len(rays), len(model.channels))
         if min(grid.shape) < self.layers:
@@ -86,54 +84,20 @@ class VoxelOperator:
                 f"voxels: expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}"
             )
         self.step = step
-        self.path, self.matrices = self._prepare(rays, model, step)
+        each = max(math.ceil(1 / step), 1 if self.degree == 3 else 2)  # a linear slope jumps at the centres
+        bundles = Bundle.all_of(rays, grid, self.degree, each, model)
+        self.bundles = [bundle.to(self.device, self.inner, dtype) for bundle in bundles]
+
+    @property
+    def samples(self) -> int:
+        """How many samples all rays have."""
+        return sum(int(bundle.count.sum()) for bundle in self.bundles)
 
     def for_rays(self, rays: Rays, model: ForwardModel) -> VoxelOperator:
         """Return the operator of other rays on the same grid."""
         return VoxelOperator(
             rays, self.grid, model, self.basis, self.boundary, self.step, self.device, self.dtype
         )  # fmt: skip
-
-    def _prepare(self, rays: Rays, model: ForwardModel, step: float) -> tuple[tuple[Tensor, ...], list[Tensor]]:
-        """What the kernels need: start, stride, profile and count of each ray; its A and B, in voxels."""
-        rays = rays.to(dtype=torch.float64)  # cameras stand far off: positions lose digits in single precision
-        spacing = torch.tensor(self.grid.spacing, dtype=torch.float64, device=rays.near.device)
-        lower = torch.tensor(self.grid.box.lower, dtype=torch.float64, device=rays.near.device)
-        length = rays.far - rays.near
-        count = (length / (step * min(self.grid.spacing))).ceil().clamp_min(1) * rays.crosses
-        interval = length / count.clamp_min(1)
-        s = rays.near + 0.5 * interval
-        start = (rays.origin + s[:, None] * rays.direction - lower) / spacing - 0.5
-        start = start + (self.layers - self.degree // 2)  # counted from the first coefficient beyond the box
-        stride = rays.direction * interval[:, None] / spacing
-        missing = ~rays.crosses[:, None]  # no sample of theirs is taken, but each has to have a place
-        start, stride = start.masked_fill(missing, 1.0), stride.masked_fill(missing, 0.0)
-        self._check_inside(start, start + (count - 1).clamp_min(0)[:, None] * stride)
-        last = (count - 1).clamp_min(0)
-        ends = s[:, None] + torch.stack([0 * last, last * interval], dim=1)
-        weights = model.weights(rays, ends, interval[:, None].expand_as(ends))
-        first, final = weights.profile.unbind(1)
-        profile = torch.stack([first, (final - first) / last.clamp_min(1)], dim=1)
-        if not _even(model, rays, s, interval, last * interval):
-            profile = _tabulated(model, rays, s, interval, int(count.max()))
-        kept = [a.to(self.device, self.dtype).contiguous() for a in (start, stride, profile)]
-        matrices = [] if weights.slope is None else [weights.slope / spacing]
-        matrices += [] if weights.value is None else [weights.value[..., None]]
-        for matrix in matrices:  # by which the kernels walk through memory
-            if matrix.shape[1] != self.range_shape[1]:
-                what = f"expected weights of {self.range_shape[1]} channels a ray, got {matrix.shape[1]}"
-                raise InputError(f"{type(model).__name__}: {what}")
-        path = (*kept, count.to(self.device, torch.int32))
-        return path, [a.to(self.device, self.dtype).contiguous() for a in matrices]
-
-    def _check_inside(self, *positions: Tensor) -> None:
-        """Refuse samples beyond the coefficients: the kernels would read memory that is not theirs."""
-        most = torch.tensor([n + 2 * self.layers - self.degree for n in reversed(self.domain_shape)])
-        for p in positions:
-            if not bool(((p >= 0) & (p < most.to(p))).all()):
-                raise InputError(
-                    f"rays: expected rays clipped to the box of the grid, {self.grid.box}, got longer ones"
-                )
 
     def __call__(self, coefficients: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
         """Return what every ray sees."""
@@ -143,12 +107,17 @@ class VoxelOperator:
 
     def through(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n c"]:
         """Return what every ray sees of coefficients that go on beyond the box already."""
-        padded = padded.to(self.device, self.dtype).contiguous()
+        padded = padded.to(self.device, self.dtype)
         seen = torch.zeros(self.range_shape, dtype=self.dtype, device=self.device)
-        kernels, convert = self._kernels()
-        for matrix in self.matrices:
-            path = [convert(a) for a in self.path]
-            kernels.forward(self.degree, convert(padded), path, convert(matrix), convert(seen))
+        integrate, _ = self._kernels()
+        for bundle in self.bundles:
+            value, slope = bundle.planes.cut(padded, self.inner)
+            own = torch.zeros_like(seen[: len(bundle.index)])
+            if bundle.gradient is not None:
+                own += _made(bundle.gradient, integrate(self.degree, value, slope, bundle.path))
+            if bundle.value is not None:
+                own += _made(bundle.value, integrate(self.degree, value, None, bundle.path))
+            seen[bundle.index] = own
         return seen
 
     def T(self, seen: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
@@ -157,20 +126,23 @@ class VoxelOperator:
             raise InputError(f"seen: expected {self.range_shape}, got {tuple(seen.shape)}")
         shape = tuple(n + 2 * self.layers for n in self.domain_shape)
         padded = torch.zeros(shape, dtype=self.dtype, device=self.device)
-        seen = seen.to(self.device, self.dtype).contiguous()
-        kernels, convert = self._kernels()
-        for matrix in self.matrices:
-            path = [convert(a) for a in self.path]
-            kernels.adjoint(self.degree, convert(seen), path, convert(matrix), convert(padded))
+        seen = seen.to(self.device, self.dtype)
+        _, spread = self._kernels()
+        for bundle in self.bundles:
+            for matrix in (bundle.gradient, bundle.value):
+                if matrix is not None:
+                    q = torch.einsum("nij,ni->nj", matrix, seen[bundle.index]).to(self.inner).contiguous()
+                    value, *slope = spread(self.degree, q, bundle.path, bundle.planes.shape(shape))
+                    bundle.planes.mend(value, slope[0] if slope else None, padded)
         return self.boundary.fold(padded, self.layers)
 
-    def _kernels(self) -> tuple[Any, Callable[[Tensor], Any]]:
-        """The kernels of the device, and how they take arrays."""
-        if self.device.type == "cpu":
-            return _numba(), Tensor.numpy
+    def _kernels(self) -> tuple[Callable[..., Tensor], Callable[..., list[Tensor]]]:
+        """The kernels to run."""
+        if self.compiled:
+            return _compiled_integrate, _compiled_spread
         from nerif.reconstruction import kernels_torch
 
-        return kernels_torch, lambda a: a
+        return kernels_torch.integrate, kernels_torch.spread
 
     def field(self, coefficients: Float[Tensor, "z y x"]) -> VoxelField:
         """Return the field that coefficients stand for."""
@@ -183,36 +155,27 @@ class VoxelOperator:
 
     @staticmethod
     def memory_bytes(
-        rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32, channels: int = 2
+        rays: int,
+        grid: Grid,
+        basis: str = "linear",
+        dtype: torch.dtype = torch.float32,
+        channels: int = 2,
+        device: str = "cpu",
     ) -> int:
-        """Return what an operator holds while it is applied: rays, B in so many channels, and the padded grid twice."""
-        layers = (DEGREES[basis] + 1) // 2
-        padded = 1
-        for n in grid.shape:
-            padded *= n + 2 * layers
-        return rays * ((8 + 3 * channels) * dtype.itemsize + 4) + 2 * padded * dtype.itemsize
+        """Return what an operator holds while it is applied: rays, B in so many channels, the padded grid and planes.
+
+        Planes are those of the two adjoint arrays, and of the two that are cut.
+        """
+        inner = 8 if device == "cpu" else dtype.itemsize
+        layers, each = ((2, 1) if DEGREES[basis] == 3 else (1, 2))
+        padded = math.prod(n + 2 * layers for n in grid.shape)
+        held = 8 * inner + 3 * channels * dtype.itemsize + 16  # numbers of a path, B, whole numbers
+        return rays * held + padded * (2 * dtype.itemsize + 4 * each * inner)
 
 
-def _even(model: ForwardModel, rays: Rays, s: Tensor, interval: Tensor, length: Tensor) -> bool:
-    """Whether the profile of every ray is a line from its first sample to its last, a length (mm) apart."""
-    shares = s.new_tensor(PROBES)
-    for i in torch.arange(len(rays), device=s.device).split(CHUNK):
-        at = s[i, None] + shares * length[i, None]
-        profile = model.weights(rays[i], at, interval[i, None].expand_as(at)).profile
-        line = profile[:, :1] + shares * (profile[:, -1:] - profile[:, :1])
-        if bool(((profile - line).abs() > EVEN * profile.abs().amax()).any()):
-            return False
-    return True
-
-
-def _tabulated(model: ForwardModel, rays: Rays, s: Tensor, interval: Tensor, most: int) -> Float[Tensor, "n m 1"]:
-    """The profile of a model at every sample of every ray."""
-    m = torch.arange(most, dtype=s.dtype, device=s.device)
-    parts = []
-    for i in torch.arange(len(rays), device=s.device).split(CHUNK):
-        at = s[i, None] + m * interval[i, None]
-        parts.append(model.weights(rays[i], at, interval[i, None].expand_as(at)).profile)
-    return torch.cat(parts)[..., None]
+def _made(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:
+    """What the matrices make of integrals."""
+    return torch.einsum("nij,nj->ni", matrix, integrals.to(matrix.dtype))
 
 
 def operator_norm(
@@ -238,7 +201,18 @@ def operator_norm(
     return estimate
 
 
-def _numba() -> ModuleType:
+def _compiled_integrate(degree: int, value: Tensor, slope: Tensor | None, path: Sequence[Tensor]) -> Tensor:
+    arrays = [a.numpy() for a in path]
+    found = _compiled().integrate(degree, value.numpy(), None if slope is None else slope.numpy(), arrays)
+    return torch.from_numpy(found)
+
+
+def _compiled_spread(degree: int, seen: Tensor, path: Sequence[Tensor], shape: Sequence[int]) -> list[Tensor]:
+    planes = _compiled().spread(degree, seen.numpy(), [a.numpy() for a in path], shape)
+    return [torch.from_numpy(plane) for plane in planes]
+
+
+def _compiled() -> ModuleType:
     """The compiled kernels, with as many threads as torch uses."""
     import numba
 

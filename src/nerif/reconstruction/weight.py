@@ -36,7 +36,7 @@ class Choice:
     reason: str
 
 
-def choose_weight(solve: Solve, x: Tensor, noise: float | None = None) -> Choice:
+def choose_weight(solve: Solve, x: Tensor, noise: float | None = None, guess: float | None = None) -> Choice:
     """Return the weight by the discrepancy principle or the L-curve; see the head of this file.
 
     Parameters
@@ -44,11 +44,12 @@ def choose_weight(solve: Solve, x: Tensor, noise: float | None = None) -> Choice
     solve : see Solve
     x : where to start
     noise : the residual |F x - b|^2 that noise alone would leave, or None where sigma is not known
+    guess : the weight on a coarser grid, about which it is sought; None to begin with one that smooths too much
     """
-    weights = [HIGHEST]
-    path = [solve(HIGHEST, x)]
+    weights = [HIGHEST if guess is None else guess]
+    path = [solve(weights[0], x)]
     if noise is not None and path[0].residual <= noise:
-        return _upward(solve, path[0], noise)
+        return _upward(solve, weights[0], path[0], noise)
     corner, bend = 0, 0.0
     while weights[-1] / FACTOR >= LOWEST:
         weights.append(weights[-1] / FACTOR)
@@ -56,12 +57,14 @@ def choose_weight(solve: Solve, x: Tensor, noise: float | None = None) -> Choice
         if noise is not None and path[-1].residual <= noise:
             return _between(weights[-2], path[-2], weights[-1], path[-1], noise)
         corner, bend = sharpest_corner([(p.residual, p.penalty) for p in path])
-        path = [p if i in (corner, len(path) - 2, len(path) - 1) else _without_x(p, x) for i, p in enumerate(path)]
+        kept = (corner, len(path) - 2, len(path) - 1, 0 if guess is not None else corner)
+        path = [p if i in kept else _without_x(p, x) for i, p in enumerate(path)]
         if bend > 0 and len(path) > corner + PAST:
             break
     if bend <= 0:
-        corner = len(path) - 1
-    reason = "corner of the L-curve" if bend > 0 else "lowest weight tried, for the L-curve has no corner"
+        corner = len(path) - 1 if guess is None else 0
+    without = "lowest weight tried" if guess is None else "that of a coarser grid"
+    reason = "corner of the L-curve" if bend > 0 else f"{without}, for the L-curve has no corner"
     if noise is not None:
         left = math.sqrt(path[-1].residual / noise)
         reason += f" (the residual stays at {left:.2f} sigma: sigma too small, or grid too coarse for the flow?)"
@@ -87,9 +90,8 @@ def sharpest_corner(points: list[tuple[float, float]]) -> tuple[int, float]:
     return best, sharpest
 
 
-def _upward(solve: Solve, first: Iterate, noise: float) -> Choice:
+def _upward(solve: Solve, weight: float, here: Iterate, noise: float) -> Choice:
     """The noise was reached at once: go up until it is not."""
-    weight, here = HIGHEST, first
     while weight < 1e6 * HIGHEST:
         there = solve(weight * FACTOR, here.x)
         if there.residual > noise:
