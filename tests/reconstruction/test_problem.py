@@ -138,7 +138,7 @@ def test_landweber_comes_to_the_least_residual(problem, momentum):
     exact = np.linalg.lstsq(matrix, right, rcond=None)[0]
     least = float(np.sum((matrix @ exact - right) ** 2))
     after = [last(Landweber(momentum=momentum).iterate(problem, problem.zero(), 0.0), n).residual for n in (1, 20, 400)]
-    assert after[0] == pytest.approx(1, abs=1e-5)  # the zero field
+    assert after[0] < 0.999  # the first iteration is a step from the zero field, whose residual is 1
     assert after[0] > after[1] > after[2] >= least * (1 - 1e-9)
     assert after[2] < 1.1 * least
 
@@ -152,7 +152,7 @@ def test_momentum_takes_fewer_iterations(problem):
 
 
 def test_first_landweber_step_is_the_gradient(problem):
-    x = last(Landweber(momentum=False, relaxation=0.7).iterate(problem, problem.zero(), 0.0), 2).x
+    x = last(Landweber(momentum=False, relaxation=0.7).iterate(problem, problem.zero(), 0.0), 1).x
     gradient = problem.adjoint(problem.data)
     step = float((x * gradient).sum() / gradient.square().sum())
     assert torch.allclose(x, step * gradient)

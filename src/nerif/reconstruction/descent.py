@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["Descent"]
 
 JUDGES = 1 << 16  # pixels, at most, by whom the rest is judged: their mean square is known to half a per cent
+ROUGHLY = 10  # times the tolerance, for trials and for what is there to start from
 TRIALS = 8  # weights that are tried on a grid, about
 KEPT = ("level", "done", "total", "weight", "guess", "chosen")  # of a run, in a checkpoint
 
@@ -79,7 +80,8 @@ class Descent:
         # a field to start from makes the coarse grids needless
         first = [level.grid for level in self.levels].index(finest)
         self.level, self.done, self.total = 0 if start is None else first, 0, 0
-        self.choosing = (first - 1, first)  # a weight is sought on the last grid but one, and mended on the last
+        # a weight is sought on the last grid but one, and mended at the end
+        self.choosing = (first - 1, len(self.levels) - 1)
         self.weight = settings.weight
         self.guess: float | None = None
         self.chosen = ""
@@ -100,8 +102,10 @@ class Descent:
                 if self.weight is None and self.level in self.choosing:
                     x = self._choose(problem, judge, x)
                 weight = self.guess if self.weight is None else self.weight
-                _, converged = self._solve(problem, judge, x, FIRST if weight is None else weight)
-                if self.level == len(self.levels) - 1:
+                at_last = self.level == len(self.levels) - 1
+                tolerance = self.settings.tolerance * (1 if at_last else ROUGHLY)
+                _, converged = self._solve(problem, judge, x, FIRST if weight is None else weight, tolerance)
+                if at_last:
                     return self._result(self._outcome(converged))
                 self.level, self.done = self.level + 1, 0
         except _Stop as stop:
@@ -117,12 +121,12 @@ class Descent:
 
         def solve(weight: float, x: Tensor) -> Iterate:
             self.done = 0
-            found = self._solve(problem, judge, x, weight, 10 * self.settings.tolerance)[0]
+            found = self._solve(problem, judge, x, weight, ROUGHLY * self.settings.tolerance)[0]
             return replace(found, residual=_left(judge, found))
 
         choice = choose_weight(solve, x, self.noise, self.guess)
         self.guess, self.chosen, self.done = choice.weight, choice.reason, 0
-        if self.noise is None or self.here.grid == self.levels[-1].grid:
+        if self.noise is None or self.level == len(self.levels) - 1:
             self.weight = choice.weight
         return choice.x
 
@@ -170,11 +174,10 @@ class Descent:
     # -- the loop ------------------------------------------------------------------------------------------------
 
     def _solve(
-        self, problem: Problem, judge: Problem | None, x: Tensor, weight: float, tolerance: float | None = None
+        self, problem: Problem, judge: Problem | None, x: Tensor, weight: float, tolerance: float
     ) -> tuple[Iterate, bool]:
         """Iterate until it converges or the iterations are used up; which, is told."""
         settings, past = self.settings, [math.inf] * self.settings.patience
-        tolerance = settings.tolerance if tolerance is None else tolerance
         if settings.weight is not None:
             self.chosen = ""
         self.x = x

@@ -47,15 +47,14 @@ class Landweber(VoxelReconstructor):
         x = problem.clip(x)
         # the estimate comes from below, and a step too long diverges
         step = self.relaxation / (1.02 * operator_norm(problem.forward, problem.adjoint, problem.random())) ** 2
-        x_last, ahead, k, residual_last = x, x, 0, float("inf")
+        ahead, k, last = x, 0, float("inf")
+        r = problem.data - problem.forward(ahead)
         while True:
-            r = problem.data - problem.forward(ahead)
-            residual = float(r.square().sum())
-            if self.momentum and residual > residual_last and k > 0:
-                ahead, k, residual_last = x, 0, float("inf")  # the momentum carries uphill: begin anew from here
-                continue
-            yield Iterate(ahead, residual, 0.0)
-            residual_last = residual
-            x_last, x = x, problem.clip(ahead + step * problem.adjoint(r))
-            k += 1
+            x_last, x, k = x, problem.clip(ahead + step * problem.adjoint(r)), k + 1
             ahead = problem.clip(x + (k / (k + 3)) * (x - x_last)) if self.momentum else x
+            r = problem.data - problem.forward(ahead)
+            if self.momentum and float(r.square().sum()) > last:  # it carries uphill: begin anew from here
+                ahead, k = x, 0
+                r = problem.data - problem.forward(ahead)
+            last = float(r.square().sum())
+            yield Iterate(ahead, last, 0.0)

@@ -15,7 +15,7 @@ from nerif.measurement import Measurement
 __all__ = ["Level", "coarser", "levels", "pixels_in_a_voxel"]
 
 COARSEST = 12  # voxels along the longest edge of the first grid, at least
-WHILE_COARSE = 1.0  # voxels: edge of bins from which a method goes on to finer ones
+WHILE_COARSE = 1.25  # voxels: edge of bins from which a method goes on to finer ones
 AT_LAST = 0.25  # voxels: bins this small change nothing that the grid can hold
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +21,7 @@ from torch import Tensor
 from nerif.fields.grid import Boundary
 from nerif.geometry import Grid
 from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.preconditioner import filtered, response, spectrum_of_differences
 from nerif.reconstruction.target import Target
 
 __all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients", "minimise"]
@@ -147,6 +149,12 @@ class Problem:
         """Return x within the bounds and pinned."""
         return self.pin(x) if self.bounds is None else self.pin(x.clamp(*self.bounds))
 
+    @cached_property
+    def response(self) -> Float[Tensor, "z y k"]:
+        """The spectrum of F^T F, about (preconditioner.py)."""
+        free = None if self._free is None else self._free > 0
+        return response(lambda x: self.adjoint(self.forward(x)), self.zero(), free)
+
     def random(self) -> Float[Tensor, "z y x"]:
         """Return a random field, the same every time: where the power method starts."""
         x = torch.rand(self.operator.domain_shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -173,6 +181,17 @@ class Penalty:
         self.problem, self.kind = problem, kind
         self.root = 1 / math.sqrt(problem.voxels)
         self.roots = None if face_weights is None else tuple(w.sqrt() for w in face_weights)
+
+    @cached_property
+    def spectrum(self) -> Float[Tensor, "z y k"]:
+        """The spectrum of L^T L; of the mean of weights that differ from face to face."""
+        of = spectrum_of_differences(self.problem.zero(), self.problem.differences.inverse)
+        if self.kind == "identity":
+            return torch.ones_like(of) * self.root**2
+        if self.kind == "laplacian":
+            return (of * self.root) ** 2
+        mean = 1.0 if self.roots is None else float(torch.stack([r.square().mean() for r in self.roots]).mean())
+        return mean * of * self.root**2
 
     def __call__(self, x: Float[Tensor, "z y x"]) -> tuple[Tensor, ...]:
         """Return L x."""
@@ -237,13 +256,16 @@ def _within(problem: Problem, penalty: Penalty, x: Tensor) -> Iterate:
 def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
     """Minimise |F x - b|^2 + weight |L x|^2 by conjugate gradients on the least-squares problem (CGLS), without end.
 
-        alpha = |s|^2 / (|F p|^2 + weight |L p|^2),    x <- x + alpha p,    r <- r - alpha F p
-        s = F^T r - weight L^T L x,                    p <- s + (|s|^2 / |s_last|^2) p
+        alpha = s.z / (|F p|^2 + weight |L p|^2),         x <- x + alpha p,    r <- r - alpha F p
+        s = F^T r - weight L^T L x,    z = M^-1 s,        p <- z + (s.z / s_last.z_last) p
 
     Where bounds are given, voxels at a bound towards which the objective falls are held there; the others may pass
     theirs.
 
-    Source: Bjorck, Numerical Methods for Least Squares Problems (SIAM, 1996), Sec. 7.4.
+    M is that of preconditioner.py.
+
+    Source: Bjorck, Numerical Methods for Least Squares Problems (SIAM, 1996), Sec. 7.4; with circulant M: Chan & Ng,
+    SIAM Review 38 (1996) 427.
     """
     r = problem.data - problem.forward(x)
     q = tuple(-a for a in penalty(x))
@@ -253,7 +275,9 @@ def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Te
         low, high = problem.bounds
         hold = (~((x <= low) & (s < 0)) & ~((x >= high) & (s > 0))).to(x)
     s = s * hold
-    p, gamma = s.clone(), float(s.square().sum())
+    spectrum = problem.response + weight * penalty.spectrum
+    p = problem.pin(filtered(s, spectrum)) * hold
+    gamma = float((s * p).sum())
     done = gamma * (100 * torch.finfo(x.dtype).eps) ** 2  # from here on there is but rounding to follow
     while True:
         if gamma > done:
@@ -265,8 +289,9 @@ def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Te
         yield Iterate(x, _square(r), sum(_square(a) for a in q))
         if gamma > done:
             s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q)) * hold
-            last, gamma = gamma, float(s.square().sum())
-            p = s + (gamma / last) * p
+            z = problem.pin(filtered(s, spectrum)) * hold
+            last, gamma = gamma, float((s * z).sum())
+            p = z + (gamma / last) * p
 
 
 def _square(x: Tensor) -> float:

@@ -32,7 +32,7 @@ class TotalVariation(WeightedVoxelReconstructor):
 
     softness: float = 0.1
     """Gradient, in units of the field's own scale per box edge, below which the penalty is quadratic."""
-    round: int = 20
+    round: int = 10
     """Conjugate-gradient iterations between new weights."""
     iterations: int = 60
     """Most iterations on each grid and with each weight."""

@@ -22,6 +22,7 @@ FACTOR = 10**0.5  # between one weight and the next
 HIGHEST, LOWEST = 1e-1, 1e-6
 FIRST = 1e-2  # on coarse grids, which are there to start from
 PAST = 3  # weights beyond the corner before it is believed
+IDLE = 0.3  # of what is above the noise: a weight that takes away less than that does not lead down to it
 
 Solve = Callable[[float, Tensor], Iterate]
 """Solves with a weight, from a start."""
@@ -61,14 +62,13 @@ def choose_weight(solve: Solve, x: Tensor, noise: float | None = None, guess: fl
         path = [p if i in kept else _without_x(p, x) for i, p in enumerate(path)]
         if bend > 0 and len(path) > corner + PAST:
             break
+        if guess is not None and noise is not None and _idle(path[-2], path[-1], noise):
+            return Choice(weights[0], path[0].x, "that of a coarser grid" + _left(path[-1], noise))
     if bend <= 0:
         corner = len(path) - 1 if guess is None else 0
     without = "lowest weight tried" if guess is None else "that of a coarser grid"
     reason = "corner of the L-curve" if bend > 0 else f"{without}, for the L-curve has no corner"
-    if noise is not None:
-        left = math.sqrt(path[-1].residual / noise)
-        reason += f" (the residual stays at {left:.2f} sigma: sigma too small, or grid too coarse for the flow?)"
-    return Choice(weights[corner], path[corner].x, reason)
+    return Choice(weights[corner], path[corner].x, reason + _left(path[-1], noise))
 
 
 def sharpest_corner(points: list[tuple[float, float]]) -> tuple[int, float]:
@@ -88,6 +88,19 @@ def sharpest_corner(points: list[tuple[float, float]]) -> tuple[int, float]:
         if curvature > sharpest:
             best, sharpest = i, curvature
     return best, sharpest
+
+
+def _left(last: Iterate, noise: float | None) -> str:
+    """What is to be said of a residual that does not come down to the noise."""
+    if noise is None:
+        return ""
+    left = math.sqrt(last.residual / noise)
+    return f" (the residual stays at {left:.2f} sigma: sigma too small, or grid too coarse for the flow?)"
+
+
+def _idle(above: Iterate, below: Iterate, noise: float) -> bool:
+    """Whether a lower weight hardly brings the residual nearer to the noise: the grid cannot come down to it."""
+    return above.residual - below.residual < IDLE * (above.residual - noise)
 
 
 def _upward(solve: Solve, weight: float, here: Iterate, noise: float) -> Choice:
