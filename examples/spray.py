@@ -101,9 +101,9 @@ def draw(path: Path, scan: LineScan, predicted: np.ndarray, found: Reconstructio
         axes[1, 0].axhline(degrees[i], color="0.4", linewidth=0.6, linestyle=":")
     for k, i in enumerate(held_out):
         (line,) = axes[1, 1].plot(x, predicted[i] + k, linewidth=1)
-        axes[1, 1].plot(x, scan.readings[i] + k, ".", markersize=4, color=line.get_color(), label=f"{degrees[i]:.0f}°")
-    axes[1, 1].set(xlabel="position [mm]", ylabel="absorbance, each 1 higher", title="Angles held out")
-    axes[1, 1].legend(title="dots: measured", fontsize=8, title_fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+        axes[1, 1].plot(x, scan.readings[i] + k, ".", markersize=4, color=line.get_color())
+        axes[1, 1].text(x[-1], k + 0.08, f"{degrees[i]:.0f}°", ha="right", color=line.get_color())
+    axes[1, 1].set(xlabel="position [mm]", ylabel="absorbance, each 1 higher", title="Angles held out; dots: measured")
     figure.savefig(path, dpi=150)
 
 

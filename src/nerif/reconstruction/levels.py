@@ -12,7 +12,7 @@ from torch import Tensor
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
 
-__all__ = ["Level", "coarser", "levels", "pixels_in_a_voxel"]
+__all__ = ["Level", "bins_at_last", "coarser", "levels", "pixels_in_a_voxel"]
 
 COARSEST = 12  # voxels along the longest edge of the first grid, at least
 WHILE_COARSE = 1.25  # voxels: edge of bins from which a method goes on to finer ones
@@ -37,7 +37,7 @@ def levels(measurement: Measurement, voxels: int, degree: int, coarse_to_fine: b
     coarse_to_fine : whether there are coarser ones before it, each of voxels twice as large
     """
     grids = _grids(measurement.box, voxels, degree, coarse_to_fine)
-    last = Level(grids[-1], _bins(measurement, grids[-1], AT_LAST))
+    last = Level(grids[-1], bins_at_last(measurement, grids[-1]))
     if not coarse_to_fine:
         return [last]
     before = [Level(grid, _bins(measurement, grid, WHILE_COARSE)) for grid in grids]
@@ -52,6 +52,11 @@ def _grids(box: Box, voxels: int, degree: int, coarse_to_fine: bool) -> list[Gri
         shape = [min(n, max(4, n // 2)) for n in shape]
         grids.insert(0, Grid(box, (shape[0], shape[1], shape[2])))
     return grids
+
+
+def bins_at_last(measurement: Measurement, grid: Grid) -> int:
+    """Return the edge of the bins of pixels that the last iterations on a grid take, px."""
+    return _bins(measurement, grid, AT_LAST)
 
 
 def _bins(measurement: Measurement, grid: Grid, share: float) -> int:

@@ -53,7 +53,8 @@ def spectrum_of_differences(x: Float[Tensor, "z y x"], inverse: Sequence[float])
     x : any field of the shape
     inverse : factor of the differences along z, y and x
     """
-    waves = [torch.fft.fftfreq(n, dtype=torch.float64) for n in x.shape[:2]] + [torch.fft.rfftfreq(x.shape[2], dtype=torch.float64)]
+    last = torch.fft.rfftfreq(x.shape[2], dtype=torch.float64)
+    waves = [*(torch.fft.fftfreq(n, dtype=torch.float64) for n in x.shape[:2]), last]
     along = [i**2 * (2 - 2 * torch.cos(2 * math.pi * k)) for i, k in zip(inverse, waves, strict=True)]
     return (along[0][:, None, None] + along[1][:, None] + along[2]).to(x)
 

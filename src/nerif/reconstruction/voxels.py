@@ -23,6 +23,7 @@ from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.descent import Descent
+from nerif.reconstruction.levels import bins_at_last
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.techniques.registry import AUTO, check_model
@@ -114,12 +115,12 @@ class VoxelReconstructor(Reconstructor):
         dtype = getattr(torch, self.precision)
         return sum(
             VoxelOperator.memory_bytes(rays, grid, self.basis, dtype, channels)
-            for rays, channels in _seen(measurement)
+            for rays, channels in _seen(measurement, grid)
         )
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
         """Return what a run will need at most, beside what the process holds already."""
-        seen = _seen(measurement)
+        seen = _seen(measurement, grid)
         rays, numbers = sum(n for n, _ in seen), sum(n * channels for n, channels in seen)
         volumes, data = VOLUMES * math.prod(grid.shape) * self.itemsize, DATA * numbers * self.itemsize
         preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
@@ -155,6 +156,8 @@ class WeightedVoxelReconstructor(VoxelReconstructor):
         return None if self.regularisation == "auto" else float(self.regularisation)
 
 
-def _seen(measurement: Measurement) -> list[tuple[int, int]]:
-    """Rays and channels of each technique."""
-    return [(int(measurement.usable_for(o).sum()), len(o.technique.channels)) for o in measurement.observations]
+def _seen(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
+    """Rays, those of bins, and channels of each technique."""
+    pixels = bins_at_last(measurement, grid) ** 2
+    observations = measurement.observations
+    return [(int(measurement.usable_for(o).sum()) // pixels + 1, len(o.technique.channels)) for o in observations]
