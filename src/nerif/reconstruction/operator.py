@@ -155,19 +155,14 @@ class VoxelOperator:
 
     @staticmethod
     def memory_bytes(
-        rays: int,
-        grid: Grid,
-        basis: str = "linear",
-        dtype: torch.dtype = torch.float32,
-        channels: int = 2,
-        device: str = "cpu",
+        rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32, channels: int = 2
     ) -> int:
         """Return what an operator holds while it is applied: rays, B in so many channels, the padded grid and planes.
 
-        Planes are those of the two adjoint arrays, and of the two that are cut.
+        Paths and planes count in double precision, as on a CPU; planes are those of value and slope, cut and mended.
         """
-        inner = 8 if device == "cpu" else dtype.itemsize
-        layers, each = ((2, 1) if DEGREES[basis] == 3 else (1, 2))
+        inner = 8
+        layers, each = (2, 1) if DEGREES[basis] == 3 else (1, 2)
         padded = math.prod(n + 2 * layers for n in grid.shape)
         held = 8 * inner + 3 * channels * dtype.itemsize + 16  # numbers of a path, B, whole numbers
         return rays * held + padded * (2 * dtype.itemsize + 4 * each * inner)

@@ -42,7 +42,7 @@ class VoxelReconstructor(Reconstructor):
     voxels: int = 100
     """Voxels along the longest edge of the box, of the reconstruction and of the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
-    """Between voxel centres: cubic B-splines, or trilinear (less accurate, and no faster)."""
+    """Between voxel centres: cubic B-splines, or trilinear (less accurate, little faster)."""
     model: str = AUTO
     """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
     step: float | None = None
