@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 # ruff: noqa: E402
+import functools
+import inspect
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -46,6 +48,7 @@ from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
 from nerif.measurement import Measurement
 from nerif.reconstruction.training import Training
+from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.simulation import simulate
 
 torch.set_num_threads(1)  # tests run side by side
@@ -82,23 +85,31 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def checked_steps() -> Iterator[None]:
-    """Shapes are checked in the first step of a training; the others are like it, and many."""
-    run = Training.run
+    """Shapes are checked in the first step of a training or descent; the others are like it, and many."""
 
-    def run_checked_once(self: Training, on_step: Any = None) -> Any:
-        before = jaxtyping.config.jaxtyping_disable
+    def checked_once(run: Callable[..., Any]) -> Callable[..., Any]:
+        asks = inspect.signature(run)
 
-        def told(step: Any) -> Any:
-            jaxtyping.config.update("jaxtyping_disable", True)
-            return None if on_step is None else on_step(step)
+        @functools.wraps(run)
+        def run_checked_once(*given: Any, **named: Any) -> Any:
+            before, call = jaxtyping.config.jaxtyping_disable, asks.bind(*given, **named)
+            on_step = call.arguments.get("on_step")
 
-        try:
-            return run(self, told)
-        finally:
-            jaxtyping.config.update("jaxtyping_disable", before)
+            def told(step: Any) -> Any:
+                jaxtyping.config.update("jaxtyping_disable", True)
+                return None if on_step is None else on_step(step)
+
+            call.arguments["on_step"] = told
+            try:
+                return run(*call.args, **call.kwargs)
+            finally:
+                jaxtyping.config.update("jaxtyping_disable", before)
+
+        return run_checked_once
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Training, "run", run_checked_once)
+        patch.setattr(Training, "run", checked_once(Training.run))
+        patch.setattr(VoxelReconstructor, "__call__", checked_once(VoxelReconstructor.__call__))
         yield
 
 

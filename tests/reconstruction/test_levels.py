@@ -22,7 +22,7 @@ from nerif.simulation import simulate
 def flame() -> Measurement:
     """A flame that is seen by pictures of many more pixels than the grids here have voxels."""
     cameras, box = paper_rig(96)
-    return simulate(make_phantom("flame", box, 0), cameras, box, 1.00027, 0.05, 0, steps=30)
+    return simulate(make_phantom("flame", box, 0), cameras[::3], box, 1.00027, 0.05, 0, steps=20)
 
 
 def test_pixels_in_a_voxel_are_those_of_the_lens(flame):
@@ -52,11 +52,10 @@ def test_a_view_without_a_whole_bin_keeps_its_pixels(flame):
 
 
 def test_coarse_grids_and_bins_change_the_way_and_not_the_end(flame):
-    small = flame.select(flame.names[::3])
-    method = Tikhonov(voxels=24, device="cpu", regularisation=1e-3, tolerance=1e-7, iterations=200)
-    way, straight = method(small), replace(method, coarse_to_fine=False)(small)
+    method = Tikhonov(voxels=16, device="cpu", regularisation=1e-3, tolerance=1e-6, iterations=100)
+    way, straight = method(flame), replace(method, coarse_to_fine=False)(flame)
     assert {r["bin_edge"] for r in way.history} > {r["bin_edge"] for r in straight.history} == {1.0}
-    grid = Grid.of_resolution(flame.box, 24)
+    grid = Grid.of_resolution(flame.box, 16)
     a, b = (r.field.sample(grid) for r in (way, straight))
     assert float((a - b).norm() / b.norm()) < 5e-3
 

@@ -39,9 +39,8 @@ def test_every_weight_moves_and_the_loss_falls(kind):
 def test_muon_takes_the_matrices_and_turns_them_by_equal_amounts():
     net = network()
     optimiser = NetworkOptimiser("muon", net, (0.9, 0.99), 0.9)
-    groups = optimiser.parts["muon"].param_groups
     # neither biases nor the single output
-    assert {p.shape for group in groups for p in group["params"]} == {(16, 15), (16, 16)}
+    assert {p.shape for p in optimiser.parts["muon"].weights} == {(16, 15), (16, 16)}
     before = net.layers[1].weight.detach().clone()
     take_steps(optimiser, net, 1)
     step = torch.linalg.svdvals(net.layers[1].weight.detach() - before) / (2e-2 * 0.2 * 128**0.5)
@@ -98,7 +97,21 @@ def test_the_reference_steps_as_torch_has_it():
         ours, theirs = (matrix - start).flatten(), (twin - start).flatten()
         assert float(torch.dot(ours, theirs) / (ours.norm() * theirs.norm())) > 0.995  # up to bf16
         torch.testing.assert_close(ours.norm(), theirs.norm(), rtol=0.02, atol=0)
-    assert {group["share"] for group in optimiser.parts["adam"].param_groups} == {1.0}
+    assert set(optimiser.parts["adam"].shares) == {1.0}
+
+
+def test_adam_is_that_of_torch():
+    net, twin = network(), network()
+    optimiser = NetworkOptimiser("adam", net, (0.9, 0.99), 0.9, by_shape=False)
+    of_torch = torch.optim.Adam(twin.parameters(), lr=1e-2, betas=(0.9, 0.99))
+    p = torch.linspace(-1, 1, 60).reshape(-1, 3)
+    take_steps(optimiser, net, 10)
+    for _ in range(10):
+        of_torch.zero_grad()
+        (twin(p) - p.sum(1).sin()).square().mean().backward()
+        of_torch.step()
+    for ours, theirs in zip(net.parameters(), twin.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs)
 
 
 
@@ -110,8 +123,8 @@ def test_rates_follow_the_width(width):
         net = Network(shape)
         optimiser = NetworkOptimiser(kind, net, (0.9, 0.99), 0.9)
         names = {id(p): name for name, p in net.named_parameters()}
-        groups = [group for part in optimiser.parts.values() for group in part.param_groups]
-        return {names[id(p)]: group["share"] for group in groups for p in group["params"]}
+        parts = [zip(part.weights, part.shares, strict=True) for part in optimiser.parts.values()]
+        return {names[id(p)]: share for part in parts for p, share in part}
 
     wide, reference = shares(NetworkShape(width=width), "muon"), shares(NetworkShape(), "muon")
     assert wide["layers.1.weight"] == pytest.approx(reference["layers.1.weight"])  # square: the same spectral norm

@@ -59,9 +59,9 @@ def test_the_voxel_asked_is_free_and_a_blind_measurement_is_harmless():
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cameras, box = paper_rig(24)
-    measurement = simulate(make_phantom("flame", box, 0), cameras, box, 1.00027, 0.1, 0, steps=30)
-    target, grid = Target.of(measurement, linear=True), Grid.of_resolution(box, 14)
+    cameras, box = paper_rig(20)
+    measurement = simulate(make_phantom("flame", box, 0), cameras, box, 1.00027, 0.1, 0, steps=20)
+    target, grid = Target.of(measurement, linear=True), Grid.of_resolution(box, 10)
     faces = Boundary(measurement.ambient_faces)
     operators = [VoxelOperator(p.rays, grid, p.model, "cubic", faces, dtype=torch.float64) for p in target.parts]
     return Problem(operators, target)
@@ -73,7 +73,7 @@ def test_the_minimum_is_the_same_and_found_in_fewer_iterations(problem, kind, mo
 
     def objectives() -> list[float]:
         iterates = conjugate_gradients(problem, Penalty(problem, kind), weight, problem.zero())
-        return [i.objective(weight) for i in itertools.islice(iterates, 200)]
+        return [i.objective(weight) for i in itertools.islice(iterates, 120)]
 
     scaled = objectives()
     monkeypatch.setattr(problem_module, "filtered", lambda x, spectrum: x)

@@ -10,11 +10,13 @@ Source: Jordan et al., Muon (2024), kellerjordan.github.io/posts/muon.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from nerif.reconstruction.update import Update
 
 __all__ = ["Muon"]
 
@@ -22,30 +24,23 @@ NEWTON_SCHULZ = 5
 A, B, C = 3.4445, -4.7750, 2.0315  # of the polynomial a s + b s^3 + c s^5 of the singular values
 
 
-class Muon(torch.optim.Optimizer):
+class Muon(Update):
     """Muon for weight matrices.
 
     Parameters
     ----------
-    groups : of parameters, as torch's optimisers take them
+    weights, shares : see Update
     momentum : mu
     """
 
-    def __init__(self, groups: list[dict[str, Any]], momentum: float) -> None:
-        super().__init__(groups, {"lr": 1.0, "momentum": momentum})
+    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], momentum: float) -> None:
+        super().__init__(weights, shares)
+        self.momentum = momentum
 
-    @torch.no_grad()
-    def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Step all matrices that have a gradient."""
-        for group in self.param_groups:
-            for matrix in group["params"]:
-                if matrix.grad is None:
-                    continue
-                state = self.state[matrix]
-                kept = state.setdefault("momentum_buffer", torch.zeros_like(matrix))
-                kept.lerp_(matrix.grad, 1 - group["momentum"])
-                direction = orthogonal(matrix.grad.lerp(kept, group["momentum"]))
-                matrix.add_(direction.to(matrix), alpha=-group["lr"])
+    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
+        kept = memory.setdefault("momentum_buffer", torch.zeros_like(weight))
+        kept.lerp_(gradient, 1 - self.momentum)
+        weight.add_(orthogonal(gradient.lerp(kept, self.momentum)).to(weight), alpha=-rate)
 
 
 def orthogonal(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:

@@ -18,13 +18,14 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.encoding import encoded_width
 from nerif.fields.mlp import Network, NetworkShape
+from nerif.reconstruction.adam import Adam
 from nerif.reconstruction.muon import Muon
+from nerif.reconstruction.update import Update
 
 __all__ = ["OPTIMISERS", "NetworkOptimiser"]
 
@@ -51,11 +52,10 @@ class NetworkOptimiser:
         matrices = [p for p in parameters if kind == "muon" and p.ndim == 2 and min(p.shape) > 1]
         chosen = {id(p) for p in matrices}
         others = [p for p in parameters if id(p) not in chosen]
-        adam = [{"params": [p], "share": adam_share(network, p) if by_shape else 1.0} for p in others]
-        self.parts: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(adam, lr=1.0, betas=betas)}
+        shares = [adam_share(network, p) if by_shape else 1.0 for p in others]
+        self.parts: dict[str, Update] = {"adam": Adam(others, shares, betas)}
         if matrices:
-            muon = [{"params": [p], "share": muon_share(network, p)} for p in matrices]
-            self.parts["muon"] = Muon(muon, momentum)
+            self.parts["muon"] = Muon(matrices, [muon_share(network, p) for p in matrices], momentum)
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -65,17 +65,15 @@ class NetworkOptimiser:
     def step(self, rates: dict[str, float]) -> None:
         """Step, with a learning rate for each part by name."""
         for name, part in self.parts.items():
-            for group in part.param_groups:
-                group["lr"] = rates[name] * group["share"]
-            part.step()
+            part.step(rates[name])
 
     def tensors(self) -> dict[str, Tensor]:
         """Return copies of all that the next step depends on, by name."""
         return {
-            f"{name}.{i}.{key}": torch.as_tensor(value).clone()
+            f"{name}.{i}.{key}": value.clone()
             for name, part in self.parts.items()
-            for i, moments in part.state_dict()["state"].items()
-            for key, value in moments.items()
+            for i, memory in enumerate(part.memory)
+            for key, value in memory.items()
         }
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -87,12 +85,14 @@ class NetworkOptimiser:
                 f"resume: expected a checkpoint of {asked}, got one of {' and '.join(sorted(found))}; "
                 "give the same --optimiser"
             )
-        moments: dict[str, dict[int, dict[str, Tensor]]] = {name: {} for name in self.parts}
+        for part in self.parts.values():
+            for memory in part.memory:
+                memory.clear()
         for key, tensor in tensors.items():
             name, i, entry = key.split(".")
-            moments[name].setdefault(int(i), {})[entry] = tensor.clone()
-        for name, part in self.parts.items():
-            part.load_state_dict({"state": moments[name], "param_groups": part.state_dict()["param_groups"]})
+            part = self.parts[name]
+            where = tensor.device if entry == "step" else part.weights[int(i)].device  # Adam counts on the CPU
+            part.memory[int(i)][entry] = tensor.to(where, copy=True)
 
 
 def muon_share(network: Network, matrix: Tensor) -> float:

@@ -15,11 +15,13 @@ from torch import nn
 
 from nerif.fields.base import Field
 from nerif.fields.mlp import UNBOUNDED, NeuralField
+from nerif.reconstruction.adam import Adam
 from nerif.reconstruction.losses import Evaluator
 
 __all__ = ["adopt", "fit_network"]
 
 WARM_UP = 20  # steps
+BETAS = (0.9, 0.999)  # Adam's decay rates
 
 
 def adopt(field: NeuralField, start: Field) -> bool:
@@ -68,7 +70,8 @@ def fit_network(
     generator : draws the points
     on_step : called with the step and the loss; True ends the fit
     """
-    adam = torch.optim.Adam(field.network.parameters(), lr=learning_rate)
+    weights = list(field.network.parameters())
+    adam = Adam(weights, [1.0] * len(weights), BETAS)
     device = next(field.network.parameters()).device
     start = start.to(device)
     lower, edges = torch.tensor(field.box.lower), torch.tensor(field.box.edges)
@@ -83,11 +86,9 @@ def fit_network(
         guess, slope, _ = network.value_and_gradient(field.normalise(points), False)
         loss = (guess.float() - value).square().mean() * value_scale
         loss = loss + (slope.float() - gradient).square().sum(-1).mean() * gradient_scale
-        for group in adam.param_groups:
-            cosine = 0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * step / steps))
-            group["lr"] = learning_rate * cosine * min(1.0, (step + 1) / WARM_UP)
+        cosine = 0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * step / steps))
         adam.zero_grad()
         loss.backward()
-        adam.step()
+        adam.step(learning_rate * cosine * min(1.0, (step + 1) / WARM_UP))
         if on_step is not None and on_step(step + 1, float(loss.detach())):
             break
