@@ -95,3 +95,14 @@ def test_small_pictures_are_not_binned(measurement):
             measurement, cameras=cameras, displacement=torch.zeros(2, pixels, pixels + 30, 2), sigma=None
         )
         assert coarsest_edge(shown) == edge
+
+
+def test_usable_pixels_at_the_rim_of_the_box_alone_are_kept(measurement):
+    """No whole bin holds any of them."""
+    view = measurement.select(measurement.names[:1])
+    usable = view.usable & view.sees_box
+    first = usable[0].nonzero()[:, 0].min()
+    valid = torch.zeros_like(usable)
+    valid[0, first] = usable[0, first]
+    rays, displacement, _ = binned(replace(view, valid=valid))
+    assert len(rays) == len(displacement) == int(valid.sum())

@@ -6,16 +6,21 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
-from nerif.fields.phantoms import make_phantom
-from nerif.geometry import Grid, paper_rig
-from nerif.measurement import Measurement
+from nerif.fields.phantoms import GaussianBalls, make_phantom
+from nerif.geometry import Box, Grid, Ring, paper_rig
+from nerif.measurement import Measurement, measurement_of
+from nerif.reconstruction import descent
 from nerif.reconstruction.bins import binned_rays
+from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.levels import Level, levels, pixels_in_a_voxel
 from nerif.reconstruction.problem import Iterate
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.weight import choose_weight
 from nerif.simulation import simulate
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.interferometry import Interferometry
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +49,12 @@ def test_bins_are_a_voxel_wide_before_the_end_and_small_at_the_end(flame):
     assert levels(flame, 4, 3, coarse_to_fine=True)[-1].edge > 1  # single pixels would change nothing
 
 
+def test_a_camera_in_the_middle_of_the_box_has_bins_of_some_size(flame):
+    middle = replace(flame.cameras[0], translation=torch.zeros(3, dtype=torch.float64))
+    inside = replace(flame, cameras=(middle, *flame.cameras[1:]))
+    assert 0 < pixels_in_a_voxel(inside, Grid.of_resolution(flame.box, 24)) <= 96
+
+
 def test_a_view_without_a_whole_bin_keeps_its_pixels(flame):
     (observation,) = flame.observations
     found = binned_rays(flame, observation, 128)  # larger than the picture
@@ -58,6 +69,63 @@ def test_coarse_grids_and_bins_change_the_way_and_not_the_end(flame):
     grid = Grid.of_resolution(flame.box, 16)
     a, b = (r.field.sample(grid) for r in (way, straight))
     assert float((a - b).norm() / b.norm()) < 5e-3
+
+
+def test_bins_bring_no_noise_into_a_field_that_is_regularised_by_stopping_alone(flame):
+    truth = make_phantom("flame", flame.box, 0).sample(Grid.of_resolution(flame.box, 24))
+    noise = 0.4 * torch.randn(flame.displacement.shape, generator=torch.Generator().manual_seed(1))
+    noisy = replace(flame, displacement=flame.displacement + noise, sigma=torch.full_like(flame.displacement, 0.4))
+    method = Landweber(voxels=24, device="cpu")
+
+    def error(settings: Landweber) -> float:
+        found = settings(noisy).field.sample(Grid.of_resolution(flame.box, 24))
+        return float((found - truth).norm() / truth.norm())
+
+    assert error(method) < 1.05 * error(replace(method, coarse_to_fine=False))
+
+
+def test_pixels_judge_also_where_the_last_bins_are_larger():
+    """Noise alike in neighbours: bins of it have more than their share, pixels have just that."""
+    ring = Ring(views=3, arc=(0.0, 120.0), image_size=(128, 128), pixel_pitch=0.0375)
+    box = Box.cube(50.0)
+    ball = GaussianBalls(torch.zeros(1, 3), torch.tensor([9.0]), torch.tensor([1e-4]))
+    clean = simulate(ball, ring.cameras(), box, 1.00027, 0.0, 0, steps=20)
+    d = torch.randn(clean.displacement.shape, generator=torch.Generator().manual_seed(0))
+    smooth = torch.from_numpy(gaussian_filter(d.numpy(), (0, 1.5, 1.5, 0)))
+    sigma = 0.02
+    noise = sigma * smooth / smooth.std()
+    seen = replace(clean, displacement=clean.displacement + noise, sigma=torch.full_like(d, sigma))
+    found = Tikhonov(voxels=8, device="cpu")(seen)
+    assert found.history[-1]["bin_edge"] > 1
+    assert "residual is the noise (discrepancy principle)" in found.outcome.message
+
+
+@pytest.mark.parametrize("at", [3, 30])
+def test_a_run_stopped_on_a_grid_with_bins_goes_on_from_there(flame, at):
+    method = Tikhonov(voxels=24, device="cpu", iterations=12)
+    whole = method(flame)
+    first = method(flame, on_step=lambda step: step.step == at)
+    assert first.outcome.reason == "interrupted"
+    assert first.history[-1]["bin_edge"] > 1
+    again = method(flame, resume=first.state)
+    grid = Grid.of_resolution(flame.box, 24)
+    a, b = (r.field.sample(grid) for r in (whole, again))
+    assert float((a - b).norm() / a.norm()) < 1e-2
+
+
+def test_every_technique_has_pixels_that_judge(flame, monkeypatch):
+    """However few it has, and however many the others."""
+    monkeypatch.setattr(descent, "JUDGES", 1)
+    few = torch.full((*flame.displacement.shape[:3], 1), torch.nan)
+    few[0, 40:42, 40:50] = 1.0
+    both = measurement_of(
+        {Deflection: flame.displacement, Interferometry: few}, flame.cameras, flame.box, flame.n_ambient, 532.0,
+        flame.ambient_faces,
+    )  # fmt: skip
+    thin = descent._thinned(both)
+    counts = [int(thin.usable_for(o).sum()) for o in thin.observations]
+    assert counts[1] == 20
+    assert 200 < counts[0] < 400
 
 
 def solver(floor: float):

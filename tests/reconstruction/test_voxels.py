@@ -12,7 +12,7 @@ from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
-from nerif.reconstruction import descent, kernels_torch
+from nerif.reconstruction import descent, kernels_numba, kernels_torch
 from nerif.reconstruction import voxels as voxels_module
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.files import read_field, read_state, write_field, write_state
@@ -250,7 +250,7 @@ def test_settings_are_recorded(fixed):
         (Tikhonov, {"iterations": 0}, "iterations: expected at least 1, got 0"),
         (Tikhonov, {"basis": "quadratic"}, "basis: expected one of linear, cubic, got 'quadratic'"),
         (Tikhonov, {"model": "bent"}, "model: expected one of auto, lever_arm, paraxial, curved"),
-        (Tikhonov, {"step": 0.0}, "step: expected above 0 voxels, got 0.0"),
+        (Tikhonov, {"step": 0.0}, "step: expected above 0 and at most 1 voxels .basis cubic., got 0.0"),
         (Tikhonov, {"tolerance": -1.0}, "tolerance: expected 0 or more, got -1.0"),
         (Tikhonov, {"lower": 1e-5}, "lower, upper: expected bounds of the field around 0"),
         (Landweber, {"relaxation": 2.0}, "relaxation: expected above 0 and below 2"),
@@ -278,14 +278,22 @@ def test_data_that_cannot_be_reconstructed(fixed, measurement, monkeypatch):
         FIXED(measurement)
 
 
-@pytest.mark.parametrize("upper", [None, 0.0])
-def test_memory_is_not_underestimated(measurement, upper):
-    """Arrays of the size of the grid that are alive at once, counted by torch, fit in the estimate."""
+@pytest.mark.parametrize(("upper", "step"), [(None, None), (0.0, None), (None, 0.1)])
+def test_memory_is_not_underestimated(measurement, monkeypatch, upper, step):
+    """Arrays of the size of the grid that are alive at once, counted by torch and NumPy, fit in the estimate."""
     from torch.profiler import ProfilerActivity, profile
 
     method = TotalVariation(
-        voxels=32, device="cpu", regularisation=1e-2, iterations=3, coarse_to_fine=False, upper=upper
+        voxels=32, device="cpu", regularisation=1e-2, iterations=3, coarse_to_fine=False, upper=upper, step=step
     )
+    of_numpy, spread = [], kernels_numba.spread
+
+    def noted(*given):
+        planes = spread(*given)
+        of_numpy.append(sum(plane.nbytes for plane in planes))
+        return planes
+
+    monkeypatch.setattr(kernels_numba, "spread", noted)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as record:
         method(measurement)
     alive = highest = 0
@@ -294,6 +302,7 @@ def test_memory_is_not_underestimated(measurement, upper):
             alive += event.nbytes()
             highest = max(highest, alive)
     grid = Grid.of_resolution(measurement.box, 32)
+    highest += max(of_numpy)
     assert 0 < highest < method.memory_bytes(measurement, grid) - voxels_module.COMPILER_BYTES < 8 * highest
 
 

@@ -124,6 +124,15 @@ def test_functions_give_back_the_axes_they_take(volume, whole):
     assert draw_isosurface(space, volume, default_level(volume)) is space
 
 
+def test_the_curves_of_a_run_on_voxels_are_residual_penalty_and_objective():
+    record = {"step": 1.0, "seconds": 1.0, "voxels": 24.0, "bin_edge": 4.0, "weight": 1e-3, "residual": 0.5}
+    record |= {"penalty": 0.2, "objective": 0.7, "residual_over_sigma": 1.5}
+    axes = figures.draw_history(Figure().subplots(), [record, {**record, "seconds": 2.0, "bin_edge": 1.0}], "tikhonov")
+    drawn = {str(line.get_label()) for line in axes.lines}
+    assert drawn >= {"residual", "penalty", "objective"}
+    assert not drawn & {"bin edge", "voxels", "weight"}
+
+
 def test_a_slice_is_the_middle_one_the_right_way_up(volume):
     axes = Figure().subplots()
     drawing.draw_slice(axes, volume, "z")

@@ -163,6 +163,10 @@ def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
     c, y = (torch.randn(shape, generator=g, dtype=torch.float64) for shape in (a.domain_shape, a.range_shape))
     there, back = float((a(c) * y).sum()), float((c * a.T(y)).sum())
     assert abs(there - back) <= 1e-12 * float(a(c).norm() * y.norm())
+    # whichever kernels sum
+    compiled, adjoint, a.compiled = a(c), a.T(y), False
+    assert torch.allclose(a(c), compiled, rtol=1e-12, atol=1e-12 * float(compiled.abs().max()))
+    assert torch.allclose(a.T(y), adjoint, rtol=1e-12, atol=1e-12 * float(adjoint.abs().max()))
     # and it is the path integral through the spline
     fine = VoxelOperator(rays, grid, model, basis, Boundary(), step=0.05, dtype=torch.float64)
     exact = PathIntegral(model, 600)(fine.field(c), rays)

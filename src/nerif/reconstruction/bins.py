@@ -48,7 +48,7 @@ def binned_rays(
         if not bool(mask.any()):
             continue
         camera = observation.technique.seen_by(camera)
-        keep = _inside(camera, measurement.box, edge, open_faces)
+        keep = _inside(camera, measurement.box, edge, open_faces) & (_sums(mask[..., None].double(), edge)[..., 0] > 0)
         own = edge if bool(keep.any()) else 1
         known = None if observation.sigma is None else observation.sigma[i, :height, :width]
         weight = mask[..., None].expand(height, width, channels).double()

@@ -2,6 +2,9 @@
 
 What is left of the measurement is always judged by single pixels, for the noise of neighbours may be alike: a bin of
 them then has more than its share of it.
+
+A method without a penalty is kept from the noise by stopping alone, so on coarse grids, whose residual never comes down
+to the noise, it goes on as soon as it gains little.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import asdict, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -34,8 +38,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Descent"]
 
-JUDGES = 1 << 16  # pixels, at most, by whom the rest is judged: their mean square is known to half a per cent
+JUDGES = 1 << 16  # pixels, about, by whom the rest is judged: their mean square is known to half a per cent
+FEWEST = 1 << 8  # of them for each technique
 ROUGHLY = 10  # times the tolerance, for trials and for what is there to start from
+EARLY = 100  # times the tolerance, for what is there to start from, where nothing but an early end keeps the noise out
 TRIALS = 8  # weights that are tried on a grid, about
 KEPT = ("level", "done", "total", "weight", "guess", "chosen")  # of a run, in a checkpoint
 
@@ -74,8 +80,7 @@ class Descent:
         bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.bounds = bounds if math.isfinite(bounds[0]) or math.isfinite(bounds[1]) else None
         self.last = self._target(self.levels[-1].edge)
-        self.scale, self.noise = self.last.scale, self.last.noise
-        self.judges = self.last[_some(len(self.last))]
+        self.scale = self.last.scale
         self.history: list[dict[str, float]] = []
         # a field to start from makes the coarse grids needless
         first = [level.grid for level in self.levels].index(finest)
@@ -103,7 +108,8 @@ class Descent:
                     x = self._choose(problem, judge, x)
                 weight = self.guess if self.weight is None else self.weight
                 at_last = self.level == len(self.levels) - 1
-                tolerance = self.settings.tolerance * (1 if at_last else ROUGHLY)
+                before = EARLY if self.settings.weight == 0.0 else ROUGHLY
+                tolerance = self.settings.tolerance * (1 if at_last else before)
                 _, converged = self._solve(problem, judge, x, FIRST if weight is None else weight, tolerance)
                 if at_last:
                     return self._result(self._outcome(converged))
@@ -124,9 +130,10 @@ class Descent:
             found = self._solve(problem, judge, x, weight, ROUGHLY * self.settings.tolerance)[0]
             return replace(found, residual=_left(judge, found))
 
-        choice = choose_weight(solve, x, self.noise, self.guess)
+        noise = _noise(problem, judge)
+        choice = choose_weight(solve, x, noise, self.guess)
         self.guess, self.chosen, self.done = choice.weight, choice.reason, 0
-        if self.noise is None or self.level == len(self.levels) - 1:
+        if noise is None or self.level == len(self.levels) - 1:
             self.weight = choice.weight
         return choice.x
 
@@ -150,17 +157,21 @@ class Descent:
         boundary = Boundary(self.faces)
         return VoxelField.of(self.x * self.scale, level.grid, DEGREES[self.settings.basis], boundary)
 
-    def _target(self, edge: int) -> Target:
-        """What bins of so many pixels along an edge measured."""
-        settings = self.settings
-        return Target.of(self.measurement, settings.open_faces, edge, settings.model, linear=True).to(self.device)
+    def _target(self, edge: int, measurement: Measurement | None = None) -> Target:
+        """What bins of so many pixels along an edge measured; of a measurement, or of all."""
+        settings, measurement = self.settings, measurement or self.measurement
+        return Target.of(measurement, settings.open_faces, edge, settings.model, linear=True).to(self.device)
+
+    @cached_property
+    def judges(self) -> Target:
+        """The pixels that judge what bins leave."""
+        return replace(self._target(1, _thinned(self.measurement)), scale=self.scale)
 
     def _problems(self, level: Level) -> tuple[Problem, Problem | None]:
         """The problem of a level and, where it has bins, that of the pixels that judge what they leave."""
-        if level.edge == self.levels[-1].edge:
-            return self._problem(level, self.last), None
-        target = replace(self._target(level.edge), scale=self.scale)
-        return self._problem(level, target), self._problem(level, self.judges)
+        same = level.edge == self.levels[-1].edge
+        target = self.last if same else replace(self._target(level.edge), scale=self.scale)
+        return self._problem(level, target), None if level.edge == 1 else self._problem(level, self.judges)
 
     def _problem(self, level: Level, target: Target) -> Problem:
         settings, boundary, grid = self.settings, Boundary(self.faces), level.grid
@@ -177,7 +188,7 @@ class Descent:
         self, problem: Problem, judge: Problem | None, x: Tensor, weight: float, tolerance: float
     ) -> tuple[Iterate, bool]:
         """Iterate until it converges or the iterations are used up; which, is told."""
-        settings, past = self.settings, [math.inf] * self.settings.patience
+        settings, past, noise = self.settings, [math.inf] * self.settings.patience, _noise(problem, judge)
         if settings.weight is not None:
             self.chosen = ""
         self.x = x
@@ -190,7 +201,7 @@ class Descent:
             before, past = past[0], [*past[1:], objective]
             self._tell(problem, judge, iterate, weight)
             converged = 0 <= before - objective < tolerance * settings.patience * objective
-            if settings.weight == 0.0 and self.noise is not None and _left(judge, iterate) <= self.noise:
+            if settings.weight == 0.0 and noise is not None and _left(judge, iterate) <= noise:
                 self.chosen, converged = "residual is the noise (discrepancy principle)", True
             if converged or self.done >= settings.iterations:
                 return iterate, converged
@@ -209,8 +220,8 @@ class Descent:
             "penalty": iterate.penalty,
             "objective": iterate.objective(weight),
         }
-        if self.noise is not None and judge is None:
-            record["residual_over_sigma"] = math.sqrt(iterate.residual / self.noise)
+        if judge is None and problem.target.noise is not None:
+            record["residual_over_sigma"] = math.sqrt(iterate.residual / problem.target.noise)
         self.history.append(record)
         losses = {k: v for k, v in record.items() if k in ("voxels", "weight", "residual", "residual_over_sigma")}
         speed = len(problem.target) * self.total / max(self.seconds, 1e-9)
@@ -301,8 +312,16 @@ def _left(judge: Problem | None, iterate: Iterate) -> float:
     return iterate.residual if judge is None else float((judge.data - judge.forward(iterate.x)).square().sum())
 
 
-def _some(rays: int) -> Tensor:
-    """Numbers of those who judge, the same every time."""
-    if rays <= JUDGES:
-        return torch.arange(rays)
-    return torch.randperm(rays, generator=torch.Generator().manual_seed(0))[:JUDGES].sort().values
+def _noise(problem: Problem, judge: Problem | None) -> float | None:
+    """What the noise alone leaves of that; None where sigma is not known."""
+    return (judge or problem).target.noise
+
+
+def _thinned(measurement: Measurement) -> Measurement:
+    """Some of the pixels, of each technique a few at least, the same every time."""
+    usable = [measurement.usable_for(observation) for observation in measurement.observations]
+    draw = torch.rand(usable[0].shape, generator=torch.Generator().manual_seed(0))
+    total, keep = sum(int(mask.sum()) for mask in usable), torch.zeros_like(usable[0])
+    for mask in usable:
+        keep |= mask & (draw < max(JUDGES / total, FEWEST / max(int(mask.sum()), 1)))
+    return replace(measurement, valid=keep)

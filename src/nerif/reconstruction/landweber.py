@@ -46,7 +46,8 @@ class Landweber(VoxelReconstructor):
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         x = problem.clip(x)
         # the estimate comes from below, and a step too long diverges
-        step = self.relaxation / (1.02 * operator_norm(problem.forward, problem.adjoint, problem.random())) ** 2
+        norm = operator_norm(problem.forward, problem.adjoint, problem.random(), tolerance=1e-2)
+        step = self.relaxation / (1.05 * norm) ** 2
         ahead, k, last = x, 0, float("inf")
         r = problem.data - problem.forward(ahead)
         while True:

@@ -72,7 +72,8 @@ def pixels_in_a_voxel(measurement: Measurement, grid: Grid) -> float:
     seen = []
     for camera in measurement.cameras:
         pixels = camera.project(torch.cat([middle[None], ends]).to(camera.intrinsics.dtype))
-        seen.append(float((pixels[1:] - pixels[0]).norm(dim=-1).max()))  # of the edge that is seen most from the side
+        spans = (pixels[1:] - pixels[0]).norm(dim=-1).nan_to_num(1.0).clamp(max=min(camera.image_size))
+        seen.append(float(spans.max()))  # of the edge that is seen most from the side
     return min(seen)
 
 

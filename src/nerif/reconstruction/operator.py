@@ -16,10 +16,10 @@ from nerif.geometry import Grid, Rays
 from nerif.reconstruction.planes import Bundle
 from nerif.techniques.base import ForwardModel
 
-__all__ = ["STEPS", "VoxelOperator", "operator_norm"]
+__all__ = ["STEPS", "VoxelOperator", "check_step", "operator_norm"]
 
 STEPS = {"linear": 0.5, "cubic": 1.0}
-"""Voxels between samples: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
+"""Voxels between planes, at most: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
 
 
 class VoxelOperator:
@@ -38,7 +38,7 @@ class VoxelOperator:
     model : linear ForwardModel
     basis : "linear" (coefficients are the values at voxel centres) or "cubic"
     boundary : how the coefficients go on beyond the box
-    step : longest distance between planes, in edges of a voxel; None for that of STEPS
+    step : longest distance between planes, in edges of a voxel, at most that of STEPS; None for that
     device, dtype : where and in which precision c and y are
 
     Raises
@@ -67,8 +67,7 @@ class VoxelOperator:
         if basis not in DEGREES:
             raise InputError(f"basis: expected {' or '.join(DEGREES)}, got '{basis}'")
         step = STEPS[basis] if step is None else step
-        if not step > 0:
-            raise InputError(f"step: expected a length above 0 voxels, got {step}")
+        check_step(step, basis)
         if not bool(rays.crosses.any()):
             raise InputError("rays: expected rays that cross the box, got none; check box, cameras and masks")
         self.grid, self.basis, self.boundary = grid, basis, boundary or Boundary()
@@ -84,8 +83,7 @@ class VoxelOperator:
                 f"voxels: expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}"
             )
         self.step = step
-        each = max(math.ceil(1 / step), 1 if self.degree == 3 else 2)  # a linear slope jumps at the centres
-        bundles = Bundle.all_of(rays, grid, self.degree, each, model)
+        bundles = Bundle.all_of(rays, grid, self.degree, math.ceil(1 / step), model)
         self.bundles = [bundle.to(self.device, self.inner, dtype) for bundle in bundles]
 
     @property
@@ -155,17 +153,25 @@ class VoxelOperator:
 
     @staticmethod
     def memory_bytes(
-        rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32, channels: int = 2
-    ) -> int:
+        rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32, channels: int = 2,
+        step: float | None = None,
+    ) -> int:  # fmt: skip
         """Return what an operator holds while it is applied: rays, B in so many channels, the padded grid and planes.
 
-        Paths and planes count in double precision, as on a CPU; planes are those of value and slope, cut and mended.
+        Paths and planes count in double precision, as on a CPU; planes are those of value and slope, cut and mended,
+        and what they are made of.
         """
         inner = 8
-        layers, each = (2, 1) if DEGREES[basis] == 3 else (1, 2)
+        layers, each = (DEGREES[basis] + 1) // 2, math.ceil(1 / (step or STEPS[basis]))
         padded = math.prod(n + 2 * layers for n in grid.shape)
         held = 8 * inner + 3 * channels * dtype.itemsize + 16  # numbers of a path, B, whole numbers
-        return rays * held + padded * (2 * dtype.itemsize + 4 * each * inner)
+        return rays * held + padded * (2 * dtype.itemsize + each * (4 * inner + 6 * dtype.itemsize))
+
+
+def check_step(step: float, basis: str) -> None:
+    """Refuse a distance of planes that no operator has."""
+    if not 0 < step <= STEPS[basis]:
+        raise InputError(f"step: expected above 0 and at most {STEPS[basis]:g} voxels (basis {basis}), got {step}")
 
 
 def _made(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:

@@ -24,7 +24,7 @@ __all__ = ["Bundle", "Planes"]
 EVEN = 1e-9  # of the largest weight: how far one may be from the line between those at the ends of a ray
 PROBES = (0.0, 0.0931, 0.2718, 0.3819, 0.5, 0.6543, 0.8191, 0.9397, 1.0)  # shares of a ray; no profile repeats there
 CHUNK = 1 << 15  # rays whose weights are looked at a time, sample by sample
-OUTSIDE = 1e-2  # voxels: how far a ray clipped in single precision may reach beyond the box
+OUTSIDE = 0.25  # voxels: how far a ray clipped in single precision, far from its camera, may reach beyond the box
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Sta
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.descent import Descent
 from nerif.reconstruction.levels import bins_at_last
-from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.operator import VoxelOperator, check_step
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.techniques.registry import AUTO, check_model
 
@@ -46,7 +46,8 @@ class VoxelReconstructor(Reconstructor):
     model: str = AUTO
     """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
     step: float | None = None
-    """Longest distance between samples along a ray, in voxels; by default 1 (cubic) or 0.5 (linear)."""
+    """Longest distance between the planes on which rays are sampled, in voxels: at most, and by default, 1 (cubic) or
+    0.5 (linear)."""
     coarse_to_fine: bool = True
     """Start on a coarse grid and halve the voxels from solution to solution."""
     tolerance: float = 1e-4
@@ -77,8 +78,8 @@ class VoxelReconstructor(Reconstructor):
         for name in ("voxels", "iterations"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if self.step is not None and not self.step > 0:
-            raise InputError(f"step: expected above 0 voxels, got {self.step}")
+        if self.step is not None:
+            check_step(self.step, self.basis)
         for name in ("tolerance", "time_limit"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
@@ -114,7 +115,7 @@ class VoxelReconstructor(Reconstructor):
         """Return what the operators of all techniques hold."""
         dtype = getattr(torch, self.precision)
         return sum(
-            VoxelOperator.memory_bytes(rays, grid, self.basis, dtype, channels)
+            VoxelOperator.memory_bytes(rays, grid, self.basis, dtype, channels, self.step)
             for rays, channels in _seen(measurement, grid)
         )
 

@@ -119,7 +119,8 @@ class ForwardModel(ABC):
     straight: ClassVar[bool] = True
     """Whether samples stand on the straight ray."""
     additive: ClassVar[bool] = False
-    """Whether a pixel sees a sum, with weights above 0, of a field that is never negative."""
+    """Whether a pixel sees a sum, with weights above 0, of a field that is never negative (on a grid, of faces that are
+    ambient, weights may be a hundredth of the largest below 0: the spline is mirrored there)."""
     fill: ClassVar[float] = 1.0
     """Share of the path through the box that counts towards what is measured, at about: for the size of the field."""
     gains: ClassVar[bool] = False
