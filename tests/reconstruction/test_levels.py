@@ -10,8 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from nerif.fields.phantoms import GaussianBalls, make_phantom
 from nerif.geometry import Box, Grid, Ring, paper_rig
-from nerif.measurement import Measurement, measurement_of
-from nerif.reconstruction import descent
+from nerif.measurement import Measurement
 from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.levels import Level, levels, pixels_in_a_voxel
@@ -19,8 +18,6 @@ from nerif.reconstruction.problem import Iterate
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.weight import choose_weight
 from nerif.simulation import simulate
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.interferometry import Interferometry
 
 
 @pytest.fixture(scope="module")
@@ -111,21 +108,6 @@ def test_a_run_stopped_on_a_grid_with_bins_goes_on_from_there(flame, at):
     grid = Grid.of_resolution(flame.box, 24)
     a, b = (r.field.sample(grid) for r in (whole, again))
     assert float((a - b).norm() / a.norm()) < 1e-2
-
-
-def test_every_technique_has_pixels_that_judge(flame, monkeypatch):
-    """However few it has, and however many the others."""
-    monkeypatch.setattr(descent, "JUDGES", 1)
-    few = torch.full((*flame.displacement.shape[:3], 1), torch.nan)
-    few[0, 40:42, 40:50] = 1.0
-    both = measurement_of(
-        {Deflection: flame.displacement, Interferometry: few}, flame.cameras, flame.box, flame.n_ambient, 532.0,
-        flame.ambient_faces,
-    )  # fmt: skip
-    thin = descent._thinned(both)
-    counts = [int(thin.usable_for(o).sum()) for o in thin.observations]
-    assert counts[1] == 20
-    assert 200 < counts[0] < 400
 
 
 def solver(floor: float):

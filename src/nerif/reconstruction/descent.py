@@ -30,6 +30,7 @@ from nerif.reconstruction.gauge import ambient_faces, check_gauge, visual_hull
 from nerif.reconstruction.levels import Level, coarser, levels
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
+from nerif.reconstruction.some_pixels import some_pixels
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.weight import FIRST, choose_weight
 
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 __all__ = ["Descent"]
 
 JUDGES = 1 << 16  # pixels, about, by whom the rest is judged: their mean square is known to half a per cent
-FEWEST = 1 << 8  # of them for each technique
 ROUGHLY = 10  # times the tolerance, for trials and for what is there to start from
 EARLY = 100  # times the tolerance, for what is there to start from, where nothing but an early end keeps the noise out
 TRIALS = 8  # weights that are tried on a grid, about
@@ -165,7 +165,7 @@ class Descent:
     @cached_property
     def judges(self) -> Target:
         """The pixels that judge what bins leave."""
-        return replace(self._target(1, _thinned(self.measurement)), scale=self.scale)
+        return replace(self._target(1, some_pixels(self.measurement, JUDGES)), scale=self.scale)
 
     def _problems(self, level: Level) -> tuple[Problem, Problem | None]:
         """The problem of a level and, where it has bins, that of the pixels that judge what they leave."""
@@ -315,13 +315,3 @@ def _left(judge: Problem | None, iterate: Iterate) -> float:
 def _noise(problem: Problem, judge: Problem | None) -> float | None:
     """What the noise alone leaves of that; None where sigma is not known."""
     return (judge or problem).target.noise
-
-
-def _thinned(measurement: Measurement) -> Measurement:
-    """Some of the pixels, of each technique a few at least, the same every time."""
-    usable = [measurement.usable_for(observation) for observation in measurement.observations]
-    draw = torch.rand(usable[0].shape, generator=torch.Generator().manual_seed(0))
-    total, keep = sum(int(mask.sum()) for mask in usable), torch.zeros_like(usable[0])
-    for mask in usable:
-        keep |= mask & (draw < max(JUDGES / total, FEWEST / max(int(mask.sum()), 1)))
-    return replace(measurement, valid=keep)

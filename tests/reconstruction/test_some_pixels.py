@@ -1,0 +1,59 @@
+"""Pixels drawn at random: as many as asked, of every technique and view some, the same every time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.geometry import paper_rig
+from nerif.measurement import Measurement, measurement_of
+from nerif.reconstruction.some_pixels import held_back, some_pixels
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.interferometry import Interferometry
+
+
+@pytest.fixture(scope="module")
+def both() -> Measurement:
+    """Two views of displacements, and of fringes one with few pixels and one with none."""
+    cameras, box = paper_rig(60)
+    fringes = torch.full((2, 60, 60, 1), torch.nan)
+    fringes[0, 20:22, 30:40] = 1.0
+    seen = {Deflection: torch.ones(2, 60, 60, 2), Interferometry: fringes}
+    return measurement_of(seen, cameras[:2], box, 1.00027, 532.0)
+
+
+def counts(measurement: Measurement) -> list[list[int]]:
+    return [measurement.usable_for(o).flatten(1).sum(dim=1).tolist() for o in measurement.observations]
+
+
+def test_about_so_many_and_of_every_technique_and_view_some(both):
+    (first, second), fringes = counts(some_pixels(both, 1000))
+    assert 800 < first + second < 1200
+    assert fringes == [20, 0]  # too few to choose from
+    assert torch.equal(some_pixels(both, 1000).usable, some_pixels(both, 1000).usable)
+
+
+def test_blocks_are_taken_whole(both):
+    alone = replace(both, maps={})
+    mask = some_pixels(alone, 2000, edge=4).usable
+    blocks = mask.reshape(2, 15, 4, 15, 4).float().mean(dim=(2, 4))
+    assert set(blocks.unique().tolist()) == {0.0, 1.0}
+
+
+def test_what_is_held_back_is_apart_from_the_rest(both):
+    rest, held = (m.usable_for(both.observations[0]) for m in held_back(both, 500, edge=2))
+    few = both.usable_for(both.observations[1])  # of fringes too few to hold any back
+    assert not bool((rest & held & ~few).any())
+    assert torch.equal(rest | held, both.usable_for(both.observations[0]))
+    assert counts(held_back(both, 500)[0])[1] == [20, 0]
+
+
+def test_a_view_of_a_single_pixel_is_in_both(both):
+    valid = torch.ones(2, 60, 60, dtype=torch.bool)
+    valid[1] = False
+    valid[1, 3, 4] = True
+    lonely = replace(both, valid=valid)
+    assert [counts(m)[0][1] for m in held_back(lonely, 100)] == [1, 1]
+    assert counts(some_pixels(lonely, 100))[0][1] == 1
