@@ -9,7 +9,7 @@ import torch
 
 from nerif.geometry import paper_rig
 from nerif.measurement import Measurement, measurement_of
-from nerif.reconstruction.some_pixels import held_back, some_pixels
+from nerif.reconstruction.some_pixels import some_pixels
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.interferometry import Interferometry
 
@@ -35,25 +35,9 @@ def test_about_so_many_and_of_every_technique_and_view_some(both):
     assert torch.equal(some_pixels(both, 1000).usable, some_pixels(both, 1000).usable)
 
 
-def test_blocks_are_taken_whole(both):
-    alone = replace(both, maps={})
-    mask = some_pixels(alone, 2000, edge=4).usable
-    blocks = mask.reshape(2, 15, 4, 15, 4).float().mean(dim=(2, 4))
-    assert set(blocks.unique().tolist()) == {0.0, 1.0}
-
-
-def test_what_is_held_back_is_apart_from_the_rest(both):
-    rest, held = (m.usable_for(both.observations[0]) for m in held_back(both, 500, edge=2))
-    few = both.usable_for(both.observations[1])  # of fringes too few to hold any back
-    assert not bool((rest & held & ~few).any())
-    assert torch.equal(rest | held, both.usable_for(both.observations[0]))
-    assert counts(held_back(both, 500)[0])[1] == [20, 0]
-
-
-def test_a_view_of_a_single_pixel_is_in_both(both):
+def test_a_view_of_a_single_pixel_keeps_it(both):
     valid = torch.ones(2, 60, 60, dtype=torch.bool)
     valid[1] = False
     valid[1, 3, 4] = True
     lonely = replace(both, valid=valid)
-    assert [counts(m)[0][1] for m in held_back(lonely, 100)] == [1, 1]
     assert counts(some_pixels(lonely, 100))[0][1] == 1

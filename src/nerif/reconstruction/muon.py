@@ -38,7 +38,9 @@ class Muon(Update):
         self.momentum = momentum
 
     def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        kept = memory.setdefault("momentum_buffer", torch.zeros_like(weight))
+        if not memory:
+            memory["momentum_buffer"] = torch.zeros_like(weight)
+        kept = memory["momentum_buffer"]
         kept.lerp_(gradient, 1 - self.momentum)
         weight.add_(orthogonal(gradient.lerp(kept, self.momentum)).to(weight), alpha=-rate)
 
