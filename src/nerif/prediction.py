@@ -27,7 +27,6 @@ VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame
 EXACT_WORK = {"cpu": 2.5e11, "cuda": 2.5e13}  # multiplications: ten seconds on two cores
 VOXELS, BEYOND = 100, 3  # along the longest edge of the box, and beyond each face
-SPARSE_STEP = 2.0  # voxels between samples of SampledViews: as near to the network as half a voxel
 COMPARED = 1024  # pixels
 
 __all__ = ["TRACED", "SampledViews", "check_sees", "predict", "predict_view", "reproject"]
@@ -228,7 +227,7 @@ class SampledViews:
         return self.projector.model.linear_twin
 
     def _straight(self, rays: Rays) -> Float[Tensor, "n c"]:
-        operator = VoxelOperator(rays, self.voxels.grid, self._straight_model, "cubic", step=SPARSE_STEP)
+        operator = VoxelOperator(rays, self.voxels.grid, self._straight_model, "cubic")
         return operator.through(self.voxels.coefficients)
 
     def _bending(self, rays: Rays) -> Float[Tensor, "n c"]:
