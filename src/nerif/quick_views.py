@@ -85,7 +85,7 @@ def fit(measurement: Measurement, voxels: int, weight: float = 0.0) -> tuple[Fie
     """Return a quick reconstruction, and its objective; of weight 0 smooth enough to predict other views well."""
     weight = weight or (OF_GRADIENTS if measurement.observations[0].technique.gauge else OF_INTEGRALS)
     settings = Tikhonov(
-        voxels=voxels, basis="linear", iterations=30, tolerance=1e-3, regularisation=weight, coarse_to_fine=False,
+        voxels=voxels, basis="linear", iterations=20, tolerance=1e-3, regularisation=weight, coarse_to_fine=False,
         hull=False, device="cpu",
     )  # fmt: skip
     result = settings(measurement)

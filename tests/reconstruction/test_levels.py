@@ -97,11 +97,10 @@ def test_pixels_judge_also_where_the_last_bins_are_larger():
     assert "residual is the noise (discrepancy principle)" in found.outcome.message
 
 
-@pytest.mark.parametrize("at", [3, 30])
-def test_a_run_stopped_on_a_grid_with_bins_goes_on_from_there(flame, at):
+def test_a_run_stopped_on_a_grid_with_bins_goes_on_from_there(flame):
     method = Tikhonov(voxels=24, device="cpu", iterations=12)
     whole = method(flame)
-    first = method(flame, on_step=lambda step: step.step == at)
+    first = method(flame, on_step=lambda step: step.step == 3)
     assert first.outcome.reason == "interrupted"
     assert first.history[-1]["bin_edge"] > 1
     again = method(flame, resume=first.state)
