@@ -106,7 +106,7 @@ def main() -> None:
     grid = Grid.of_resolution(box, 64)
     truth = Volume(flame.sample(grid), grid)
     measurement = add_noise(simulate(flame, cameras, box, N_AMBIENT), 0.05, seed=1)
-    base = NeRIF(time_limit=arguments.time_limit, epochs=1e6, device="cpu")
+    base = NeRIF(time_limit=arguments.time_limit, device="cpu")
     variants = {
         "fast preset": base,
         "Adam for all weights": replace(base, optimiser="adam"),

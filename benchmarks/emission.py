@@ -25,7 +25,7 @@ from nerif.simulation import Simulation
 
 def methods(asked: argparse.Namespace) -> dict[str, Callable[[int], Reconstructor]]:
     """The methods by name, each for a seed."""
-    network = NeRIF(time_limit=asked.time_limit, epochs=1e6, device="cpu")
+    network = NeRIF(time_limit=asked.time_limit, device="cpu")
     return {
         f"NeRIF, {asked.time_limit:g} s": lambda seed: replace(network, seed=seed),
         f"TV, {asked.voxels}³": lambda seed: TotalVariation(voxels=asked.voxels, device="cpu"),

@@ -36,7 +36,7 @@ COLUMNS = ("L2", "L2 of mean", "std / error", "mean, all", "mean, flow", "recons
 def methods(steps: int) -> dict[str, Reconstructor]:
     """What is measured: the default preset cut to a number of steps, and total variation."""
     return {
-        "NeRIF": replace(preset("fast"), max_steps=steps, epochs=1e9),
+        "NeRIF": replace(preset("fast"), max_steps=steps),
         "TV": TotalVariation(voxels=40),
     }
 

@@ -34,7 +34,7 @@ COLUMNS = (
 def method_of(name: str, voxels: int, time_limit: float) -> Reconstructor:
     """Return the settings of a method."""
     if name == "NeRIF":
-        return replace(preset("fast"), time_limit=time_limit, epochs=1e6, device="cpu")
+        return replace(preset("fast"), time_limit=time_limit, device="cpu")
     return (MART if name == "MART" else MLEM)(voxels=voxels, basis="linear", device="cpu")
 
 

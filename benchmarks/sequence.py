@@ -139,7 +139,7 @@ def main() -> None:
     arguments = parser.parse_args()
     keep_freed_memory()
     table = Table("A film of a flame", COLUMNS, arguments.write)
-    base = replace(preset(arguments.preset), device=arguments.device, epochs=1e6)
+    base = replace(preset(arguments.preset), device=arguments.device)
     best = max([*arguments.cold, 1])
     kinds: list[tuple[str, int, NeRIF, dict[str, float]]] = []
     kinds += [("from nothing", n, replace(base, max_steps=n), {}) for n in arguments.cold]

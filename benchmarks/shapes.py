@@ -56,7 +56,7 @@ def main() -> None:
     measurement = simulate(make_phantom("flame", box, 0), cameras, box, N_AMBIENT, arguments.noise, seed=1)
     target = Target.of(measurement)
     target = target[torch.arange(0, len(target), 20)]
-    base = replace(preset(arguments.preset), epochs=1e6, max_steps=arguments.steps, device=arguments.device)
+    base = replace(preset(arguments.preset), max_steps=arguments.steps, device=arguments.device)
     base = replace(base, points_per_batch=arguments.batch)
     size = f"{arguments.pixels} x {arguments.pixels} px"
     more = f"; flame, {size}, noise {arguments.noise:g}, {arguments.steps} steps of {arguments.batch} points"

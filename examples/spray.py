@@ -118,7 +118,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("spray"))
     asked = parser.parse_args()
     methods: dict[str, Reconstructor] = {
-        "nerif": NeRIF(max_steps=asked.steps, epochs=1e9, samples=(24, 40)),
+        "nerif": NeRIF(max_steps=asked.steps, samples=(24, 40)),
     }
     scan, held_out = read(asked.data, asked.slice), tuple(asked.hold_out)
     if asked.method == "tv":

@@ -11,14 +11,14 @@ from nerif.reconstruction.neural import NeRIF
 
 RIG = ["--image-size", "14", "16", "--pixel-pitch", "0.3", "--views", "3", "--steps", "20", "--truth-voxels", "12"]
 QUICK = [
-    "--network.depth", "2", "--network.width", "16", "--network.octaves", "2", "--max-steps", "40", "--epochs", "1000",
+    "--network.depth", "2", "--network.width", "16", "--network.octaves", "2", "--max-steps", "40",
     "--samples", "8", "12", "--sample-jitter", "2", "--points-per-batch", "400", "--device", "cpu",
     "--precision", "float32", "--warm-steps", "20", "--voxels", "12",
 ]  # fmt: skip
 
 COLD = NeRIF(
     network=NetworkShape(depth=2, width=16, octaves=2), samples=(8, 12), sample_jitter=2, points_per_batch=400,
-    max_steps=30, epochs=1000, device="cpu", precision="float32",
+    max_steps=30, device="cpu", precision="float32",
 )  # fmt: skip
 """Frames that start from nothing."""
 

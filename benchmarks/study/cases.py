@@ -163,7 +163,7 @@ def cases(scale: Scale, only: tuple[str, ...] = ()) -> list[Case]:
 def nerif(scale: Scale, **changes: Any) -> NeRIF:
     """NeRIF as the study runs it: a preset, so many seconds, and what a section changes."""
     base = preset(scale.preset)
-    limits = {"time_limit": scale.seconds, "max_steps": scale.steps, "epochs": 1e6}
+    limits = {"time_limit": scale.seconds, "max_steps": scale.steps, "epochs": 0}
     points = scale.points or base.points_per_batch
     return replace(base, **{**limits, "points_per_batch": points, "device": scale.device, **changes})
 

@@ -33,7 +33,7 @@ from study.running import PRELOADED, run_case, run_cases
 RING = Ring(views=4, image_size=(16, 16), pixel_pitch=0.25)
 SMALL = NeRIF(
     network=NetworkShape(depth=2, width=24, octaves=2), samples=(12, 16), sample_jitter=2, points_per_batch=600,
-    max_steps=200, epochs=1000, device="cpu", precision="float32",
+    max_steps=200, device="cpu", precision="float32",
 )  # fmt: skip
 TIKHONOV = Tikhonov(voxels=8, basis="linear", iterations=3, device="cpu")
 

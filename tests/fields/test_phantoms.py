@@ -8,12 +8,14 @@ import torch
 from nerif.conventions import InputError
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import FLAME_INTERVAL, Flame, GaussianBalls, Octahedron, make_phantom
+from nerif.fields.turbulence import LONGEST, Fire, TurbulentPlume, inertial_scalar
 from nerif.geometry import Box, Grid, Rays, paper_rig
 from nerif.physics.path_integral import PathIntegral
 from nerif.techniques.deflection import MODELS
 
 CUBE = Box.cube(50.0)
 SLAB = Box((-20.0, -25.0, -15.0), (24.0, 21.0, 33.0))
+PLUME, FIRE = TurbulentPlume(SLAB, 2, shortest=0.1), Fire(SLAB, 2, shortest=0.1)
 
 
 def voxels() -> VoxelField:
@@ -23,8 +25,8 @@ def voxels() -> VoxelField:
 
 @pytest.mark.parametrize(
     "field",
-    [GaussianBalls.random(SLAB, 3), Flame(SLAB, 2e-4, 1), Octahedron(SLAB), voxels()],
-    ids=["gaussians", "flame", "octahedron", "voxels"],
+    [GaussianBalls.random(SLAB, 3), Flame(SLAB, 2e-4, 1), Octahedron(SLAB), voxels(), PLUME, FIRE],
+    ids=["gaussians", "flame", "octahedron", "voxels", "turbulence", "fire"],
 )
 def test_gradient_is_exact(field):
     unit = torch.rand(4, 50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
@@ -146,3 +148,34 @@ def test_octahedron_is_the_paper_s():
 def test_unknown_phantom_is_refused():
     with pytest.raises(InputError, match="flame"):
         make_phantom("cloud", CUBE)
+
+
+def test_the_scalar_of_turbulence_has_the_spectrum_of_the_inertial_range():
+    """Power summed over shells of wave numbers falls as k^(-5/3) within the range, and there is none beyond."""
+    scalar = inertial_scalar(CUBE, 0, shortest=0.04)
+    values = scalar(scalar.grid.points(torch.float64))
+    n = scalar.grid.shape[0]
+    assert float(values.mean()) == pytest.approx(0, abs=1e-6)
+    assert float(values.std()) == pytest.approx(1, rel=1e-3)
+    power = torch.fft.fftn(values).abs().square()
+    wave = torch.fft.fftfreq(n, 1 / n)
+    k = (wave[:, None, None].square() + wave[:, None].square() + wave.square()).sqrt()
+    shells = torch.arange(3, 24)
+    found = torch.stack([power[(k >= s - 0.5) & (k < s + 0.5)].sum() for s in shells])
+    slope = torch.linalg.lstsq(
+        torch.stack([shells.double().log(), torch.ones(len(shells)).double()], dim=1), found.log()[:, None]
+    ).solution[0, 0]
+    assert float(slope) == pytest.approx(-5 / 3, abs=0.15)
+    outside = power[(k > 25.5) | (k < 1 / LONGEST - 0.5)].sum()
+    assert float(outside / power.sum()) < 1e-6
+
+
+def test_turbulent_phantoms_are_hot_inside_and_ambient_at_the_sides():
+    for field in (TurbulentPlume(CUBE, 1, shortest=0.08), Fire(CUBE, 1, shortest=0.08)):
+        values = field.sample(Grid.of_resolution(CUBE, 40))
+        size = float(values.min())
+        assert -3.2e-4 < size < -1.4e-4
+        assert float(values[:, 0].abs().max()) < 0.01 * -size
+        assert float(values[:, :, -1].abs().max()) < 0.01 * -size
+    with pytest.raises(InputError, match="shortest"):
+        inertial_scalar(CUBE, 0, shortest=0.6)

@@ -14,7 +14,7 @@ from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.mlp import Network, NetworkShape
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
-from nerif.reconstruction import bins, training
+from nerif.reconstruction import bins, objective, training
 from nerif.reconstruction.base import Reconstruction, Step
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.gauge import AmbientRegion
@@ -32,7 +32,6 @@ SMALL = NeRIF(
     sample_jitter=4,
     points_per_batch=1024,
     max_steps=30,
-    epochs=1000,
     device="cpu",
     precision="float32",
 )
@@ -138,14 +137,14 @@ def test_same_seed_same_result_other_seed_another(measurement):
 
 
 def test_non_finite_loss_goes_back_to_the_last_good_state(measurement, monkeypatch):
-    real, calls = training.loss_terms, []
+    real, calls = objective.loss_terms, []
 
     def poisoned(*args, **kwargs):
         calls.append(1)
         terms = real(*args, **kwargs)
         return {k: v * float("nan") for k, v in terms.items()} if len(calls) == 15 else terms
 
-    monkeypatch.setattr(training, "loss_terms", poisoned)
+    monkeypatch.setattr(objective, "loss_terms", poisoned)
     monkeypatch.setattr(training, "KEEP_EVERY", 10)
     result = SMALL(measurement)
     assert result.outcome.reason == "steps"
@@ -155,14 +154,14 @@ def test_non_finite_loss_goes_back_to_the_last_good_state(measurement, monkeypat
 
 
 def test_loss_that_stays_non_finite_ends_with_the_last_good_state(measurement, monkeypatch):
-    real, calls = training.loss_terms, []
+    real, calls = objective.loss_terms, []
 
     def poisoned(*args, **kwargs):
         calls.append(1)
         terms = real(*args, **kwargs)
         return {k: v * float("nan") for k, v in terms.items()} if len(calls) > 15 else terms
 
-    monkeypatch.setattr(training, "loss_terms", poisoned)
+    monkeypatch.setattr(objective, "loss_terms", poisoned)
     monkeypatch.setattr(training, "KEEP_EVERY", 10)
     result = SMALL(measurement)
     assert result.outcome.reason == "diverged"
@@ -208,7 +207,7 @@ def test_a_field_that_is_lost_is_taken_back(measurement, monkeypatch):
 )
 def test_sixty_steps_serve_every_shape(measurement, octaves, width, depth):
     shape = NetworkShape(depth=depth, width=width, octaves=octaves)
-    result = replace(NeRIF(device="cpu", precision="float32", epochs=1e6), network=shape, max_steps=60)(measurement)
+    result = replace(NeRIF(device="cpu", precision="float32"), network=shape, max_steps=60)(measurement)
     assert result.history[-1]["loss"] < 0.5 or "not explained" in result.outcome.message
     assert not result.outcome.failed
 
@@ -365,7 +364,7 @@ def test_presets(measurement: Measurement):
     [
         ({"norm": "l3"}, "norm"),
         ({"model": "round"}, "model"),
-        ({"epochs": 0}, "epochs"),
+        ({"epochs": -1}, "epochs"),
         ({"learning_rate": -1}, "learning_rate"),
         ({"time_limit": -1}, "time_limit"),
         ({"samples": (4, 16)}, "samples"),

@@ -15,7 +15,7 @@ from nerif.reconstruction.files import read_field
 from nerif.reconstruction.parallel import Ranks
 
 SMALL = [
-    "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "30", "--epochs", "1000",
+    "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "30",
     "--samples", "12", "16", "--sample-jitter", "2", "--points-per-batch", "600", "--voxels", "12", "--device", "cpu",
     "--precision", "float32", "--no-report",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from report.browsing import open_browser
 
 RIG = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]
 QUICK = [
-    "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "60", "--epochs", "1000",
+    "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "60",
     "--samples", "12", "16", "--sample-jitter", "2", "--points-per-batch", "600", "--voxels", "16", "--device", "cpu",
     "--precision", "float32",
 ]  # fmt: skip

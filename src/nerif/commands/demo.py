@@ -68,7 +68,7 @@ def run(settings: Demo) -> None:
             voxels=80,
             force=True,
             run=Run(hold_out=(held_out,), report=False),
-            reconstructor=NeRIF(time_limit=settings.time_limit, epochs=1000, seed=settings.seed),
+            reconstructor=NeRIF(time_limit=settings.time_limit, seed=settings.seed),
         )
     )
     evaluate.run(evaluate.Evaluate(settings.out, truth=simulate.truth_path(measured)))

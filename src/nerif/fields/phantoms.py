@@ -3,6 +3,8 @@
 gaussians    randomly placed Gaussian balls (paper, Phantom 1)
 flame        a turbulent Bunsen flame (in the place of the paper's Phantoms 2-7)
 octahedron   paper, Eq. (SRphantom), for the spatial resolution
+turbulence   a plume with the spectrum of the inertial range down to the pixel (turbulence.py)
+fire         the folded front of a buoyant fire (turbulence.py)
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field
+from nerif.fields.turbulence import Fire, TurbulentPlume
 from nerif.geometry import Box
 
 __all__ = ["Flame", "GaussianBalls", "Octahedron", "Scaled", "make_phantom"]
@@ -196,6 +199,11 @@ def make_phantom(name: str, box: Box, seed: int = 0, time: float = 0.0) -> Field
         return Flame(box, (int(name) - 2) * FLAME_INTERVAL + time, seed)
     if name == "octahedron":
         return Octahedron(box)
+    if name == "turbulence":
+        return TurbulentPlume(box, seed)
+    if name == "fire":
+        return Fire(box, seed)
     raise InputError(
-        f"phantom: expected gaussians, flame, octahedron, 1-7 (the paper's) or a .nc or .vti volume, got '{name}'"
+        f"phantom: expected gaussians, flame, octahedron, turbulence, fire, 1-7 (the paper's) or a .nc or .vti volume, "
+        f"got '{name}'"
     )

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from nerif.reconstruction.base import Outcome
+from nerif.reconstruction.convergence import Cycles
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.settings import TrainingSettings
 
@@ -20,7 +21,7 @@ class Budget:
 
     Parameters
     ----------
-    settings : epochs, max_steps and time_limit are the limits
+    settings : epochs, max_steps and time_limit are the limits; where there is none the run goes in Cycles
     rays : of one pass over all of them
     ranks : processes that go by the clock of the first
     device : where the ranks talk to each other
@@ -29,6 +30,7 @@ class Budget:
     def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
         self.settings, self.rays, self.ranks, self.device = settings, rays, ranks, device
         self.step, self.rays_done = 0, 0
+        self.cycles = None if settings.limited else Cycles(settings.first_cycle, settings.longest)
         self._before, self._began, self._agreed = 0.0, time.perf_counter(), 0.0
 
     def agree(self) -> None:
@@ -51,14 +53,21 @@ class Budget:
 
     @property
     def progress(self) -> float:
-        """0 at the start, 1 when the first of the limits is reached."""
+        """0 at the start, 1 when the first of the limits is reached, or the end of a cycle."""
         settings = self.settings
-        shares = [self.epoch / settings.epochs]
+        if self.cycles is not None:
+            return self.cycles.progress(self.step, self.seconds)
+        shares = [self.epoch / settings.epochs] if settings.epochs else []
         if settings.max_steps:
             shares.append(self.step / settings.max_steps)
         if settings.time_limit:
             shares.append(self.seconds / settings.time_limit)
         return max(shares)
+
+    @property
+    def share(self) -> float:
+        """What of the run is done at least: 0 at the start, 1 at the latest end."""
+        return self.progress if self.cycles is None else self.seconds / self.cycles.longest
 
     def left(self, rays: int) -> float:
         """Return how many rays the run has time or steps for yet, at the pace so far; inf where neither is limited.
@@ -70,13 +79,14 @@ class Budget:
         settings = self.settings
         shares = [self.step / settings.max_steps] if settings.max_steps else []
         shares += [self.seconds / settings.time_limit] if settings.time_limit else []
+        shares += [] if self.cycles is None else [self.share]
         share = max(shares, default=0.0)
         return rays * (1 - share) / share if share else math.inf
 
     def exhausted(self) -> Outcome | None:
         """Return which limit is reached, if one is."""
         settings = self.settings
-        if self.epoch >= settings.epochs:
+        if settings.epochs and self.epoch >= settings.epochs:
             return Outcome("epochs", f"all {settings.epochs:g} epochs done")
         if settings.max_steps and self.step >= settings.max_steps:
             return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may give more")
@@ -94,9 +104,12 @@ class Budget:
 
     def used(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""
-        return {"step": self.step, "rays_done": self.rays_done, "seconds": self.seconds}
+        used = {"step": self.step, "rays_done": self.rays_done, "seconds": self.seconds}
+        return used if self.cycles is None else {**used, "cycles": self.cycles.kept()}
 
     def restore(self, used: dict[str, Any]) -> None:
         """Go on from what a checkpoint kept."""
         self.step, self.rays_done = int(used["step"]), int(used["rays_done"])
         self._before, self._began = float(used["seconds"]), time.perf_counter()
+        if self.cycles is not None and "cycles" in used:
+            self.cycles.restore(used["cycles"])

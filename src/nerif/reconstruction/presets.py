@@ -22,7 +22,6 @@ PRESETS: dict[str, NeRIF] = {
         samples=(24, 64),
         points_per_batch=1 << 17,
         learning_rate=6e-3,
-        epochs=60,
     ),
     # the paper to the letter: three terms, lengths of residuals, constant learning rate, its stopping rule
     "paper": NeRIF(

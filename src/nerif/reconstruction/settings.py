@@ -67,12 +67,17 @@ class TrainingSettings(Reconstructor):
     """Steps over which the learning rate rises, at most a sixth of max_steps; with the cosine schedule."""
     schedule: str = "cosine"
     """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
-    epochs: float = 40.0
-    """Stop after so many passes over all rays (the paper's n_outer)."""
+    epochs: float = 0.0
+    """Stop after so many passes over all rays (the paper's n_outer); 0 for no limit. Without any limit a run ends when
+    rays that it is not given are met no better."""
     max_steps: int = 0
     """Stop after so many steps; 0 for no limit."""
     time_limit: float = 0.0
     """Stop after so many seconds; 0 for no limit."""
+    longest: float = 600.0
+    """Seconds after which a run without a limit ends, whether more would bring anything or not."""
+    first_cycle: int = 400
+    """Steps after which a run without a limit first asks whether more would; then after each twice as many."""
     stop_ratio: float = 0.0
     """Stop when the loss is below this share of the initial loss; 0 never (paper: 0.005)."""
     fit_steps: int = 400
@@ -99,7 +104,8 @@ class TrainingSettings(Reconstructor):
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
         for name in (
-            "epochs",
+            "longest",
+            "first_cycle",
             "learning_rate",
             "matrix_rate",
             "points_per_batch",
@@ -109,7 +115,7 @@ class TrainingSettings(Reconstructor):
         ):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("max_steps", "time_limit", "stop_ratio", "sample_jitter"):
+        for name in ("epochs", "max_steps", "time_limit", "stop_ratio", "sample_jitter"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         if not (len(self.samples) == 2 and min(self.samples) > self.sample_jitter):
@@ -127,3 +133,8 @@ class TrainingSettings(Reconstructor):
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")
+
+    @property
+    def limited(self) -> bool:
+        """Whether the run ends by a limit that was asked for."""
+        return bool(self.epochs or self.max_steps or self.time_limit)

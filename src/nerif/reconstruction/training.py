@@ -1,6 +1,8 @@
 """The training of a network, on one frame or on several at once: the loop, and what it does when something goes wrong.
 
-    batch of rays -> samples -> loss_terms -> one step of the optimiser, until the budget is used up
+    batch of rays -> samples -> terms of the loss (objective.py) -> one step of the optimiser
+
+until the budget is used up or, where there is no limit, until more brings nothing (convergence.py).
 
 Of large pictures the first steps see bins of pixels, and those after PIONEERS of the run the smallest bins of which it
 can see all (bins.py). A loss or weights that turn non-finite, and a field that is or becomes empty (watch.py), take the
@@ -11,8 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -21,20 +22,18 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.mlp import UNBOUNDED
-from nerif.fields.space_time import AtTimes, with_time
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import check_resumed
 from nerif.reconstruction.budget import Budget
 from nerif.reconstruction.device import peak_memory
 from nerif.reconstruction.fingerprint import check_fingerprint
-from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
+from nerif.reconstruction.losses import DATA
+from nerif.reconstruction.objective import Objective, Piece
 from nerif.reconstruction.optimiser import NetworkOptimiser
 from nerif.reconstruction.order import shuffled
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
-from nerif.reconstruction.sampling import SamplingDensity, sample_count, sample_rays
 from nerif.reconstruction.settings import TrainingSettings
-from nerif.reconstruction.target import Part
 from nerif.reconstruction.training_data import TrainingData
 from nerif.reconstruction.warm_start import adopt, fit_network
 from nerif.reconstruction.watch import Watch
@@ -43,27 +42,9 @@ __all__ = ["Training"]
 
 RETRIES = 5  # times a run is taken back before it gives up
 PIONEERS = 0.1  # share of the run after which its pace is known
-GAUGE_POINTS = 256  # a step
 DENSITY_EVERY = 60  # steps between looks at where the field varies
 LEVEL_POINTS = 1 << 14  # at which the ambient level is taken at the end
 LOG_EVERY, KEEP_EVERY = 20, 200  # steps
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Rays of one technique in a step.
-
-    Parameters
-    ----------
-    part : rays, what they measured, and the forward model
-    tau : (n,) their instants, or None
-    s, interval : (n, m) path lengths of the samples, and the length that each stands for, mm
-    """
-
-    part: Part
-    tau: Tensor | None
-    s: Tensor
-    interval: Tensor
 
 
 class Training:
@@ -97,17 +78,18 @@ class Training:
             torch.manual_seed(settings.seed)
             self.field = data.untrained(settings.network)
         network = self.field.network
-        self.density = SamplingDensity(self.field)
         self.optimiser = NetworkOptimiser(
             settings.optimiser, network, settings.betas, settings.momentum, settings.rates_by_shape
         )
         self.network = MixedPrecision(network, self.device, settings.precision, settings.compile)
+        self.objective = Objective(settings, data, self.field, self.network, self.generator, self.ranks)
         # its clock begins here: imports are no training
         self.budget = Budget(settings, len(data), self.ranks, self.device)
         self.history: list[dict[str, float]] = []
         self.edge, self.settled = data.coarsest, data.coarsest == 1
         self.watch = Watch(data.noise)
         self.retries, self.rate = 0, 1.0
+        self.best: dict[str, Tensor] = {}  # weights at the end of the best cycle
         self.initial_loss, self.running = float("nan"), float("nan")
         if resume is not None:
             check_fingerprint(resume.scalars.get("fingerprint"), data.fingerprint)
@@ -128,7 +110,8 @@ class Training:
                 self._settle()
                 clock, rays_then = time.perf_counter(), budget.rays_done
             pieces, whole = self._batch()
-            terms, mine = self._terms(pieces), sum(piece.part.measured.numel() for piece in pieces)
+            self.network.low = budget.progress < settings.full_precision_from
+            terms, mine = self.objective.terms(pieces), sum(piece.part.measured.numel() for piece in pieces)
             loss = sum(getattr(settings.weights, name) * term for name, term in terms.items())
             assert isinstance(loss, Tensor)
             rate = self._learning_rate()
@@ -140,9 +123,8 @@ class Training:
             outcome = self._outcome()
             if self.device.type == "cuda" and budget.step % LOG_EVERY and outcome is None:
                 continue  # looking at a number waits for the GPU, so look now and then
-            empty = sum(share * reduce(piece.part.of_nothing, settings.norm) for piece, share in shares(pieces))
-            assert isinstance(empty, Tensor)
-            figures = torch.stack([term.detach().float() for term in (*terms.values(), loss, empty)])
+            found = (*terms.values(), loss, self.objective.of_nothing(pieces))
+            figures = torch.stack([term.detach().float() for term in found])
             means = self.ranks.average(figures, mine, whole).tolist()
             values = dict(zip((*terms, "loss"), means, strict=False))
             if not math.isfinite(values["loss"]) or (outcome is not None and not self._finite()):
@@ -194,17 +176,22 @@ class Training:
                 self.field, self.network, self.start, settings.fit_steps, settings.points_per_batch,
                 settings.learning_rate, self.generator, log,
             )  # fmt: skip
-        self._look()
+        self.objective.look()
         self.rate, self.good = settings.rate_after_fit, self._capture()
         return outcome
 
     # -- a step --------------------------------------------------------------------------------------------------
 
-    def _draw(self, count: int) -> Tensor:
-        """The numbers of the next rays, of a random order that has each once an epoch."""
-        index = shuffled(self.budget.rays_done, count, len(self.data), self.settings.seed)
-        self.budget.rays_done += count
-        return index
+    def _batch(self) -> tuple[list[Piece], int]:
+        """The next rays, of a random order that has each once an epoch."""
+        budget, objective = self.budget, self.objective
+        samples = objective.samples(budget.progress)
+        rays = objective.rays(samples)
+        index = shuffled(budget.rays_done, rays, len(self.data), self.settings.seed)
+        budget.rays_done += rays
+        if self.settings.sampling == "adaptive" and budget.step and budget.step % DENSITY_EVERY == 0:
+            objective.look()
+        return objective.batch(index, samples)
 
     def _settle(self) -> None:
         """Go on with the smallest bins of which the rest of the run can see all."""
@@ -222,52 +209,6 @@ class Training:
         self.watch.noise = self.data.noise
         self._log({"bin_edge": float(edge)})
 
-    def _batch(self) -> tuple[list[Piece], int]:
-        """This process's share of a step, and how many measured numbers the step has in all."""
-        settings, step = self.settings, self.budget.step
-        count = sample_count(self.budget.progress, *settings.samples, settings.sample_jitter, self.generator)
-        rays = min(max(self.ranks.size, settings.points_per_batch // count), len(self.data))
-        batch = self.data.batch(self._draw(rays))
-        if settings.sampling == "adaptive" and step and step % DENSITY_EVERY == 0:
-            self._look()
-        pieces, mine = [], self.ranks.share
-        for part, tau in batch:
-            s, interval = sample_rays(part.rays, count, self.generator, settings.sampling, self.density)
-            pieces.append(Piece(part[mine], None if tau is None else tau[mine], s[mine], interval[mine]))
-        return [p for p in pieces if len(p.part)], sum(part.measured.numel() for part, _ in batch)
-
-    def _look(self) -> None:
-        """Look at where the field varies."""
-        self.density.update(*(self._at(tau) for tau in self.data.instants))
-
-    def _terms(self, pieces: list[Piece]) -> dict[str, Tensor]:
-        """The terms of the loss, each the mean over all measured numbers of the pieces."""
-        settings = self.settings
-        self.network.low = self.budget.progress < settings.full_precision_from
-        terms: dict[str, Tensor] = {}
-        for piece, share in shares(pieces):
-            found = loss_terms(
-                self.field, self._at(piece.tau), piece.part, piece.s, piece.interval, settings.weights, settings.norm
-            )
-            for name, term in found.items():
-                terms[name] = terms[name] + share * term if name in terms else share * term
-        ambient = self._at_ambient(GAUGE_POINTS, self.generator)
-        if ambient is not None:
-            terms["gauge"] = ambient.square().mean()
-        return terms
-
-    def _at(self, tau: Tensor | None) -> Evaluator:
-        """The network as a function of space, at the instants given."""
-        return self.network if tau is None else AtTimes(self.network, tau)
-
-    def _at_ambient(self, count: int, generator: torch.Generator) -> Tensor | None:
-        """What the network gives where it should give 0, in full precision; None where no place is known."""
-        found = self.data.ambient_points(count, generator)
-        if found is None:
-            return None
-        points, tau = found
-        return self.field.network(with_time(self.field.normalise(points), tau))
-
     def _learning_rate(self) -> float:
         """Adam's, of the next step."""
         settings, rate = self.settings, self.rate * self.settings.learning_rate
@@ -281,10 +222,28 @@ class Training:
 
     def _outcome(self) -> Outcome | None:
         """Why the run is over, if it is."""
-        outcome, share = self.budget.exhausted(), self.settings.stop_ratio
+        outcome, share = self.budget.exhausted() or self._judge(), self.settings.stop_ratio
         if outcome is None and share and self.running <= share * self.initial_loss:
             return Outcome("converged", f"loss fell to {share:g} of its initial value")
         return outcome
+
+    def _judge(self) -> Outcome | None:
+        """At the end of a cycle, what the rays held back say of going on; what the best cycle found is kept."""
+        budget, cycles, held = self.budget, self.budget.cycles, self.data.held_back
+        if cycles is None or budget.progress < 1:
+            return None
+        error = self.running**2 if held is None else self.objective.held_back()
+        (error,) = self.ranks.decided([error], self.device)
+        outcome = cycles.judge(error, float(held is not None and held.sigma_known), budget.step, budget.seconds)
+        self._log({"held_back": math.sqrt(error)})
+        if cycles.best:
+            self.best = self._weights()
+        elif self.best:
+            self.field.network.load_state_dict(self.best)
+        return outcome
+
+    def _weights(self) -> dict[str, Tensor]:
+        return {name: value.detach().clone() for name, value in self.field.network.state_dict().items()}
 
     def _follow(self, values: dict[str, float], empty: float) -> None:
         """A running mean of the loss; squares are rooted so that ratios mean the same for both norms."""
@@ -332,15 +291,15 @@ class Training:
 
     def _tell(self, values: dict[str, float], speed: float) -> Step:
         budget = self.budget
-        progress = min(budget.progress, 1.0)
+        progress = min(budget.share, 1.0)
         return Step(budget.step, budget.epoch, budget.seconds, progress, values, speed, self._capture)
 
     def _capture(self) -> State:
-        tensors = {f"network.{k}": v.detach().clone() for k, v in self.field.network.state_dict().items()}
+        tensors = {f"network.{k}": v for k, v in self._weights().items()}
         tensors |= {f"optimiser.{k}": v for k, v in self.optimiser.tensors().items()}
         tensors["generator"] = self.generator.get_state().clone()
-        if self.density.values is not None:
-            tensors["density"] = self.density.values.clone()
+        if self.objective.density.values is not None:
+            tensors["density"] = self.objective.density.values.clone()
         names = ("retries", "rate", "initial_loss", "running", "settled")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
         scalars |= {"scale": self.field.scale, "offset": self.field.offset}
@@ -358,7 +317,7 @@ class Training:
         self.optimiser.restore({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser.")})
         self.generator.set_state(tensors["generator"])
         density = tensors.get("density")
-        self.density.values = None if density is None else density.clone().to(self.device)
+        self.objective.density.values = None if density is None else density.clone().to(self.device)
         self.history = list(scalars.pop("history"))
         self.watch.restore(scalars.pop("watch"))
         edge = int(scalars.pop("edge"))
@@ -375,7 +334,7 @@ class Training:
             again = f"; taken back {self.retries} time(s) to the last good state" if self.retries else ""
             outcome = Outcome(outcome.reason, outcome.message + again + self.watch.remark)
         self.field.network.eval().requires_grad_(False)
-        ambient = self._at_ambient(LEVEL_POINTS, torch.Generator().manual_seed(0))
+        ambient = self.objective.at_ambient(LEVEL_POINTS, torch.Generator().manual_seed(0))
         if ambient is not None and self.data.open and self.field.network.limits == UNBOUNDED:
             self.field.offset = float(ambient.mean())  # the constant that the data leave open
         return Reconstruction(
@@ -392,9 +351,3 @@ class Training:
             quantity=self.data.quantity,
         )
 
-
-def shares(pieces: list[Piece]) -> Iterator[tuple[Piece, float]]:
-    """Give each piece with its share of all measured numbers."""
-    total = sum(piece.part.measured.numel() for piece in pieces)
-    for piece in pieces:
-        yield piece, piece.part.measured.numel() / total

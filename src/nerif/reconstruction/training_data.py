@@ -21,6 +21,7 @@ from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.gauge import AmbientRegion, is_open
 from nerif.reconstruction.settings import TrainingSettings
+from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.target import Part, Target
 
 __all__ = ["FrameData", "TrainingData"]
@@ -52,6 +53,9 @@ class TrainingData(ABC):
     """Edge of the largest bins that the data can be given in, px."""
     noise: float = 0.0
     """Mean square of the noise over that of what was measured; 0 where it is not known."""
+
+    held_back: Target | None = None
+    """Rays that are in no batch; None where the settings limit the training, or there are too few."""
 
     def refine(self, edge: int) -> None:
         """Give bins of another edge, px, from now on."""
@@ -100,6 +104,10 @@ class FrameData(TrainingData):
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
+        if not settings.limited:
+            self.measurement, held = hold_back(measurement, self.coarsest)
+            if held is not None:
+                self.held_back = Target.of(held, settings.open_faces, model=settings.model).to(self.device)
         self.refine(self.coarsest)
 
     def refine(self, edge: int) -> None:

@@ -82,8 +82,9 @@ def _attempts(
     plan: SequencePlan, sequence: MeasurementSequence, index: int, before: NeuralField | None, watch: OnStep
 ) -> Frame:
     """One frame: as planned, then from nothing, then more cautiously."""
-    careful = replace(plan.cold, learning_rate=plan.cold.learning_rate / 2)
-    tries = [(plan.cold, None) if before is None else (plan.warm, before), (plan.cold, None), (careful, None)]
+    first = plan.first
+    careful = replace(first, learning_rate=first.learning_rate / 2)
+    tries = [(first, None) if before is None else (plan.warm, before), (first, None), (careful, None)]
     reason = ""
     for number, (settings, start) in enumerate(tries, start=1):
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -87,7 +88,7 @@ class SequencePlan:
     Parameters
     ----------
     measurement, out : stores
-    cold : settings of a frame that starts from nothing
+    cold : settings of the method as they were asked
     settings : of the sequence
     threads : of a worker on a CPU; 0 for its share of the cores
     """
@@ -97,6 +98,11 @@ class SequencePlan:
     cold: NeRIF
     settings: SequenceSettings = field(default_factory=SequenceSettings)
     threads: int = 0
+
+    @property
+    def first(self) -> NeRIF:
+        """Settings of a frame that starts from nothing, repeatable: no clock ends it."""
+        return replace(self.cold, longest=math.inf)
 
     @property
     def warm(self) -> NeRIF:

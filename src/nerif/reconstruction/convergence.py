@@ -1,0 +1,72 @@
+"""When more training brings next to nothing, seen by rays that no step is given.
+
+A run goes in cycles, each twice as long as the one before. Each ends with the smallest learning rate, so that what it
+reached can be compared with what the last one did; e is the mean square of the residual on the rays held back, over
+sigma, of which the noise is 1:
+
+    e_before - e < max(FALL (e - 1), SCATTER)      the run has converged
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from nerif.reconstruction.base import Outcome
+
+__all__ = ["Cycles"]
+
+FALL = 0.08  # of what is above the noise: a doubling that gains less leaves 5 % of the error, its root, to the next two
+SCATTER = 0.003  # of e itself: so much is chance
+
+
+class Cycles:
+    """The cycles of a run: where they began, and how well each met the rays held back.
+
+    Parameters
+    ----------
+    first : steps of the first cycle
+    longest : seconds after which the run ends at the latest
+    """
+
+    def __init__(self, first: int, longest: float) -> None:
+        self.length, self.longest = first, longest
+        self.step, self.seconds = 0, 0.0  # at which the present one began
+        self.errors: list[float] = []
+
+    def progress(self, step: int, seconds: float) -> float:
+        """0 at the start of the present cycle, 1 at its end."""
+        left = self.longest - self.seconds
+        return max((step - self.step) / self.length, (seconds - self.seconds) / left if left > 0 else 1.0)
+
+    def judge(self, error: float, noise: float, step: int, seconds: float) -> Outcome | None:
+        """Take in how well the rays held back are met at the end of a cycle; begin the next, or say why there is none.
+
+        Parameters
+        ----------
+        error : mean square of the residual on the rays held back
+        noise : what of it is noise; 0 where that is not known
+        step, seconds : done so far
+        """
+        before, self.errors = (self.errors[-1] if self.errors else math.inf), [*self.errors, error]
+        left = f"rays held back are met to {math.sqrt(error):.3g}{' sigma' if noise else ''}"
+        if before - error < max(FALL * (error - noise), SCATTER * error):
+            return Outcome("converged", f"{left}, and {self.length} steps more gained next to nothing")
+        if seconds + (seconds - self.seconds) > self.longest:
+            return Outcome("time_limit", f"{left} after {seconds:.0f} s; --time-limit {4 * seconds:.0f} may give more")
+        self.step, self.seconds, self.length = step, seconds, 2 * self.length
+        return None
+
+    @property
+    def best(self) -> bool:
+        """Whether no earlier cycle met the rays held back better than the last."""
+        return self.errors[-1] <= min(self.errors)
+
+    def kept(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps."""
+        return {name: getattr(self, name) for name in ("length", "step", "seconds", "errors")}
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go on from what a checkpoint kept."""
+        for name, value in kept.items():
+            setattr(self, name, value)

@@ -1,0 +1,124 @@
+"""A run without a limit: cycles, rays held back, and an end that says why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_volume
+from nerif.fields.mlp import NetworkShape
+from nerif.geometry import Grid
+from nerif.reconstruction import objective
+from nerif.reconstruction.convergence import Cycles
+from nerif.reconstruction.files import read_state, write_state
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.some_pixels import hold_back
+from nerif.reconstruction.training_data import FrameData
+from nerif.simulation import add_noise
+from nerif.volume import Volume
+
+ENDLESS = NeRIF(
+    network=NetworkShape(depth=2, width=32, octaves=2), samples=(12, 16), points_per_batch=512, first_cycle=40,
+    device="cpu", precision="float32",
+)  # fmt: skip
+
+
+def cycles(errors: list[float], noise: float = 1.0, longest: float = 1e9) -> tuple[list[int], str]:
+    """Lengths of the cycles that end with such errors, a second a step, and why the last was the last."""
+    found, step, lengths, outcome = Cycles(100, longest), 0, [], None
+    for error in errors:
+        assert outcome is None
+        lengths.append(found.length)
+        step += found.length
+        assert found.progress(step, step) == 1
+        outcome = found.judge(error, noise, step, step)
+    return lengths, outcome.reason if outcome else ""
+
+
+def test_cycles_double_until_one_gains_next_to_nothing():
+    assert cycles([5.0, 3.0, 2.0]) == ([100, 200, 400], "")
+    assert cycles([5.0, 3.0, 2.9]) == ([100, 200, 400], "converged")
+    assert cycles([5.0, 3.0, 3.2]) == ([100, 200, 400], "converged")
+    assert cycles([1.010, 1.008]) == ([100, 200], "converged")  # a fifth of the excess, but within the scatter
+    assert cycles([5.0, 4.8], noise=0.0)[1] == "converged"
+    assert cycles([5.0, 3.0], longest=350)[1] == "time_limit"  # the next would not be as long as the last
+
+
+def test_a_cycle_ends_in_time():
+    found = Cycles(100, 50.0)
+    assert found.progress(10, 50.0) == 1
+    assert found.judge(2.0, 1.0, 10, 50.0).reason == "time_limit"
+
+
+def test_pixels_held_back_are_of_every_view_and_in_no_batch(measurement):
+    rest, held = hold_back(measurement, 1)
+    usable = [m.usable.flatten(1).sum(dim=1) for m in (measurement, rest, held)]
+    assert torch.equal(usable[1] + usable[2], usable[0])
+    assert bool((usable[1] > 0).all())
+    assert 0.02 < usable[2].sum() / usable[0].sum() < 0.2
+    assert not bool((rest.usable & held.usable).any())
+    data = FrameData(ENDLESS, measurement)
+    assert data.held_back is not None
+    assert len(data) + len(data.held_back) == len(FrameData(replace(ENDLESS, max_steps=1), measurement))
+
+
+def test_a_single_pixel_is_held_back_of_a_few_and_none_of_single_ones(measurement):
+    valid = torch.zeros_like(measurement.usable)
+    valid[:, 10, 10] = True
+    few = replace(measurement, valid=valid)
+    assert hold_back(few, 1)[1] is None
+    assert replace(ENDLESS, first_cycle=10, longest=1.0)(few).outcome.reason in ("converged", "time_limit")
+    valid[1, 10, 11] = True
+    rest, held = hold_back(replace(measurement, valid=valid), 1)
+    assert held.names == (measurement.names[1],)
+    assert int(held.usable.sum()) == 1
+    assert torch.equal(rest.usable.flatten(1).sum(dim=1), torch.ones(len(measurement.names), dtype=torch.long))
+
+
+def test_a_run_without_a_limit_converges_and_goes_on_where_it_was(measurement, ball, tmp_path):
+    measurement, states = add_noise(measurement, 0.3, seed=3), {}
+    whole = ENDLESS(measurement, lambda s: states.__setitem__(s.step, s.capture()) if s.step == 90 else None)
+    assert whole.outcome.reason == "converged"
+    assert "rays held back are met to" in whole.outcome.message
+    judged = [record["held_back"] for record in whole.history if "held_back" in record]
+    assert len(judged) >= 2
+    assert judged[0] > judged[-1] > 0.9
+    grid = Grid.of_resolution(measurement.box, 24)
+    truth = Volume(ball.sample(grid), grid)
+    assert evaluate_volume(whole.field, truth, measurement.n_ambient)["l2_variation"] < 0.2
+    write_state(tmp_path, states[90])
+    again = ENDLESS(measurement, resume=read_state(tmp_path))
+    points = torch.rand(50, 3)
+    assert torch.equal(again.field(points), whole.field(points))
+    assert [r["held_back"] for r in again.history if "held_back" in r] == judged
+    assert ENDLESS(measurement, resume=whole.state).outcome.reason == "converged"
+
+
+def test_the_longest_time_ends_it(measurement):
+    result = replace(ENDLESS, longest=0.5, first_cycle=10**6)(measurement)
+    assert result.outcome.reason == "time_limit"
+    assert "--time-limit" in result.outcome.message
+    assert 0.4 < result.seconds < 10
+
+
+def test_the_best_cycle_is_kept(measurement, monkeypatch):
+    """A cycle that the rays held back like less than the one before gives it back."""
+    errors, fields = iter([2.0, 3.0]), []
+    monkeypatch.setattr(objective.Objective, "held_back", lambda self: next(errors))
+    points = torch.rand(50, 3)
+    settings = replace(ENDLESS, first_cycle=20)
+    whole = settings(measurement, lambda s: fields.append(s.capture()) if s.step == 20 else None)
+    kept = {k.removeprefix("network."): v for k, v in fields[0].tensors.items() if k.startswith("network.")}
+    found = whole.field.network.state_dict()
+    assert all(torch.equal(found[k], v) for k, v in kept.items())
+    assert bool(torch.isfinite(whole.field(points)).all())
+
+
+@pytest.mark.parametrize(("setting", "value"), [("longest", 0.0), ("first_cycle", 0), ("longest", math.nan)])
+def test_limits_that_cannot_be_are_refused(setting, value):
+    with pytest.raises(InputError, match=setting):
+        NeRIF(**{setting: value})
