@@ -61,9 +61,9 @@ def test_pixels_held_back_are_of_every_view_and_in_no_batch(measurement):
     assert bool((usable[1] > 0).all())
     assert 0.02 < usable[2].sum() / usable[0].sum() < 0.2
     assert not bool((rest.usable & held.usable).any())
-    data = FrameData(ENDLESS, measurement)
+    data = FrameData(ENDLESS, measurement, judged=True)
     assert data.held_back is not None
-    assert len(data) + len(data.held_back) == len(FrameData(replace(ENDLESS, max_steps=1), measurement))
+    assert len(data) + len(data.held_back) == len(FrameData(ENDLESS, measurement))
 
 
 def test_a_single_pixel_is_held_back_of_a_few_and_none_of_single_ones(measurement):

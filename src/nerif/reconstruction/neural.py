@@ -25,4 +25,4 @@ class NeRIF(TrainingSettings):
         resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:
-        return Training(self, FrameData(self, measurement), resume, start).run(on_step)
+        return Training(self, FrameData(self, measurement, judged=not self.limited), resume, start).run(on_step)

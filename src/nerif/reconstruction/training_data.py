@@ -55,7 +55,7 @@ class TrainingData(ABC):
     """Mean square of the noise over that of what was measured; 0 where it is not known."""
 
     held_back: Target | None = None
-    """Rays that are in no batch; None where the settings limit the training, or there are too few."""
+    """Rays that are in no batch, to judge by them; None where there are none."""
 
     def refine(self, edge: int) -> None:
         """Give bins of another edge, px, from now on."""
@@ -93,9 +93,12 @@ class FrameData(TrainingData):
     settings : TrainingSettings
     measurement : Measurement
     coarsest : edge of the bins to begin with, px; None for what a picture of its size can do with
+    judged : whether some of the rays are held back
     """
 
-    def __init__(self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None) -> None:
+    def __init__(
+        self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, judged: bool = False
+    ) -> None:
         super().__init__(
             resolve_device(settings.device), measurement.box, measurement.n_ambient,
             fingerprint(measurement, settings.open_faces), is_open(measurement), measurement.quantity,
@@ -104,7 +107,7 @@ class FrameData(TrainingData):
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
-        if not settings.limited:
+        if judged:
             self.measurement, held = hold_back(measurement, self.coarsest)
             if held is not None:
                 self.held_back = Target.of(held, settings.open_faces, model=settings.model).to(self.device)

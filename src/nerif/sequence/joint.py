@@ -91,7 +91,7 @@ def _read(plan: SequencePlan, sequence: MeasurementSequence, index: int) -> Fram
     """A frame without the views held out."""
     frame = sequence.frame(index)
     training = frame.select([name for name in frame.names if name not in plan.settings.hold_out])
-    return FrameData(replace(plan.cold, device="cpu", max_steps=plan.settings.joint_steps), training, coarsest=1)
+    return FrameData(replace(plan.cold, device="cpu"), training, coarsest=1)
 
 
 def _trained(
