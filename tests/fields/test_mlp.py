@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from nerif.conventions import InputError
-from nerif.fields.encoding import encode, encode_pullback, encoded_width
+from nerif.fields.encoding import encode, encode_pullback, encoded_width, wave_vectors
 from nerif.fields.mlp import ACTIVATIONS, Network, NetworkShape, NeuralField
 from nerif.geometry import Box
+from nerif.reconstruction.presets import PRESETS
 
 BASE = NetworkShape(depth=3, width=11, octaves=2, skip=2, head_width=5, gradient_head=True)
 SHAPES = {
@@ -59,25 +60,41 @@ def test_a_loss_on_the_gradient_trains_the_same_weights_as_double_backward(activ
 
 def test_encoding_is_the_paper_s():
     p = torch.tensor([[0.3, -0.2, 0.7]], dtype=torch.float64)
-    e = encode(p, 3)[0]
-    assert e.shape == (encoded_width(3),) == (21,)
+    e = encode(p, wave_vectors(3, 3)[0])[0]
+    assert e.shape == (encoded_width(3, 3),) == (21,)
     assert torch.equal(e[:3], p[0])
     for k in range(3):
         assert torch.allclose(e[3 + 3 * k : 6 + 3 * k], torch.sin(2**k * torch.pi * p[0]))
         assert torch.allclose(e[12 + 3 * k : 15 + 3 * k], torch.cos(2**k * torch.pi * p[0]))
 
 
-def test_encoding_pullback_is_its_transposed_jacobian():
+@pytest.mark.parametrize("directions", [3, 9, 13])
+def test_encoding_pullback_is_its_transposed_jacobian(directions):
     p = torch.rand(1, 3, dtype=torch.float64)
-    gains = torch.tensor([1.0, 0.5], dtype=torch.float64)
-    cotangent = torch.rand(1, 15, dtype=torch.float64)
-    jacobian = torch.autograd.functional.jacobian(lambda q: encode(q, 2, gains)[0], p)[:, 0]
-    got = encode_pullback(encode(p, 2, gains), cotangent, 2)
+    waves, octave = wave_vectors(2, directions)
+    gains = torch.tensor([1.0, 0.5], dtype=torch.float64)[octave]
+    cotangent = torch.rand(1, encoded_width(2, directions), dtype=torch.float64)
+    jacobian = torch.autograd.functional.jacobian(lambda q: encode(q, waves, gains)[0], p)[:, 0]
+    got = encode_pullback(encode(p, waves, gains), cotangent, waves)
     assert torch.allclose(got[0], cotangent[0] @ jacobian)
 
 
+def test_octaves_run_along_directions_that_a_cube_turned_into_itself_has():
+    """Each octave has one length, and the directions sum to a multiple of the identity: none is favoured."""
+    for count in (3, 9, 13):
+        waves, octave = wave_vectors(3, count)
+        assert len(waves) == 3 * count
+        for k in range(3):
+            some = waves[octave == k] / (torch.pi * 2**k)
+            assert torch.allclose(some.norm(dim=1), torch.ones(count))
+            assert torch.allclose(some.T @ some, count / 3 * torch.eye(3), atol=1e-5)
+            assert float((some @ some.T - torch.eye(count)).abs().max()) < 0.9  # no two are one
+    with pytest.raises(InputError, match="directions: expected one of 3, 9, 13, got 5"):
+        NetworkShape(directions=5)
+
+
 def test_paper_s_network():
-    net = Network(NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64, gradient_head=True))
+    net = Network(PRESETS["paper"].network)
     e = 3 * (2 * 5 + 1)
     assert [layer.in_features for layer in net.layers] == [e, 256, 256, 256, 256 + e, 256, 256]
     assert [layer.out_features for layer in net.layers] == [256] * 7

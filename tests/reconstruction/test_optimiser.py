@@ -7,9 +7,9 @@ import torch
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape
-from nerif.reconstruction.optimiser import NetworkOptimiser
+from nerif.reconstruction.optimiser import REFERENCE, NetworkOptimiser
 
-SHAPE = NetworkShape(depth=2, width=16, octaves=2)
+SHAPE = NetworkShape(depth=2, width=16, octaves=2, directions=3)
 
 
 def network() -> Network:
@@ -78,7 +78,7 @@ def test_a_checkpoint_of_another_optimiser_is_refused(made_by, asked):
 def test_the_reference_steps_as_torch_has_it():
     """Muon in float32 and one group a matrix: the steps of torch.optim.Muon, up to the rounding of bf16."""
     torch.manual_seed(0)
-    net = Network(NetworkShape())
+    net = Network(REFERENCE)
     matrices = [layer.weight for layer in net.layers]
     twins = [m.detach().clone().requires_grad_() for m in matrices]
     optimiser = NetworkOptimiser("muon", net, (0.9, 0.99), 0.9)

@@ -1,52 +1,86 @@
-"""Sinusoidal encoding of coordinates (paper, Eq. (postionencode)), with its derivative written out."""
+"""Sinusoidal encoding of coordinates, octave by octave along several directions, with its derivative written out.
+
+The paper's (Eq. (postionencode)) runs along the axes; waves along the diagonals as well let a network meet fronts that
+lie askew.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-__all__ = ["encode", "encode_pullback", "encoded_width"]
+from nerif.conventions import InputError
+
+__all__ = ["DIRECTIONS", "encode", "encode_pullback", "encoded_width", "wave_vectors"]
 
 
-def encoded_width(octaves: int) -> int:
-    """Return 3 (2 N + 1), the width of the encoding of a point."""
-    return 3 * (2 * octaves + 1)
+def _unit(count: int) -> list[tuple[float, ...]]:
+    """Directions, up to their sign, with so many components other than 0, all equal in size."""
+    found = [v for v in itertools.product((1, 0, -1), repeat=3) if sum(map(abs, v)) == count]
+    return [tuple(x / math.sqrt(count) for x in v) for v in found if v > tuple(-x for x in v)]
 
 
-def encode(p: Float[Tensor, "n 3"], octaves: int, gains: Float[Tensor, " k"] | None = None) -> Float[Tensor, "n e"]:
-    """Return (p, sin(2^k pi p), cos(2^k pi p)), k = 0 .. octaves - 1, each octave times its gain.
+AXES = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
+DIRECTIONS = {3: AXES, 9: [*AXES, *_unit(2)], 13: [*AXES, *_unit(2), *_unit(3)]}
+"""By their number: the axes of the box; with the diagonals of the faces of a cube; with those of the cube as well."""
+
+
+def check_directions(count: int) -> None:
+    """Raise InputError unless there are DIRECTIONS of that number."""
+    if count not in DIRECTIONS:
+        raise InputError(f"directions: expected one of {', '.join(map(str, DIRECTIONS))}, got {count}")
+
+
+def wave_vectors(octaves: int, directions: int) -> tuple[Float[Tensor, "w 3"], Int[Tensor, " w"]]:
+    """Return 2^k pi e for k = 0 .. octaves - 1 and each direction e, those along the axes first, and k of each."""
+    unit, waves, octave = torch.tensor(DIRECTIONS[directions], dtype=torch.float64), [], []
+    for some in (unit[:3], unit[3:]):
+        for k in range(octaves):
+            waves.append(math.pi * 2.0**k * some)
+            octave += [k] * len(some)
+    if not waves:
+        return torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
+    return torch.cat(waves).float(), torch.tensor(octave)
+
+
+def encoded_width(octaves: int, directions: int) -> int:
+    """Return 3 + 2 N D, the width of the encoding of a point by N octaves along D directions."""
+    return 3 + 2 * octaves * directions
+
+
+def encode(
+    p: Float[Tensor, "n 3"], waves: Float[Tensor, "w 3"], gains: Float[Tensor, " w"] | None = None
+) -> Float[Tensor, "n e"]:
+    """Return (p, g sin(k . p), g cos(k . p)) for each wave vector k and its gain g.
 
     Parameters
     ----------
     p : (n, 3) coordinates, the box mapped to [-1, 1]
-    octaves : N
-    gains : (N,) weights of the octaves; the paper's are all 1
+    waves : (w, 3) see wave_vectors
+    gains : (w,) weights of the waves; the paper's are all 1
     """
-    if octaves == 0:
-        return p
-    frequency = math.pi * 2.0 ** torch.arange(octaves, dtype=p.dtype, device=p.device)
-    angle = (p[:, None, :] * frequency[:, None]).reshape(-1, 3 * octaves)
-    sine, cosine = angle.sin(), angle.cos()
+    x, y, z = waves.to(p).unbind(-1)
+    # written out, since a matrix product in reduced precision would turn the phases
+    phase = torch.addcmul(torch.addcmul(p[:, :1] * x, p[:, 1:2], y), p[:, 2:], z)
+    sine, cosine = phase.sin(), phase.cos()
     if gains is not None:
-        gain = gains.repeat_interleave(3)
-        sine, cosine = sine * gain, cosine * gain
+        sine, cosine = sine * gains, cosine * gains
     return torch.cat([p, sine, cosine], dim=1)
 
 
 def encode_pullback(
-    encoded: Float[Tensor, "n e"], cotangent: Float[Tensor, "n e"], octaves: int
+    encoded: Float[Tensor, "n e"], cotangent: Float[Tensor, "n e"], waves: Float[Tensor, "w 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Return J^T cotangent, where J = d encode / d p and `encoded` = encode(p).
+    """Return J^T cotangent, where J = d encode / d p and `encoded` = encode(p, waves).
 
-    d sin(w p) = w cos(w p), so the two halves of the encoding are each other's derivative, gains included.
+    d sin(k . p) = k cos(k . p), so the two halves of the encoding are each other's derivative, gains included.
     """
-    if octaves == 0:
-        return cotangent
-    frequency = math.pi * 2.0 ** torch.arange(octaves, dtype=encoded.dtype, device=encoded.device)
-    m = 3 * octaves
-    sine, cosine = encoded[:, 3 : 3 + m], encoded[:, 3 + m :]
-    swirl = cotangent[:, 3 : 3 + m] * cosine - cotangent[:, 3 + m :] * sine
-    return cotangent[:, :3] + (swirl.reshape(-1, octaves, 3) * frequency[:, None]).sum(1)
+    w = len(waves)
+    sine, cosine = encoded[:, 3 : 3 + w], encoded[:, 3 + w :]
+    swirl = cotangent[:, 3 : 3 + w] * cosine - cotangent[:, 3 + w :] * sine
+    with torch.autocast(encoded.device.type, enabled=False):
+        return cotangent[:, :3] + swirl.to(encoded) @ waves.to(encoded)

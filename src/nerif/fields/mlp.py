@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from nerif.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field
-from nerif.fields.encoding import encode, encode_pullback, encoded_width
+from nerif.fields.encoding import check_directions, encode, encode_pullback, encoded_width, wave_vectors
 from nerif.geometry import Box
 
 __all__ = ["ACTIVATIONS", "Network", "NetworkShape", "NeuralField"]
@@ -75,6 +75,8 @@ class NetworkShape:
     """Neurons per hidden layer (paper: 256)."""
     octaves: int = 5
     """N of the sinusoidal encoding; octaves beyond the fifth are weighted down, see Network."""
+    directions: int = 13
+    """That each octave runs along: 3 the axes (the paper's), 9 also the diagonals of a cube's faces, 13 its own too."""
     skip: int = 0
     """The encoding is joined to the output of this layer (paper: 4); 0 for none."""
     head_width: int = 0
@@ -92,6 +94,12 @@ class NetworkShape:
         for name, least in (("depth", 1), ("width", 1), ("octaves", 0), ("skip", 0), ("head_width", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        check_directions(self.directions)
+
+    @classmethod
+    def of(cls, kept: dict[str, Any]) -> NetworkShape:
+        """Return the shape of what a file keeps of it; one that tells no directions is of encodings along the axes."""
+        return cls(**{"directions": 3, **kept})
 
 
 class Network(nn.Module):
@@ -113,22 +121,27 @@ class Network(nn.Module):
 
     gains: Tensor
     bounds: Tensor
+    waves: Tensor
+    octave: Tensor
 
     def __init__(self, shape: NetworkShape, encoded: int = 0, bounds: tuple[float, float] = UNBOUNDED) -> None:
         super().__init__()
         self.shape, self.limits = shape, bounds
         self.register_buffer("bounds", torch.tensor(bounds, dtype=torch.float64))
-        e, w = encoded or encoded_width(shape.octaves), shape.width
+        e, w = encoded or encoded_width(shape.octaves, shape.directions), shape.width
+        waves, octave = wave_vectors(shape.octaves, shape.directions)
+        self.register_buffer("waves", waves, persistent=False)
+        self.register_buffer("octave", octave, persistent=False)
         inputs = [e] + [w + (e if i == shape.skip else 0) for i in range(1, shape.depth + 1)]
         self.layers = nn.ModuleList(nn.Linear(inputs[i], w) for i in range(shape.depth))
         outputs = 4 if shape.gradient_head else 1
         hidden_heads = outputs if shape.head_width else 0
         self.heads = nn.ModuleList(nn.Linear(inputs[-1], shape.head_width) for _ in range(hidden_heads))
         self.outputs = nn.ModuleList(nn.Linear(shape.head_width or inputs[-1], 1) for _ in range(outputs))
-        octave = torch.arange(shape.octaves)
+        k = torch.arange(shape.octaves)
         even = NetworkShape.octaves  # so many count alike; those above would be steeper than the field itself
-        beyond = 4.0 ** -(octave - (even - 1)).clamp(min=0)
-        self.register_buffer("gains", beyond * 2.0 ** (-shape.octave_decay * octave))
+        beyond = 4.0 ** -(k - (even - 1)).clamp(min=0)
+        self.register_buffer("gains", beyond * 2.0 ** (-shape.octave_decay * k))
         if shape.depth > NetworkShape.depth:
             # a signal passes with the strength it has after the layers of the network of reference
             lost = (shape.depth - NetworkShape.depth) / (shape.depth - 1)
@@ -186,11 +199,11 @@ class Network(nn.Module):
 
     def _encode(self, p: Tensor) -> Tensor:
         """What the first layer is given of a point."""
-        return encode(p, self.shape.octaves, self.gains.to(p))
+        return encode(p, self.waves, self.gains[self.octave].to(p))
 
     def _pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
         """From the slope along what the first layer is given to that along x, y, z."""
-        return encode_pullback(encoded, cotangent, self.shape.octaves)
+        return encode_pullback(encoded, cotangent, self.waves)
 
     def _trunk(self, p: Tensor, slopes: list[Tensor]) -> tuple[Tensor, Tensor]:
         activate = ACTIVATIONS[self.shape.activation]

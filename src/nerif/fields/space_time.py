@@ -35,23 +35,23 @@ class SpaceTimeNetwork(Network):
 
     def __init__(self, shape: NetworkShape, time_octaves: int, bounds: tuple[float, float] = UNBOUNDED) -> None:
         self.time_octaves = time_octaves
-        super().__init__(shape, 2 * encoded_width(shape.octaves) + 1 + 2 * time_octaves, bounds)
+        space = encoded_width(shape.octaves, shape.directions)
+        super().__init__(shape, 2 * space + 1 + 2 * time_octaves, bounds)
         self.drift = nn.Parameter(torch.zeros(3))  # half edges of the box per unit of tau
 
     def _encode(self, p: Float[Tensor, "n 4"]) -> Tensor:
         place, tau = p[:, :3], p[:, 3:]
-        octaves = self.shape.octaves
-        gains = self.gains.to(p)
+        waves, gains = self.waves, self.gains[self.octave].to(p)
         angle = math.pi * tau * 2.0 ** torch.arange(self.time_octaves, device=p.device, dtype=p.dtype)
         carried = place - tau * self.drift.to(p)
         return torch.cat(
-            [encode(place, octaves, gains), encode(carried, octaves, gains), tau, angle.sin(), angle.cos()], dim=1
+            [encode(place, waves, gains), encode(carried, waves, gains), tau, angle.sin(), angle.cos()], dim=1
         )
 
     def _pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
-        e, octaves = encoded_width(self.shape.octaves), self.shape.octaves
-        still = encode_pullback(encoded[:, :e], cotangent[:, :e], octaves)
-        return still + encode_pullback(encoded[:, e : 2 * e], cotangent[:, e : 2 * e], octaves)
+        e = encoded_width(self.shape.octaves, self.shape.directions)
+        still = encode_pullback(encoded[:, :e], cotangent[:, :e], self.waves)
+        return still + encode_pullback(encoded[:, e : 2 * e], cotangent[:, e : 2 * e], self.waves)
 
 
 def with_time(p: Float[Tensor, "n 3"], tau: Float[Tensor, " m"] | None) -> Float[Tensor, "n k"]:

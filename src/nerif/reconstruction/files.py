@@ -62,7 +62,7 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         if about["kind"] == "voxels":
             grid = Grid(box, tuple(about["shape"]))
             return VoxelField(tensors["coefficients"], grid, int(about["degree"])), box, n_ambient
-        network = Network(NetworkShape(**about["network"]))
+        network = Network(NetworkShape.of(about["network"]))
         network.load_state_dict(tensors)
         network.eval().requires_grad_(False)
         return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient

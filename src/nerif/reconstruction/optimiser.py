@@ -3,9 +3,9 @@
 Muon steps along the matrix U V^T nearest to the momentum U S V^T, so that each direction of a layer moves alike,
 however small its gradient. What that is worth: benchmarks/results/choices-cpu.md.
 
-A rate is that of the reference, a network of 4 x 128 and five octaves. In another shape each weight has a share of it,
-such that a step changes what a layer gives as much as in the reference, whatever the width (maximal-update
-parametrisation):
+A rate is that of the reference, a network of 4 x 128 and five octaves along the axes. In another shape each weight has
+a share of it, such that a step changes what a layer gives as much as in the reference, whatever the width
+(maximal-update parametrisation):
 
     Muon   |dW|_2 ~ sqrt(fan_out / fan_in)
     Adam   |dW_ij| ~ 1 / fan_in,      biases and first layer ~ 1
@@ -30,7 +30,7 @@ from nerif.reconstruction.update import Update
 __all__ = ["OPTIMISERS", "NetworkOptimiser"]
 
 OPTIMISERS = ("muon", "adam")
-REFERENCE = NetworkShape()
+REFERENCE = NetworkShape(directions=3)
 SPECTRAL = 0.2 * math.sqrt(REFERENCE.width)  # of a square matrix of the reference: the root mean square of Adam's step
 
 
@@ -99,8 +99,8 @@ def muon_share(network: Network, matrix: Tensor) -> float:
     """Return the spectral norm of a step of Muon, in units of its rate."""
     fan_out, fan_in = matrix.shape
     if matrix is network.layers[0].weight:  # its inputs are as many as the octaves ask for, whatever the width
-        octaves = encoded_width(REFERENCE.octaves) / encoded_width(network.shape.octaves)
-        return SPECTRAL * math.sqrt(fan_out / REFERENCE.width * octaves)
+        inputs = [encoded_width(shape.octaves, shape.directions) for shape in (REFERENCE, network.shape)]
+        return SPECTRAL * math.sqrt(fan_out / REFERENCE.width * inputs[0] / inputs[1])
     return SPECTRAL * math.sqrt(fan_out / fan_in)
 
 

@@ -218,7 +218,7 @@ def _checkpoints(path: Path) -> Path:
 
 def _network(attributes: dict[str, Any], scale: float = 1.0) -> Network:
     """An empty network of the kind that a store was made with, for a field in units of `scale`."""
-    shape = NetworkShape(**attributes["network"])
+    shape = NetworkShape.of(attributes["network"])
     low, high = attributes.get("bounds", (None, None))  # JSON knows no infinity
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
     if attributes.get("temporal") == "joint":
