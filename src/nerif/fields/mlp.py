@@ -153,7 +153,7 @@ class Network(nn.Module):
         """Return the scaled index excess."""
         activate = ACTIVATIONS[self.shape.activation]
         h, _ = self._trunk(p, [])
-        return self._bounded(self._head(0, h, activate)[0])[0]
+        return self.bounded(self._head(0, h, activate)[0])[0]
 
     def value_and_gradient(
         self, p: Float[Tensor, "n k"], heads: bool = False
@@ -162,7 +162,7 @@ class Network(nn.Module):
         slopes: list[Tensor] = []
         h, encoded = self._trunk(p, slopes)
         value, cotangent = self._head(0, h, ACTIVATIONS[self.shape.activation])
-        value, slope = self._bounded(value)
+        value, slope = self.bounded(value)
         cotangent = cotangent if slope is None else cotangent * slope[:, None]
         # from here on the reverse pass: cotangent is d value / d (output of the layer)
         to_encoding: Tensor | None = None
@@ -173,7 +173,7 @@ class Network(nn.Module):
             cotangent = (cotangent * slopes[i - 1]) @ _linear(self.layers[i - 1]).weight
         if to_encoding is not None:
             cotangent = cotangent + to_encoding
-        return value, self._pull_back(encoded, cotangent), self._gradient_heads(h) if heads else None
+        return value, self.pull_back(encoded, cotangent), self._gradient_heads(h) if heads else None
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
         """Weights without gains are of networks whose octaves count alike but for octave_decay."""
@@ -183,8 +183,8 @@ class Network(nn.Module):
         self.limits = low, high
         super()._load_from_state_dict(state_dict, prefix, *others)
 
-    def _bounded(self, v: Float[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"] | None]:
-        """The n head within its bounds, and its derivative; None for 1."""
+    def bounded(self, v: Float[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"] | None]:
+        """Return the n head within its bounds, and its derivative; None for 1."""
         if self.limits == UNBOUNDED:
             return v, None
         low, high = self.limits
@@ -197,17 +197,17 @@ class Network(nn.Module):
                 slope = slope - torch.sigmoid(beyond)
         return value.clamp(low, high), slope  # of rounding alone
 
-    def _encode(self, p: Tensor) -> Tensor:
-        """What the first layer is given of a point."""
+    def encode(self, p: Float[Tensor, "n k"]) -> Float[Tensor, "n e"]:
+        """Return what the first layer is given of points."""
         return encode(p, self.waves, self.gains[self.octave].to(p))
 
-    def _pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
-        """From the slope along what the first layer is given to that along x, y, z."""
+    def pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
+        """Return the slope along x, y, z of that along what the first layer is given."""
         return encode_pullback(encoded, cotangent, self.waves)
 
     def _trunk(self, p: Tensor, slopes: list[Tensor]) -> tuple[Tensor, Tensor]:
         activate = ACTIVATIONS[self.shape.activation]
-        encoded = self._encode(p)
+        encoded = self.encode(p)
         h = encoded
         for i, layer in enumerate(self.layers, start=1):
             h, slope = activate(layer(h))

@@ -39,7 +39,7 @@ class SpaceTimeNetwork(Network):
         super().__init__(shape, 2 * space + 1 + 2 * time_octaves, bounds)
         self.drift = nn.Parameter(torch.zeros(3))  # half edges of the box per unit of tau
 
-    def _encode(self, p: Float[Tensor, "n 4"]) -> Tensor:
+    def encode(self, p: Float[Tensor, "n 4"]) -> Tensor:
         place, tau = p[:, :3], p[:, 3:]
         waves, gains = self.waves, self.gains[self.octave].to(p)
         angle = math.pi * tau * 2.0 ** torch.arange(self.time_octaves, device=p.device, dtype=p.dtype)
@@ -48,7 +48,7 @@ class SpaceTimeNetwork(Network):
             [encode(place, waves, gains), encode(carried, waves, gains), tau, angle.sin(), angle.cos()], dim=1
         )
 
-    def _pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
+    def pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
         e = encoded_width(self.shape.octaves, self.shape.directions)
         still = encode_pullback(encoded[:, :e], cotangent[:, :e], self.waves)
         return still + encode_pullback(encoded[:, e : 2 * e], cotangent[:, e : 2 * e], self.waves)

@@ -85,8 +85,7 @@ class Descent:
         # a field to start from makes the coarse grids needless
         first = [level.grid for level in self.levels].index(finest)
         self.level, self.done, self.total = 0 if start is None else first, 0, 0
-        # a weight is sought on the last grid but one, and mended at the end
-        self.choosing = (first - 1, len(self.levels) - 1)
+        self.choosing = (first - 1, first)  # a weight is sought on the last grid but one, and mended on the last
         self.weight = settings.weight
         self.guess: float | None = None
         self.chosen = ""
@@ -133,7 +132,7 @@ class Descent:
         noise = _noise(problem, judge)
         choice = choose_weight(solve, x, noise, self.guess)
         self.guess, self.chosen, self.done = choice.weight, choice.reason, 0
-        if noise is None or self.level == len(self.levels) - 1:
+        if noise is None or self.level == self.choosing[-1]:
             self.weight = choice.weight
         return choice.x
 

@@ -1,6 +1,8 @@
-"""A network evaluated in mixed precision, and compiled where that pays."""
+"""A network evaluated in mixed precision, compiled where that pays, and by layers of one function where that can be."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
@@ -18,7 +20,7 @@ class MixedPrecision:
     Parameters
     ----------
     precision : auto, float32, tf32 or bf16
-    compile : on, off, or auto (on CUDA only)
+    compile : on, off, or auto: on CUDA by PyTorch, on a CPU in float32 by Numba (fused.py)
     """
 
     def __init__(self, network: Network, device: torch.device, precision: str, compile: str) -> None:
@@ -27,6 +29,11 @@ class MixedPrecision:
         self.both = network.value_and_gradient
         if compile == "on" or (compile == "auto" and device.type == "cuda"):
             self.both = torch.compile(network.value_and_gradient, dynamic=True)
+        self.by_layers: Callable[[Network, Tensor], tuple[Tensor, Tensor]] | None = None
+        if compile == "auto" and device.type == "cpu" and _is_plain(network):
+            from nerif.reconstruction.fused import value_and_gradient
+
+            self.by_layers = value_and_gradient
 
     def value(self, p: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
         """Return the n head."""
@@ -37,9 +44,21 @@ class MixedPrecision:
         self, p: Float[Tensor, "n k"], heads: bool
     ) -> tuple[Tensor, Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
         """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
+        if self.by_layers is not None and torch.is_grad_enabled() and not self._is_low:
+            return *self.by_layers(self.network, p), None
         with self._precision():
             return self.both(p, heads)
 
     def _precision(self) -> torch.autocast:
-        bf16 = self.low and self.dtype is not None
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=bf16)
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self._is_low)
+
+    @property
+    def _is_low(self) -> bool:
+        return self.low and self.dtype is not None
+
+
+def _is_plain(network: Network) -> bool:
+    """Whether it is of layers alone, in the precision and with the activation that fused.py has."""
+    shape, dtype = network.shape, network.outputs[0].weight.dtype
+    alone = not (shape.skip or shape.head_width or shape.gradient_head)
+    return alone and shape.activation == "silu" and dtype == torch.float32
