@@ -12,6 +12,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 
@@ -21,13 +22,14 @@ from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory
+from nerif.reconstruction.fused import value_and_gradient
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import add_noise, simulate
 from nerif.volume import Volume
 
 
-def rate(work: Callable[[], None], points: int) -> float:
+def rate(work: Callable[[], object], points: int) -> float:
     """Median of seven timings of `work`, in thousand points a second."""
     work()
     seconds = []
@@ -54,12 +56,33 @@ def steps(network: Network, count: int) -> dict[str, Callable[[], None]]:
             n = network(points).float().reshape(4, -1)
         ((n[0] - n[1]).square() + (n[2] - n[3]).square()).mean().backward()
 
+    def by_layers() -> None:
+        value_and_gradient(network, p)[1].square().mean().backward()
+
     return {
         "exact gradient, float32": lambda: exact(False),
+        "exact gradient, float32, layers in one function": by_layers,
         "exact gradient, bf16": lambda: exact(True),
         "four displaced evaluations, float32": lambda: differences(False),
         "four displaced evaluations, bf16": lambda: differences(True),
     }
+
+
+def limit(network: Network, count: int) -> list[str]:
+    """What a matrix product of the shape of a hidden layer reaches, and how many points a second that would allow."""
+    layers = [weight for weight in network.layers.parameters() if weight.ndim == 2]
+    # a product for the value and one for the slope, and two for the derivative of each; none for that in the points
+    flops = 2 * (6 * sum(w.numel() for w in layers) - layers[0].numel())
+    width, found = layers[-1].shape[0], []
+    for dtype in (torch.float32, torch.bfloat16):
+        x, w = torch.rand(count, width).to(dtype), torch.rand(width, width).to(dtype)
+        speed = rate(partial(torch.mm, x, w), count) * 1e3 * 2 * width**2
+        name = str(dtype).removeprefix("torch.")
+        found.append(
+            f"A product of {count} x {width} by {width} x {width} in {name}: {speed / 1e9:.0f} GFLOP/s; at that, the "
+            f"exact gradient would have {speed / flops / 1e3:.0f} thousand points a second of {flops / 1e3:.0f} kFLOP."
+        )
+    return found
 
 
 def sampling_rates(network: Network, count: int) -> dict[str, float]:
@@ -101,6 +124,7 @@ def main() -> None:
     for k in before:
         table.row([k, f"{before[k]:.0f}", f"{after[k]:.0f}", f"{after[k] / before[k]:.2f}"])
 
+    table.text("", "  \n".join(limit(network, arguments.points)), "")
     cameras, box = paper_rig(arguments.pixels)
     flame = Flame(box)
     grid = Grid.of_resolution(box, 64)
@@ -114,6 +138,10 @@ def main() -> None:
         "equal intervals, one draw each (the paper's sampling)": replace(base, sampling="random"),
         "equal intervals, twice the samples a ray": replace(base, sampling="shifted", samples=(24, 48)),
         "Adam and equal intervals": replace(base, optimiser="adam", sampling="shifted", samples=(24, 48)),
+        "octaves along the axes alone": replace(base, network=replace(base.network, directions=3)),
+        "octaves along nine directions": replace(base, network=replace(base.network, directions=9)),
+        "96 neurons a layer": replace(base, network=replace(base.network, width=96)),
+        "plain network": replace(base, compile="off"),
         "float32 throughout": replace(base, precision="float32"),
         "bf16 throughout": replace(base, full_precision_from=2.0),
         "central differences alone": replace(base, weights=LossWeights(numerical=1, automatic=0)),

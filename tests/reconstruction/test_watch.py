@@ -48,3 +48,9 @@ def test_looking_now_and_then_is_as_good():
 def test_what_is_found_in_part_is_said():
     assert "70%" in followed([0.7] * PATIENCE).remark
     assert followed([0.2] * PATIENCE).remark == ""
+
+
+def test_a_residual_well_above_the_noise_is_said():
+    assert "the residual is 2.0 sigma" in followed([0.04] * PATIENCE, noise=0.01).remark
+    assert followed([0.012] * PATIENCE, noise=0.01).remark == ""
+    assert followed([0.04] * PATIENCE).remark == ""  # where sigma is not known

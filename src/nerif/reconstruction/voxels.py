@@ -39,7 +39,7 @@ COMPILER_BYTES = 1 << 28  # of Numba, whatever the grid (benchmarks/results/voxe
 class VoxelReconstructor(Reconstructor):
     """Settings of every classical method."""
 
-    voxels: int = 100
+    voxels: int = 64
     """Voxels along the longest edge of the box, of the reconstruction and of the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
     """Between voxel centres: cubic B-splines, or trilinear (less accurate, little faster)."""

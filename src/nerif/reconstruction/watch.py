@@ -7,12 +7,14 @@ A network that is stepped too far ends at the empty field, whose gradient is zer
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 __all__ = ["Watch"]
 
 EMPTY = 0.9  # of what can be explained is left: nothing is found
 HALF, LOSS = 0.5, 0.1
+MUCH = 1.5  # sigma, of which noise alone leaves 1
 PATIENCE, LEAST = 200, 50  # steps in which the loss must have fallen; steps after which an end says something
 MEMORY = 0.95  # of the running mean, a step
 
@@ -72,10 +74,22 @@ class Watch:
 
     @property
     def remark(self) -> str:
-        """What to say at the end of a run that found less than half."""
-        if self.since < LEAST or self.left <= HALF:
+        """What to say at the end of a run that found less than half, or left much more than the noise."""
+        if self.since < LEAST:
             return ""
-        return f"; {self.left:.0%} of what was measured, squared and noise apart, is not explained yet"
+        if self.left > HALF:
+            return f"; {self.left:.0%} of what was measured, squared and noise apart, is not explained yet"
+        if self.sigmas > MUCH:
+            return (
+                f"; the residual is {self.sigmas:.1f} sigma: more time or a larger --network.width may take up more, "
+                "unless cameras or sigma are wrong (nerif check)"
+            )
+        return ""
+
+    @property
+    def sigmas(self) -> float:
+        """The residual, rms over sigma; 0 where sigma is not known."""
+        return math.sqrt(self.residual / self.empty / self.noise) if self.noise and self.empty else 0.0
 
     def kept(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""
