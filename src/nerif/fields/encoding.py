@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from contextlib import nullcontext
 
 import torch
 from jaxtyping import Float, Int
@@ -82,5 +83,6 @@ def encode_pullback(
     w = len(waves)
     sine, cosine = encoded[:, 3 : 3 + w], encoded[:, 3 + w :]
     swirl = cotangent[:, 3 : 3 + w] * cosine - cotangent[:, 3 + w :] * sine
-    with torch.autocast(encoded.device.type, enabled=False):
+    kind = encoded.device.type
+    with torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext():
         return cotangent[:, :3] + swirl.to(encoded) @ waves.to(encoded)
