@@ -68,7 +68,7 @@ def main() -> None:
         measurement = add_noise(clean, noise, seed=1)
         if torch.cuda.is_available():
             torch.cuda.reset_peak_memory_stats()
-        settings = replace(preset(name), time_limit=seconds, device=arguments.device)
+        settings = replace(preset(name), time_limit=seconds, epochs=0, device=arguments.device)
         result = settings(measurement, tell)
         m = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
         last = result.history[-1]

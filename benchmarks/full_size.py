@@ -90,7 +90,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     settings = replace(
-        preset(arguments.preset), time_limit=arguments.time_limit, device=arguments.device
+        preset(arguments.preset), time_limit=arguments.time_limit, epochs=0, device=arguments.device
     )
     more = f"; flame, 9 views, noise {arguments.noise:g}"
     table = Table("Cameras of full size", COLUMNS, arguments.write, more)

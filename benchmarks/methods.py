@@ -60,7 +60,7 @@ class Row:
 def rows(arguments: argparse.Namespace) -> list[Row]:
     """All cases, in the order of the table."""
     device = arguments.device
-    nerif = replace(preset(arguments.preset), time_limit=arguments.time_limit, device=device)
+    nerif = replace(preset(arguments.preset), time_limit=arguments.time_limit, epochs=0, device=device)
     found: list[Row] = []
     for phantom in arguments.phantom:
         for noise in arguments.noise:

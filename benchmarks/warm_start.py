@@ -65,7 +65,7 @@ def main() -> None:
     start = tv(measurement)
     add(f"TV {arguments.voxels}³ alone", "-", "-", start.seconds, start.seconds, start.field, start.device)
     for seconds in arguments.seconds:
-        base = replace(preset(arguments.preset), device=arguments.device)
+        base = replace(preset(arguments.preset), epochs=0, device=arguments.device)
         cold = replace(base, time_limit=seconds)(measurement)
         add("nothing", "-", "-", 0, seconds, cold.field, cold.device)
         if seconds <= start.seconds + 1:

@@ -29,7 +29,8 @@ from nerif.volume_file import read_volume
 TINY = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]
 QUICK = [
     "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--network.directions", "3",
-    "--max-steps", "40", "--samples", "12", "16", "--sample-jitter", "2", "--points-per-batch", "600", "--voxels", "12", "--device", "cpu",
+    "--max-steps", "40", "--samples", "12", "16", "--sample-jitter", "2", "--points-per-batch", "600",
+    "--voxels", "12", "--device", "cpu",
     "--precision", "float32",
 ]  # fmt: skip
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from nerif.conventions import InputError
 from nerif.fields.encoding import encode, encode_pullback, encoded_width, wave_vectors
 from nerif.fields.mlp import ACTIVATIONS, Network, NetworkShape, NeuralField
 from nerif.geometry import Box
+from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.reconstruction.files import FIELD, read_field, write_field
 from nerif.reconstruction.presets import PRESETS
 
 BASE = NetworkShape(depth=3, width=11, octaves=2, skip=2, head_width=5, gradient_head=True)
@@ -126,3 +131,19 @@ def test_shapes_that_cannot_be_right(change):
 def test_gradient_heads_that_do_not_exist_cannot_be_asked():
     with pytest.raises(InputError, match="gradient_head"):
         network(SHAPES["value only"]).value_and_gradient(torch.zeros(1, 3, dtype=torch.float64), heads=True)
+
+
+def test_a_field_kept_before_there_were_directions_reads_as_it_was(tmp_path):
+    """Its header has none, and its first layer the width of an encoding along the axes."""
+    box = Box.cube(2.0)
+    field = NeuralField(Network(NetworkShape(depth=1, width=4, octaves=2, directions=3)), box, 1e-4)
+    field.network.requires_grad_(False)
+    result = Reconstruction(field, box, 1.00027, [], Outcome("steps", ""), {})
+    write_field(tmp_path, result)
+    path = tmp_path / FIELD
+    with safe_open(path, framework="pt") as file:
+        about, tensors = json.loads(file.metadata()["nerif"]), {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+    assert about["network"].pop("directions") == 3
+    save_file(tensors, path, metadata={"nerif": json.dumps(about)})
+    points = torch.rand(20, 3)
+    assert torch.equal(read_field(tmp_path)[0](points), field(points))

@@ -11,14 +11,18 @@ import torch
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import NetworkShape
-from nerif.geometry import Grid
+from nerif.geometry import Grid, paper_rig
+from nerif.measurement import measurement_of
 from nerif.reconstruction import objective
+from nerif.reconstruction.base import Step
 from nerif.reconstruction.convergence import Cycles
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import add_noise
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.interferometry import Interferometry
 from nerif.volume import Volume
 
 ENDLESS = NeRIF(
@@ -46,6 +50,8 @@ def test_cycles_double_until_one_gains_next_to_nothing():
     assert cycles([1.010, 1.008]) == ([100, 200], "converged")  # a fifth of the excess, but within the scatter
     assert cycles([5.0, 4.8], noise=0.0)[1] == "converged"
     assert cycles([5.0, 3.0], longest=350)[1] == "time_limit"  # the next would not be as long as the last
+    assert cycles([2.0**-i for i in range(6)], noise=0.0)[1] == "converged"  # for there are no more cycles
+    assert cycles([0.0, 0.0], noise=0.0)[1] == "converged"
 
 
 def test_a_cycle_ends_in_time():
@@ -95,7 +101,10 @@ def test_a_run_without_a_limit_converges_and_goes_on_where_it_was(measurement, b
     points = torch.rand(50, 3)
     assert torch.equal(again.field(points), whole.field(points))
     assert [r["held_back"] for r in again.history if "held_back" in r] == judged
-    assert ENDLESS(measurement, resume=whole.state).outcome.reason == "converged"
+    told = ENDLESS(measurement, resume=whole.state)
+    assert told.outcome.message == whole.outcome.message
+    assert len(told.history) == len(whole.history)
+    assert torch.equal(told.field(points), whole.field(points))
 
 
 def test_the_longest_time_ends_it(measurement):
@@ -105,17 +114,52 @@ def test_the_longest_time_ends_it(measurement):
     assert 0.4 < result.seconds < 10
 
 
-def test_the_best_cycle_is_kept(measurement, monkeypatch):
-    """A cycle that the rays held back like less than the one before gives it back."""
-    errors, fields = iter([2.0, 3.0]), []
+def test_more_time_goes_on_with_the_next_cycle(measurement):
+    short = replace(ENDLESS, longest=0.5, first_cycle=10**6)(measurement)
+    again = replace(ENDLESS, longest=2.0, first_cycle=10**6)(measurement, resume=short.state)
+    assert again.outcome.reason == "time_limit"
+    assert again.history[-1]["step"] > short.history[-1]["step"]
+    limited = replace(ENDLESS, max_steps=20)(measurement)
+    endless = replace(ENDLESS, first_cycle=10)(measurement, resume=limited.state)
+    first = next(record for record in endless.history if "held_back" in record)
+    assert first["step"] == 30
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_the_best_cycle_is_kept(measurement, monkeypatch, interrupted):
+    """A cycle that the rays held back like less than the one before gives it back, one that was broken off too."""
+    errors, fields = iter([2.0, 3.0, 3.0, 3.0]), []
     monkeypatch.setattr(objective.Objective, "held_back", lambda self: next(errors))
-    points = torch.rand(50, 3)
     settings = replace(ENDLESS, first_cycle=20)
-    whole = settings(measurement, lambda s: fields.append(s.capture()) if s.step == 20 else None)
+
+    def watch(step: Step) -> bool:
+        if step.step == 20:
+            fields.append(step.capture())
+        return interrupted and step.step == 30
+
+    result = settings(measurement, watch)
+    if interrupted:
+        assert result.outcome.reason == "interrupted"
+        result = settings(measurement, resume=result.state)
+    assert result.outcome.reason == "converged"
     kept = {k.removeprefix("network."): v for k, v in fields[0].tensors.items() if k.startswith("network.")}
-    found = whole.field.network.state_dict()
+    found = result.field.network.state_dict()
     assert all(torch.equal(found[k], v) for k, v in kept.items())
-    assert bool(torch.isfinite(whole.field(points)).all())
+
+
+def test_pixels_are_held_back_of_every_technique_where_the_box_is_seen():
+    """Of a technique with a few pixels in one view some are, and none of those beside the box."""
+    cameras, box = paper_rig(60)
+    fringes = torch.full((2, 60, 60, 1), torch.nan)
+    fringes[0, 28:31, 30:40] = 1.0
+    seen = {Deflection: torch.ones(2, 60, 60, 2), Interferometry: fringes}
+    both = measurement_of(seen, cameras[:2], replace(box, lower=(-9.0,) * 3, upper=(9.0,) * 3), 1.00027, 532.0)
+    rest, held = hold_back(both, 1)
+    assert bool((held.usable <= held.sees_box).all())
+    for observation in held.observations:
+        assert bool(held.usable_for(observation).any())
+    for observation in rest.observations:
+        assert bool(rest.usable_for(observation).any())
 
 
 @pytest.mark.parametrize(("setting", "value"), [("longest", 0.0), ("first_cycle", 0), ("longest", math.nan)])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from contextlib import nullcontext
 
 import torch
 from jaxtyping import Float, Int
@@ -83,6 +82,5 @@ def encode_pullback(
     w = len(waves)
     sine, cosine = encoded[:, 3 : 3 + w], encoded[:, 3 + w :]
     swirl = cotangent[:, 3 : 3 + w] * cosine - cotangent[:, 3 + w :] * sine
-    kind = encoded.device.type
-    with torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext():
-        return cotangent[:, :3] + swirl.to(encoded) @ waves.to(encoded)
+    # written out as well, so that no product is rounded
+    return cotangent[:, :3] + torch.stack([(swirl * k).sum(dim=1) for k in waves.to(encoded).T], dim=1)

@@ -52,16 +52,16 @@ def inertial_scalar(box: Box, seed: int, shortest: float = SHORTEST) -> VoxelFie
 
 
 class TurbulentPlume(Field):
-    """A hot plume that is turbulent down to the pixel: n - n_ambient = -A exp(-r^2 / (2 w^2)) (1 + b g) / (1 + 2 b).
+    """A hot plume that is turbulent down to the pixel: n - n_ambient = -A exp(-r^2 / (2 w^2)) (1 + tanh(b g)) / 2.
 
     Parameters
     ----------
     box : Box, mm
     seed, shortest : of the turbulence g, see `inertial_scalar`
-    contrast : A, index excess lost where g is two standard deviations up
+    contrast : A, the most index that is lost
     """
 
-    width, intensity = 0.13, 0.4  # w in shortest edges; b
+    width, intensity = 0.13, 0.6  # w in shortest edges; b
 
     def __init__(self, box: Box, seed: int = 0, shortest: float = SHORTEST, contrast: float = 2.2e-4) -> None:
         self.box, self.contrast, self.scalar = box, contrast, inertial_scalar(box, seed, shortest)
@@ -70,10 +70,10 @@ class TurbulentPlume(Field):
         g, slope = self.scalar.value_and_gradient(points)
         across, inverse = _across(points, self.box), (self.width * min(self.box.edges)) ** -2
         envelope = torch.exp(-0.5 * inverse * across.square().sum(-1))
-        size = -self.contrast / (1 + 2 * self.intensity)
-        f = 1 + self.intensity * g
-        gradient = self.intensity * slope - (inverse * f)[..., None] * across
-        return size * envelope * f, (size * envelope)[..., None] * gradient
+        mixed = torch.tanh(self.intensity * g)
+        f, steep = 0.5 * (1 + mixed), 0.5 * self.intensity * (1 - mixed.square())
+        gradient = steep[..., None] * slope - (inverse * f)[..., None] * across
+        return -self.contrast * envelope * f, (-self.contrast * envelope)[..., None] * gradient
 
 
 class Fire(Field):

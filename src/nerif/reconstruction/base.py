@@ -66,7 +66,7 @@ class Step:
     ----------
     step, epoch : counts; epoch in passes over all rays
     seconds : spent so far, earlier runs included
-    progress : 0 at the start, 1 at the end
+    progress : 0 at the start, 1 at the end; of a run that may end early, 1 at the latest end
     losses : the terms by name
     rays_per_second : 1/s
     capture : gives the State to resume from

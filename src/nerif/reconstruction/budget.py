@@ -90,9 +90,10 @@ class Budget:
             return Outcome("epochs", f"all {settings.epochs:g} epochs done")
         if settings.max_steps and self.step >= settings.max_steps:
             return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may give more")
-        if settings.time_limit and self.seconds >= settings.time_limit:
-            return Outcome("time_limit", f"time limit of {settings.time_limit:g} s reached; more time may give more")
-        return None
+        limit = settings.time_limit or (self.cycles.longest if self.cycles is not None else math.inf)
+        if self.seconds >= limit:
+            return Outcome("time_limit", f"time limit of {limit:g} s reached; more time may give more")
+        return None if self.cycles is None else self.cycles.outcome
 
     def recount(self, rays: int) -> None:
         """Count passes over another number of rays from now on."""
@@ -111,5 +112,5 @@ class Budget:
         """Go on from what a checkpoint kept."""
         self.step, self.rays_done = int(used["step"]), int(used["rays_done"])
         self._before, self._began = float(used["seconds"]), time.perf_counter()
-        if self.cycles is not None and "cycles" in used:
-            self.cycles.restore(used["cycles"])
+        if self.cycles is not None:  # a run that had a limit begins a cycle where it is
+            self.cycles.restore(used.get("cycles", {"step": self.step, "seconds": self._before}))

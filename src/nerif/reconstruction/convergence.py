@@ -4,7 +4,7 @@ A run goes in cycles, each twice as long as the one before. Each ends with the s
 reached can be compared with what the last one did; e is the mean square of the residual on the rays held back, over
 sigma, of which the noise is 1:
 
-    e_before - e < max(FALL (e - 1), SCATTER)      the run has converged
+    e_before - e <= max(FALL (e - 1), SCATTER e)      the run has converged
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ __all__ = ["Cycles"]
 
 FALL = 0.08  # of what is above the noise: a doubling that gains less leaves 5 % of the error, its root, to the next two
 SCATTER = 0.003  # of e itself: so much is chance
+MOST = 6  # cycles
 
 
 class Cycles:
@@ -33,6 +34,7 @@ class Cycles:
         self.length, self.longest = first, longest
         self.step, self.seconds = 0, 0.0  # at which the present one began
         self.errors: list[float] = []
+        self.verdict = ""  # why the run has converged, when it has
 
     def progress(self, step: int, seconds: float) -> float:
         """0 at the start of the present cycle, 1 at its end."""
@@ -49,13 +51,21 @@ class Cycles:
         step, seconds : done so far
         """
         before, self.errors = (self.errors[-1] if self.errors else math.inf), [*self.errors, error]
-        left = f"rays held back are met to {math.sqrt(error):.3g}{' sigma' if noise else ''}"
-        if before - error < max(FALL * (error - noise), SCATTER * error):
-            return Outcome("converged", f"{left}, and {self.length} steps more gained next to nothing")
-        if seconds + (seconds - self.seconds) > self.longest:
+        length, taken = self.length, seconds - self.seconds
+        self.step, self.seconds, self.length = step, seconds, 2 * length
+        left = f"rays held back are met to {math.sqrt(min(self.errors)):.3g}{' sigma' if noise else ''}"
+        if before - error <= max(FALL * (error - noise), SCATTER * error):
+            self.verdict = f"{left}, and {length} steps more gained next to nothing"
+        elif len(self.errors) == MOST:
+            self.verdict = f"{left} after {MOST} cycles, the most there are"
+        elif seconds + taken > self.longest:
             return Outcome("time_limit", f"{left} after {seconds:.0f} s; --time-limit {4 * seconds:.0f} may give more")
-        self.step, self.seconds, self.length = step, seconds, 2 * self.length
-        return None
+        return self.outcome
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """That of a run that has converged."""
+        return Outcome("converged", self.verdict) if self.verdict else None
 
     @property
     def best(self) -> bool:
@@ -64,7 +74,7 @@ class Cycles:
 
     def kept(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""
-        return {name: getattr(self, name) for name in ("length", "step", "seconds", "errors")}
+        return {name: getattr(self, name) for name in ("length", "step", "seconds", "errors", "verdict")}
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Go on from what a checkpoint kept."""

@@ -85,7 +85,8 @@ class Descent:
         # a field to start from makes the coarse grids needless
         first = [level.grid for level in self.levels].index(finest)
         self.level, self.done, self.total = 0 if start is None else first, 0, 0
-        self.choosing = (first - 1, first)  # a weight is sought on the last grid but one, and mended on the last
+        # a weight is sought on the last grid but one and mended on the last; where there is no other, sought at the end
+        self.choosing = (first - 1, first if first and start is None else len(self.levels) - 1)
         self.weight = settings.weight
         self.guess: float | None = None
         self.chosen = ""
@@ -278,6 +279,8 @@ class Descent:
             setattr(self, name, value)
         if self.settings.weight is not None:
             self.weight = self.settings.weight
+        elif self.level > self.choosing[-1] and self.weight is None:
+            self.weight = self.guess
 
     def _outcome(self, converged: bool) -> Outcome:
         chosen = f"; weight {self.weight:.3g}: {self.chosen}" if self.settings.weight is None else ""

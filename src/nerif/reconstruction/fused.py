@@ -24,6 +24,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from nerif.fields.mlp import Network
+from nerif.reconstruction.device import share_threads
 
 __all__ = ["value_and_gradient"]
 
@@ -69,6 +70,7 @@ class _Layers(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, out: Tensor, shift: Tensor, *layers: Tensor) -> tuple[Tensor, Tensor]:
         """Return v (n) and c_0 (n, e) of h_0 (n, e)."""
+        share_threads()
         weights, biases = layers[::2], layers[1::2]
         n, depth, width = len(x), len(weights), weights[0].shape[0]
         a, s, h, d, c, u = (x.new_empty(depth, n, width) for _ in range(6))
@@ -92,6 +94,7 @@ class _Layers(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *derivatives: Tensor) -> tuple[Tensor | None, ...]:
         """Return the derivatives in h_0, w, b, W_1, b_1, ..."""
+        share_threads()
         g, e = derivatives
         x, out, *weights, a, s, h, d, c, u = ctx.saved_tensors
         n, depth = len(x), len(weights)

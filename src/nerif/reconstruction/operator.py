@@ -13,6 +13,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.geometry import Grid, Rays
+from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.planes import Bundle
 from nerif.techniques.base import ForwardModel
 
@@ -215,9 +216,7 @@ def _compiled_spread(degree: int, seen: Tensor, path: Sequence[Tensor], shape: S
 
 def _compiled() -> ModuleType:
     """The compiled kernels, with as many threads as torch uses."""
-    import numba
-
     from nerif.reconstruction import kernels_numba
 
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+    share_threads()
     return kernels_numba

@@ -75,7 +75,7 @@ class TrainingSettings(Reconstructor):
     time_limit: float = 0.0
     """Stop after so many seconds; 0 for no limit."""
     longest: float = 600.0
-    """Seconds after which a run without a limit ends, whether more would bring anything or not."""
+    """Seconds after which a run without a limit ends, whether more would bring anything or not (no frame of a film)."""
     first_cycle: int = 400
     """Steps after which a run without a limit first asks whether more would; then after each twice as many."""
     stop_ratio: float = 0.0
@@ -89,7 +89,7 @@ class TrainingSettings(Reconstructor):
     open_faces: tuple[str, ...] = ()
     """Faces through which flow leaves the box; rays that cross them are dropped."""
     seed: int = 0
-    """Of weights and samples; makes a CPU run repeatable."""
+    """Of weights and samples; makes a CPU run repeatable that no clock ends."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda, cuda:1, ..."""
     precision: str = "auto"
@@ -97,7 +97,7 @@ class TrainingSettings(Reconstructor):
     full_precision_from: float = 0.85
     """Share of the run after which bf16 gives way to float32."""
     compile: str = "auto"
-    """Compile the network: on, off, or auto (on CUDA only)."""
+    """Compile the network: on, off, or auto, on CUDA by PyTorch and its layers on a CPU in float32 by Numba."""
 
     def __post_init__(self) -> None:
         for name, allowed in CHOICES.items():

@@ -42,13 +42,14 @@ def hold_back(measurement: Measurement, edge: int) -> tuple[Measurement, Measure
     ----------
     edge : of the bins that the rest is averaged in, px; a block is as large at least
     """
-    usable = [measurement.usable_for(observation) for observation in measurement.observations]
+    usable = [measurement.usable_for(observation) & measurement.sees_box for observation in measurement.observations]
     views, height, width = usable[0].shape
     size = max(edge, BLOCK)
     total = sum(int(mask.sum()) for mask in usable)
     share = min(max(HELD_BACK, FEWEST / total), MOST / total, LARGEST)
     blocks = torch.rand(views, -(-height // size), -(-width // size), generator=torch.Generator().manual_seed(0))
     held = (blocks < share).repeat_interleave(size, 1).repeat_interleave(size, 2)[:, :height, :width]
+    held &= torch.stack(usable).any(dim=0)
     for mask in usable:
         left, own = (mask & ~held).flatten(1).any(dim=1), mask.flatten(1).any(dim=1)
         held &= (left | ~own)[:, None, None]
@@ -58,7 +59,7 @@ def hold_back(measurement: Measurement, edge: int) -> tuple[Measurement, Measure
             if int(count.max()) < 2:
                 return measurement, None
             richest = int(count.argmax())
-            row, column = mask[richest].nonzero()[0].tolist()
+            row, column = mask[richest].nonzero()[int(count.max()) // 2].tolist()
             held[richest, row, column] = True
     valid = torch.ones_like(held) if measurement.valid is None else measurement.valid
     some = (measurement.usable & held).flatten(1).any(dim=1)

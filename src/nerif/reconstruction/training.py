@@ -89,6 +89,7 @@ class Training:
         self.edge, self.settled = data.coarsest, data.coarsest == 1
         self.watch = Watch(data.noise)
         self.retries, self.rate = 0, 1.0
+        self.drawn = 0  # rays, counted through bins of any size
         self.best: dict[str, Tensor] = {}  # weights at the end of the best cycle
         self.initial_loss, self.running = float("nan"), float("nan")
         if resume is not None:
@@ -102,7 +103,9 @@ class Training:
 
     def run(self, on_step: OnStep | None = None) -> Reconstruction:
         """Train until something says stop, and return what there is."""
-        settings, budget, outcome = self.settings, self.budget, self._outcome() or self._fit(on_step)
+        settings, budget, outcome = self.settings, self.budget, None
+        self.budget.agree()
+        outcome = budget.exhausted() or self._fit(on_step)
         clock, rays_then = time.perf_counter(), budget.rays_done
         while outcome is None:
             self._agree()
@@ -120,7 +123,7 @@ class Training:
             self.ranks.average_gradients(self.field.network, mine, whole)
             self.optimiser.step({"adam": rate, "muon": rate * settings.matrix_rate})
             budget.step += 1
-            outcome = self._outcome()
+            outcome = self._judge() or self._outcome()
             if self.device.type == "cuda" and budget.step % LOG_EVERY and outcome is None:
                 continue  # looking at a number waits for the GPU, so look now and then
             found = (*terms.values(), loss, self.objective.of_nothing(pieces))
@@ -139,7 +142,7 @@ class Training:
                 self._log({**values, "rays_per_second": speed})
             if budget.step % KEEP_EVERY == 0 and self.watch.healthy and self._finite():
                 self.good = self._capture()
-            if self._asked(on_step, self._tell(values, speed)) and outcome is None:
+            if self._asked(on_step, self._tell(values, speed, outcome is not None)) and outcome is None:
                 outcome = Outcome("interrupted", "stopped on request; --resume goes on from here")
         return self._result(outcome)
 
@@ -189,13 +192,14 @@ class Training:
         rays = objective.rays(samples)
         index = shuffled(budget.rays_done, rays, len(self.data), self.settings.seed)
         budget.rays_done += rays
+        self.drawn += rays
         if self.settings.sampling == "adaptive" and budget.step and budget.step % DENSITY_EVERY == 0:
             objective.look()
         return objective.batch(index, samples)
 
     def _settle(self) -> None:
         """Go on with the smallest bins of which the rest of the run can see all."""
-        left, rays, edge = self.budget.left(self.budget.rays_done), len(self.data), self.edge
+        left, rays, edge = self.budget.left(self.drawn), len(self.data), self.edge
         while edge > 1 and 4 * rays <= left:
             edge, rays = edge // 2, 4 * rays
         self.settled = True
@@ -222,25 +226,27 @@ class Training:
 
     def _outcome(self) -> Outcome | None:
         """Why the run is over, if it is."""
-        outcome, share = self.budget.exhausted() or self._judge(), self.settings.stop_ratio
+        outcome, share = self.budget.exhausted(), self.settings.stop_ratio
         if outcome is None and share and self.running <= share * self.initial_loss:
             return Outcome("converged", f"loss fell to {share:g} of its initial value")
         return outcome
 
     def _judge(self) -> Outcome | None:
-        """At the end of a cycle, what the rays held back say of going on; what the best cycle found is kept."""
+        """At the end of a cycle, what the rays held back say of going on; the weights of the best are kept."""
         budget, cycles, held = self.budget, self.budget.cycles, self.data.held_back
         if cycles is None or budget.progress < 1:
             return None
-        error = self.running**2 if held is None else self.objective.held_back()
-        (error,) = self.ranks.decided([error], self.device)
+        (error,) = self.ranks.decided([self._error()], self.device)
         outcome = cycles.judge(error, float(held is not None and held.sigma_known), budget.step, budget.seconds)
         self._log({"held_back": math.sqrt(error)})
         if cycles.best:
             self.best = self._weights()
-        elif self.best:
-            self.field.network.load_state_dict(self.best)
+        self.settled = self.edge == 1  # the pace is better known now
         return outcome
+
+    def _error(self) -> float:
+        """The mean square of the residual on rays held back; where there are none, the running mean of the loss."""
+        return self.running**2 if self.data.held_back is None else self.objective.held_back()
 
     def _weights(self) -> dict[str, Tensor]:
         return {name: value.detach().clone() for name, value in self.field.network.state_dict().items()}
@@ -289,9 +295,9 @@ class Training:
     def _log(self, values: dict[str, float]) -> None:
         self.history.append({**self.budget.where(), **values})
 
-    def _tell(self, values: dict[str, float], speed: float) -> Step:
+    def _tell(self, values: dict[str, float], speed: float, over: bool = False) -> Step:
         budget = self.budget
-        progress = min(budget.share, 1.0)
+        progress = 1.0 if over else min(budget.share, 1.0)
         return Step(budget.step, budget.epoch, budget.seconds, progress, values, speed, self._capture)
 
     def _capture(self) -> State:
@@ -300,7 +306,8 @@ class Training:
         tensors["generator"] = self.generator.get_state().clone()
         if self.objective.density.values is not None:
             tensors["density"] = self.objective.density.values.clone()
-        names = ("retries", "rate", "initial_loss", "running", "settled")
+        tensors |= {f"best.{k}": v.clone() for k, v in self.best.items()}
+        names = ("retries", "rate", "initial_loss", "running", "settled", "drawn")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
         scalars |= {"scale": self.field.scale, "offset": self.field.offset}
         kept = {"budget": self.budget.used(), "history": list(self.history), "fingerprint": self.data.fingerprint}
@@ -310,10 +317,14 @@ class Training:
         tensors, scalars = state.tensors, {k: v for k, v in state.scalars.items() if k != "fingerprint"}
         try:
             network = {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}
+            self.best = {k[5:]: v for k, v in tensors.items() if k.startswith("best.")}
             self.field.network.load_state_dict(network)
             self.field.scale, self.field.offset = float(scalars.pop("scale")), float(scalars.pop("offset"))
         except (RuntimeError, KeyError):
-            raise InputError("resume: the checkpoint is of another network; give the same settings") from None
+            raise InputError(
+                "resume: the checkpoint is of another network; give the same settings (of a run of a version before "
+                "--network.directions there are 3)"
+            ) from None
         self.optimiser.restore({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser.")})
         self.generator.set_state(tensors["generator"])
         density = tensors.get("density")
@@ -329,7 +340,11 @@ class Training:
             setattr(self, name, value)
 
     def _result(self, outcome: Outcome) -> Reconstruction:
-        state = self._capture()
+        state, cycles = self._capture(), self.budget.cycles
+        if cycles is not None and self.best:
+            (error,) = self.ranks.decided([self._error()], self.device)
+            if not error <= min(cycles.errors):  # or it is none
+                self.field.network.load_state_dict(self.best)
         if not outcome.failed:
             again = f"; taken back {self.retries} time(s) to the last good state" if self.retries else ""
             outcome = Outcome(outcome.reason, outcome.message + again + self.watch.remark)

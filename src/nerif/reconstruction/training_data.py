@@ -7,11 +7,13 @@ and of each point as well: tau in [-1, 1].
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import suppress
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 from nerif.measurement import Measurement
@@ -108,9 +110,11 @@ class FrameData(TrainingData):
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
         if judged:
-            self.measurement, held = hold_back(measurement, self.coarsest)
-            if held is not None:
-                self.held_back = Target.of(held, settings.open_faces, model=settings.model).to(self.device)
+            rest, held = hold_back(measurement, self.coarsest)
+            with suppress(InputError):  # all that would be held back crosses an open face
+                if held is not None:
+                    self.held_back = Target.of(held, settings.open_faces, model=settings.model).to(self.device)
+                    self.measurement = rest
         self.refine(self.coarsest)
 
     def refine(self, edge: int) -> None:

@@ -33,7 +33,7 @@ def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Ax
     known = {name for record in history for name in record}
     across = "seconds" if "seconds" in known else "step"
     aside = {"step", "epoch", "seconds", "rays_per_second", "learning_rate", "samples", "weight", "voxels", "iteration"}
-    aside |= {"taken_back", "fit_step", "bin_edge"}
+    aside |= {"taken_back", "fit_step", "bin_edge", "held_back"}
     names = [n for n in dict.fromkeys(n for record in history for n in record) if n not in aside]
     colours = [*COLOURS.values()]
     drawn = 0
