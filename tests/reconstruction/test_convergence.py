@@ -13,7 +13,7 @@ from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Grid, paper_rig
 from nerif.measurement import measurement_of
-from nerif.reconstruction import objective
+from nerif.reconstruction import convergence, objective
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.convergence import Cycles
 from nerif.reconstruction.files import read_state, write_state
@@ -88,7 +88,8 @@ def test_a_single_pixel_is_held_back_of_a_few_and_none_of_single_ones(measuremen
     assert torch.equal(rest.usable.flatten(1).sum(dim=1), torch.ones(len(measurement.names), dtype=torch.long))
 
 
-def test_a_run_without_a_limit_converges_and_goes_on_where_it_was(measurement, ball, tmp_path):
+def test_a_run_without_a_limit_converges_and_goes_on_where_it_was(measurement, ball, tmp_path, monkeypatch):
+    monkeypatch.setattr(convergence, "MOST", 3)
     measurement, states = add_noise(measurement, 0.3, seed=3), {}
     whole = ENDLESS(measurement, lambda s: states.__setitem__(s.step, s.capture()) if s.step == 90 else None)
     assert whole.outcome.reason == "converged"
