@@ -41,7 +41,9 @@ class Cycles:
         left = self.longest - self.seconds
         return max((step - self.step) / self.length, (seconds - self.seconds) / left if left > 0 else 1.0)
 
-    def judge(self, error: float, noise: float, step: int, seconds: float) -> Outcome | None:
+    def judge(
+        self, error: float, noise: float, step: int, seconds: float, judged: str = "rays held back are"
+    ) -> Outcome | None:
         """Take in how well the rays held back are met at the end of a cycle; begin the next, or say why there is none.
 
         Parameters
@@ -49,11 +51,12 @@ class Cycles:
         error : mean square of the residual on the rays held back
         noise : what of it is noise; 0 where that is not known
         step, seconds : done so far
+        judged : whose error it is, for the message
         """
         before, self.errors = (self.errors[-1] if self.errors else math.inf), [*self.errors, error]
         length, taken = self.length, seconds - self.seconds
         self.step, self.seconds, self.length = step, seconds, 2 * length
-        left = f"rays held back are met to {math.sqrt(min(self.errors)):.3g}{' sigma' if noise else ''}"
+        left = f"{judged} met to {math.sqrt(min(self.errors)):.3g}{' sigma' if noise else ''}"
         if before - error <= max(FALL * (error - noise), SCATTER * error):
             self.verdict = f"{left}, and {length} steps more gained next to nothing"
         elif len(self.errors) == MOST:

@@ -103,8 +103,8 @@ class Training:
 
     def run(self, on_step: OnStep | None = None) -> Reconstruction:
         """Train until something says stop, and return what there is."""
-        settings, budget, outcome = self.settings, self.budget, None
-        self.budget.agree()
+        settings, budget = self.settings, self.budget
+        budget.agree()
         outcome = budget.exhausted() or self._fit(on_step)
         clock, rays_then = time.perf_counter(), budget.rays_done
         while outcome is None:
@@ -237,7 +237,9 @@ class Training:
         if cycles is None or budget.progress < 1:
             return None
         (error,) = self.ranks.decided([self._error()], self.device)
-        outcome = cycles.judge(error, float(held is not None and held.sigma_known), budget.step, budget.seconds)
+        known = held is not None and held.sigma_known
+        judged = "what was measured is" if held is None else "rays held back are"
+        outcome = cycles.judge(error, float(known), budget.step, budget.seconds, judged)
         self._log({"held_back": math.sqrt(error)})
         if cycles.best:
             self.best = self._weights()
