@@ -126,7 +126,7 @@ def test_rates_follow_the_width(width):
         parts = [zip(part.weights, part.shares, strict=True) for part in optimiser.parts.values()]
         return {names[id(p)]: share for part in parts for p, share in part}
 
-    wide, reference = shares(NetworkShape(width=width), "muon"), shares(NetworkShape(), "muon")
+    wide, reference = (shares(NetworkShape(width=some), "muon") for some in (width, 128))
     assert wide["layers.1.weight"] == pytest.approx(reference["layers.1.weight"])  # square: the same spectral norm
     assert wide["layers.0.weight"] / reference["layers.0.weight"] == pytest.approx((width / 128) ** 0.5)
     assert wide["outputs.0.weight"] / reference["outputs.0.weight"] == pytest.approx(128 / width)

@@ -71,7 +71,7 @@ class NetworkShape:
 
     depth: int = 4
     """Hidden layers before the heads (paper: 7)."""
-    width: int = 128
+    width: int = 96
     """Neurons per hidden layer (paper: 256)."""
     octaves: int = 5
     """N of the sinusoidal encoding; octaves beyond the fifth are weighted down, see Network."""

@@ -30,7 +30,7 @@ from nerif.reconstruction.update import Update
 __all__ = ["OPTIMISERS", "NetworkOptimiser"]
 
 OPTIMISERS = ("muon", "adam")
-REFERENCE = NetworkShape(directions=3)
+REFERENCE = NetworkShape(width=128, directions=3)
 SPECTRAL = 0.2 * math.sqrt(REFERENCE.width)  # of a square matrix of the reference: the root mean square of Adam's step
 
 

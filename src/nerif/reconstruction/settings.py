@@ -63,7 +63,7 @@ class TrainingSettings(Reconstructor):
     """Muon's learning rate, in units of Adam's."""
     momentum: float = 0.9
     """Muon's."""
-    warm_up: int = 50
+    warm_up: int = 15
     """Steps over which the learning rate rises, at most a sixth of max_steps; with the cosine schedule."""
     schedule: str = "cosine"
     """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
