@@ -1,4 +1,4 @@
-"""The drawings of docs/conventions.md and docs/method.md, as SVG: `python docs/drawings.py FOLDER`.
+"""The drawings of docs/conventions.md, docs/method.md and docs/pixels.md, as SVG: `python docs/drawings.py FOLDER`.
 
 What they show is computed by nerif itself: camera axes, pixels and rays by `Camera`, voxel centres by `Grid`, the
 displacement by warping dots as its definition says. A convention that changed would change the drawing.
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -20,7 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
-from nerif.geometry import Box, Camera, Grid, Ring
+from nerif.geometry import Box, Camera, Grid, Lens, Ring
 
 __all__ = ["DRAWINGS", "draw_all"]
 
@@ -395,11 +396,45 @@ def lever_arm() -> Figure:
     return figure
 
 
+def cone() -> Figure:
+    """What a pixel sees through the whole of its lens, by the rays of a camera with one."""
+    figure, axes = panel()
+    ring = Ring(views=1, arc=(180, 180), distance=55, background_distance=45, focal_length=50, image_size=(1, 1))
+    camera = replace(ring.cameras()[0], lens=Lens(22.0))
+    rays = camera.rays(torch.zeros(1, 2, dtype=torch.float64)).clip(Box.cube(24))
+    shares = torch.linspace(-1, 1, 7, dtype=torch.float64)
+    turn = rays.lens.points(torch.tensor([[[1.0, 0.0], [0.0, 1.0]]], dtype=torch.float64))[0, :, 2].abs().argmax()
+    disc = torch.zeros(1, 7, 2, dtype=torch.float64)
+    disc[0, :, turn] = shares  # along z, the height of the paper
+    through = rays.through(disc)
+    start, end = (x.numpy()[:, [0, 2]] for x in (through.origin, through.end_points))
+    enter, leave = (
+        (through.origin + s[:, None] * through.direction).numpy()[:, [0, 2]] for s in (through.near, through.far)
+    )
+    axes.add_patch(Rectangle((-12, -12), 24, 24, fc="#EEF5FA", ec=GREY, lw=1.2))
+    label(axes, np.array([0, 12]), "box", (0, 9), color=GREY)
+    for a, b in zip(start, end, strict=True):
+        axes.plot(*np.stack([a, b]).T, color=PURPLE, lw=0.9, alpha=0.6)
+    axes.plot(*np.stack([start[3], end[3]]).T, color=PURPLE, lw=1.6, ls=(0, (4, 3)))
+    for points in (enter, leave):
+        axes.plot(*points[[0, -1]].T, color=ORANGE, lw=2.2, zorder=9)
+    label(axes, np.array([enter[0, 0], np.abs(enter[:, 1]).max()]), "as wide as it blurs", (48, 9), color="#A06C00")
+    axes.plot([45, 45], [-13, 13], color=INK, lw=2.0)
+    label(axes, np.array([45, 13]), "background, in focus", (0, 9))
+    axes.plot(*end[3], "o", ms=6, color=RED, zorder=12)
+    label(axes, end[3], "$X_f = X_0$", (32, 0), color=RED)
+    axes.plot(start[[0, -1], 0], start[[0, -1], 1], color=INK, lw=3.5, solid_capstyle="round")
+    label(axes, np.array([-55, -11]), "lens, diameter $D$", (0, -12))
+    fit(axes, 10)
+    return figure
+
+
 DRAWINGS: dict[str, Callable[[], Figure]] = {
     "axes": axes_and_pixels,
     "displacement": displacement_sign,
     "volume": volume_index,
     "lever_arm": lever_arm,
+    "cone": cone,
 }
 
 

@@ -64,8 +64,8 @@ def test_calibration_finds_the_rendered_rig(experiment):
         assert float((a.camera().project(points) - b.camera().project(points)).abs().max()) < 0.1
         assert a.background is not None
         assert b.background is not None
-        # nor a focal length from a distance
-        assert abs(a.background.offset - b.background.offset) < 0.01 * abs(b.background.offset)
+        # nor a focal length, told to 0.5 to 0.9 %, from a distance
+        assert abs(a.background.offset - b.background.offset) < 3 * 0.009 * abs(b.background.offset)
     for name in ("calibration.rig.png", "calibration.errors.png"):
         assert iio.imread(experiment / name).std() > 10
 

@@ -19,7 +19,7 @@ PAGES = (
     "formats", "benchmarks", "api", "contributing", "architecture", "changelog", "api/geometry", "api/reconstruction",
     "repository/benchmarks/results/methods-cpu", "repository/examples/own_data",
 )  # fmt: skip
-DRAWINGS = ("axes", "displacement", "volume", "lever_arm")
+DRAWINGS = ("axes", "displacement", "volume", "lever_arm", "cone")
 
 
 class Page(HTMLParser):

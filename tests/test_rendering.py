@@ -12,8 +12,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.geometry import PROJECTIONS, Box, Camera, Ring
-from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
+from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Ring
+from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
 from nerif.simulation import view_displacement
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
@@ -114,9 +114,9 @@ def test_a_lens_is_sharp_in_focus_and_blurs_by_its_circle_of_confusion(projectio
     edge[:, 300:] = 1.0
     texture = background_texture(flat, edge, 0.5)
     pinhole = render(flat, texture)
-    sharp = render(flat, texture, lens=Lens(diameter=10.0, points=9))
+    sharp = render(dataclasses.replace(flat, lens=Lens(10.0, points=9)), texture)
     assert float((pinhole - sharp).abs().max()) < 0.02
-    blurred = render(flat, texture, lens=Lens(diameter=10.0, focus=700.0, points=40))
+    blurred = render(dataclasses.replace(flat, lens=Lens(10.0, 700.0, points=40)), texture)
     spread = np.diff(blurred.numpy()[1])
     columns = np.arange(len(spread))
     variance = np.average((columns - np.average(columns, weights=spread)) ** 2, weights=spread)
@@ -135,10 +135,11 @@ def test_where_a_telecentric_lens_is_along_its_axis_changes_no_picture(ball):
     texture = background_texture(far, torch.from_numpy(0.5 + 0.15 * noise / noise.std()), 1.0)
     strong, pictures, diameters = Times(ball, 30.0), [], []
     for camera in (far, near):
-        lens = dataclasses.replace(Lens.stopped_down(camera, 0.12, 4.0), points=5)
-        diameters.append(lens.diameter)
-        still = render(camera, texture, samples=1, lens=lens)
-        pictures.append((still, render(camera, texture, strong, BOX, 1.00027, 1, lens, 60) - still))
+        camera = camera.stopped_down(0.12, 4.0)
+        camera = dataclasses.replace(camera, lens=dataclasses.replace(camera.lens, points=5))
+        diameters.append(camera.lens.diameter)
+        still = render(camera, texture, samples=1)
+        pictures.append((still, render(camera, texture, strong, BOX, 1.00027, 1, 60) - still))
     assert diameters[0] / diameters[1] == pytest.approx(1200 / 500)  # one cone, cut elsewhere
     for a, b in zip(*pictures, strict=True):
         assert float(a.std()) > 1e-3
@@ -148,8 +149,8 @@ def test_where_a_telecentric_lens_is_along_its_axis_changes_no_picture(ball):
 @pytest.mark.slow
 def test_an_aperture_smooths_the_flow(camera, texture, ball):
     strong = Times(ball, 20.0)
-    still = render(camera, texture, lens=Lens(60.0, points=30))
-    open_ = render(camera, texture, strong, BOX, 1.00027, lens=Lens(60.0, points=30)) - still
+    wide = dataclasses.replace(camera, lens=Lens(60.0, points=30))
+    open_ = render(wide, texture, strong, BOX, 1.00027) - render(wide, texture)
     pinhole = render(camera, texture, strong, BOX, 1.00027) - render(camera, texture)
     assert float(open_.abs().max()) < 0.95 * float(pinhole.abs().max())
 

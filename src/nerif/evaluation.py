@@ -22,6 +22,7 @@ from nerif.metrics import slice_metrics, view_metrics, volume_metrics
 from nerif.notebook import number
 from nerif.observation import Observation
 from nerif.prediction import check_sees, reproject
+from nerif.reconstruction.aperture import seen_through
 from nerif.reprojection import Reprojection
 from nerif.result import VOLUME, ResultDirectory
 from nerif.techniques.registry import AUTO
@@ -76,7 +77,7 @@ def evaluate(
     if data is not None:
         asked = directory.settings()
         held_out = _held_out(hold_out, asked, data)
-        data = with_gains(data, gains_of(asked))
+        data = with_gains(seen_through(data, str(asked.get("aperture", "off"))), gains_of(asked))
         views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
         metrics["measurement"] = str(Path(str(measurement)).resolve())

@@ -6,7 +6,7 @@ The folder is one that nerif calibrate and nerif displacement read (imaging/view
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from nerif.imaging.background import Background
 from nerif.imaging.bundle import Pose
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.targets import CalibrationTarget
-from nerif.rendering import Lens, Sensor, Texture, background_texture, pattern_size, render
+from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
 from nerif.toml import write_toml
 from nerif.volume import Volume
 from nerif.volume_file import write_netcdf
@@ -50,8 +50,6 @@ class Experiment:
     references: int = 5
     """Pictures without flow."""
     sensor: Sensor = field(default_factory=Sensor)
-    f_number: float = 0.0
-    """Focal length over aperture; 0 is a pinhole."""
     samples: int = 3
     """Points along each edge of a pixel."""
     target: str = "chessboard"
@@ -71,17 +69,16 @@ class Experiment:
 
     def write(
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,
-        pixel_pitch: float, truth_voxels: int = 100, on_picture: Callable[[], None] = lambda: None,
+        truth_voxels: int = 100, on_picture: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         """Render all pictures into VIEW/{target,background,reference,flow}/, with settings to calibrate, and the truth.
 
         Parameters
         ----------
         folder : to write; calibrate.toml, truth/calibration.toml and truth/volume.nc come with the pictures
-        cameras : of the rig
+        cameras : of the rig, with their lenses
         phantom, box : field of index excess, and the box that holds it
         n_ambient : refractive index around it
-        pixel_pitch : of the sensors, mm: with f_number it gives the aperture of the lenses
         truth_voxels : of the truth, along the longest edge of the box
         on_picture : called after each picture (`pictures` of them in all)
 
@@ -95,8 +92,7 @@ class Experiment:
         self._write_truth(folder / "truth", cameras, phantom, box, n_ambient, truth_voxels)
         self._write_settings(folder / "calibrate.toml", cameras)
         for i, camera in enumerate(cameras):
-            lens = Lens.stopped_down(camera, pixel_pitch, self.f_number) if self.f_number > 0 else None
-            self._background_pictures(folder / camera.name, camera, i, phantom, box, n_ambient, lens, on_picture)
+            self._background_pictures(folder / camera.name, camera, i, phantom, box, n_ambient, on_picture)
         if self.poses:
             self.write_targets(folder, cameras, on_picture)
 
@@ -117,6 +113,8 @@ class Experiment:
             "background_scale": background_scale(cameras),
             "target": asdict(self.target_for(cameras)),
         }
+        if cameras[0].lens is not None:
+            settings["aperture_diameter"] = cameras[0].lens.diameter
         if not cameras[0].projection.shows_depth:
             settings["projection"] = cameras[0].projection.name
             settings["side"] = side_of_one(cameras)
@@ -152,7 +150,7 @@ class Experiment:
         return views * (self.references + 1 + (self.poses + self.backgrounds if self.poses else 0))
 
     def _background_pictures(
-        self, folder: Path, camera: Camera, i: int, phantom: Field, box: Box, n_ambient: float, lens: Lens | None,
+        self, folder: Path, camera: Camera, i: int, phantom: Field, box: Box, n_ambient: float,
         on_picture: Callable[[], None],
     ) -> None:  # fmt: skip
         width, height = pattern_size(camera)
@@ -160,16 +158,17 @@ class Experiment:
         pattern = Background(self.kind, width, height, dot=self.dot * pixel, seed=1000 * self.seed + i)
         texel = pattern.raster_pixel(0.0)
         texture = background_texture(camera, torch.from_numpy(pattern.raster(texel)), texel)
-        still = render(camera, texture, samples=self.samples, lens=lens)
+        still = render(camera, texture, samples=self.samples)
         for k in range(self.references):
             self._save(folder / "reference" / f"reference_{k:03d}.tif", still)
             on_picture()
-        flow = render(camera, texture, phantom, box, n_ambient, self.samples, lens)
+        flow = render(camera, texture, phantom, box, n_ambient, self.samples)
         self._save(folder / "flow" / "flow_000.tif", flow)
         on_picture()
 
     def _target_picture(self, path: Path, camera: Camera, target: CalibrationTarget, pose: Pose) -> None:
-        self._save(path, render(camera, place(target, pose, camera), samples=self.samples))
+        sharp = replace(camera, lens=None)
+        self._save(path, render(sharp, place(target, pose, camera), samples=self.samples))
 
     def _save(self, path: Path, light: Float[Tensor, "row column"]) -> None:
         import zlib

@@ -52,7 +52,7 @@ class Measurement:
     ambient_faces : faces of the box on which the index is ambient (the gauge)
     maps : (view, row, column) of other techniques, by their names in the file: absorbance, absorbance_sigma, radiance,
         radiance_sigma, fringes, fringes_sigma; NaN where not measured; (view, row, column, c) of one with c channels
-    about_views : (view, ...) what else is known of the views, by its name in the file, such as aperture_diameter
+    about_views : (view, ...) what else is known of the views, by its name in the file, such as pose_sigma
 
     Raises
     ------
@@ -94,6 +94,8 @@ class Measurement:
         if len(set(self.names)) < len(self.names):
             raise InputError(f"view: expected different names, got {', '.join(self.names)}")
         measurement_file.check_about_views(self.about_views, len(self.cameras))
+        if len({camera.lens is None for camera in self.cameras}) > 1:
+            raise InputError("aperture_diameter: expected of every view or of none (0 is a thin ray), got it of some")
         for camera in self.cameras:
             if camera.image_size[0] > shape[1] or camera.image_size[1] > shape[2]:
                 raise InputError(

@@ -6,6 +6,7 @@ technique's. The rest is known of the rig.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
-from nerif.geometry import PERSPECTIVE, Box, Camera, Plane, Projection, projection_named
+from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.netcdf import reading, values
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.deflection import Deflection
@@ -46,6 +47,8 @@ RIG = {
     "background_offset": (("view",), "mm"),
     "box": (("corner", "i"), "mm"),
     "image_size": (("view", "side"), "px"),
+    "aperture_diameter": (("view",), "mm"),
+    "focus_distance": (("view",), "mm"),
 }
 """Dimensions and unit of what is known of the rig."""
 
@@ -55,8 +58,6 @@ SPELLED = {"px/mm": "px mm-1"}
 MASKS = ("valid", "flow_mask")
 
 ABOUT_VIEWS = {
-    "aperture_diameter": (("view",), "mm"),
-    "focus_distance": (("view",), "mm"),
     "window": (("view",), "px"),
     "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
 }
@@ -142,6 +143,11 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         nowhere = torch.full((3,), torch.nan, dtype=torch.float64)
         data["background_normal"] = stack([nowhere if c.background is None else c.background.normal for c in cameras])
         data["background_offset"] = np.array([np.nan if c.background is None else c.background.offset for c in cameras])
+    lenses = [c.lens for c in cameras if c.lens is not None]
+    if lenses:
+        data["aperture_diameter"] = np.array([lens.diameter for lens in lenses])
+    if any(lens.focus is not None for lens in lenses):
+        data["focus_distance"] = np.array([np.nan if lens.focus is None else lens.focus for lens in lenses])
     masks = {"valid": measurement.valid, "flow_mask": measurement.flow_mask}
     for name, value in {**measurement.measured_maps, **masks}.items():
         if value is not None:
@@ -156,7 +162,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         dataset = dataset.assign_coords(component=list(COMPONENTS))
     names = [kind.name for kind in measurement.techniques]
     pinholes = all(c.projection == PERSPECTIVE for c in cameras)
-    plain = names == [Deflection.name] and not measurement.about_views and pinholes
+    plain = names == [Deflection.name] and not measurement.about_views and pinholes and not lenses
     dataset.attrs = {
         "Conventions": PLAIN if plain else CONVENTIONS,
         **({} if plain else {"technique": " ".join(names)}),
@@ -307,6 +313,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
     nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64)
     normals, offsets = (_array(dataset, n, True) if n in dataset else nowhere for n in BACKGROUND)
+    lenses = _lenses(dataset, names)
     cameras = []
     for i, name in enumerate(names):
         height, width = sizes[i].tolist()
@@ -320,9 +327,24 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 distortion=distortion[i],
                 name=name,
                 projection=projections[i],
+                lens=lenses[i],
             )
         )
     return tuple(cameras)
+
+
+def _lenses(dataset: xr.Dataset, names: list[str]) -> list[Lens | None]:
+    """The lenses of all views; none of any where no aperture is known."""
+    diameters = _array(dataset, "aperture_diameter") if "aperture_diameter" in dataset else torch.zeros(len(names))
+    nowhere = torch.full((len(names),), torch.nan)
+    focus = _array(dataset, "focus_distance", True) if "focus_distance" in dataset else nowhere
+    found: list[Lens | None] = []
+    for name, diameter, depth in zip(names, diameters.tolist(), focus.tolist(), strict=True):
+        try:
+            found.append(Lens(diameter, None if math.isnan(depth) else depth))
+        except InputError as error:
+            raise InputError(f"view '{name}': {error}") from None
+    return found if bool((diameters > 0).any()) else [None] * len(names)
 
 
 def _plane(normal: Tensor, offset: Tensor, view: str) -> Plane | None:

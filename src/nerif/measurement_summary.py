@@ -30,9 +30,16 @@ def summary(measurement: Measurement, held_out: int = 0) -> list[tuple[str, str]
         ("Views", f"{len(cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
         *(row for observation in measurement.observations for row in _sizes(measurement, observation)),
         ("Usable pixels", f"{max(int(measurement.usable.sum()), 1) / inside:.1%}"),
+        *_lenses(measurement),
         ("Volume", " × ".join(f"{e:g}" for e in measurement.box.edges) + " mm (x, y, z)"),
         *ambient,
     ]
+
+
+def _lenses(measurement: Measurement) -> list[tuple[str, str]]:
+    """How wide the lenses are, where that is known."""
+    wide = sorted({c.lens.diameter for c in measurement.cameras if c.lens is not None})
+    return [("Aperture", " to ".join(f"{d:.3g}" for d in wide[:: max(len(wide) - 1, 1)]) + " mm")] if wide else []
 
 
 def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str, str]]:

@@ -15,7 +15,7 @@ from nerif.fields.grid import DEGREES, VoxelField
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.measurement import Measurement, measurement_of
-from nerif.physics.path_integral import PathIntegral, Projector, project
+from nerif.physics.path_integral import LENS_RAYS, PathIntegral, Projector, project
 from nerif.physics.ray_tracing import CurvedRays
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reprojection import Accuracy, Reprojection
@@ -178,7 +178,9 @@ def _work(field: Field, cameras: Sequence[Camera]) -> float:
     if not isinstance(field, NeuralField):
         return 0.0
     weights = sum(p.numel() for p in field.network.parameters())
-    return float(weights) * SAMPLES * sum(c.image_size[0] * c.image_size[1] for c in cameras)
+    samples = [SAMPLES * (1 if c.lens is None else LENS_RAYS / 2) for c in cameras]
+    pixels = [c.image_size[0] * c.image_size[1] for c in cameras]
+    return float(weights) * sum(n * m for n, m in zip(samples, pixels, strict=True))
 
 
 def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> VoxelField:

@@ -6,7 +6,6 @@ is the mean of the texture at X. Without a field the same rays run straight: the
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,11 +15,11 @@ from torch import Tensor
 
 from nerif.conventions import InputError, Points
 from nerif.fields.base import Field
-from nerif.geometry import BackgroundPoints, Box, Camera, Plane, Rays
+from nerif.geometry import Box, Camera, Lens, Plane, Rays
 from nerif.physics.ray_tracing import trace
 from nerif.simulation import STEPS
 
-__all__ = ["Lens", "Sensor", "Texture", "background_texture", "render"]
+__all__ = ["Sensor", "Texture", "background_texture", "render"]
 
 
 @dataclass(frozen=True)
@@ -59,53 +58,6 @@ class Texture:
             (self.values - self.surround)[None, None].to(grid), grid.reshape(1, 1, -1, 2), align_corners=False
         )
         return flat.reshape(column.shape) + self.surround
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A thin lens of finite aperture; rays over its disc meet again on the plane in focus.
-
-    Parameters
-    ----------
-    diameter : of the aperture (focal length / f-number) or, of a telecentric lens, of the cone of rays to a point in
-        focus where it passes z_cam = 0; mm; 0 is a pinhole
-    focus : depth of the plane in focus along the optical axis, mm; None is the background's
-    points : number of points on the disc
-    """
-
-    diameter: float = 0.0
-    focus: float | None = None
-    points: int = 19
-
-    def __post_init__(self) -> None:
-        if not self.diameter >= 0 or not (self.focus is None or self.focus > 0) or self.points < 1:
-            raise InputError(
-                f"lens: expected diameter >= 0 mm, focus > 0 mm and points >= 1, got {self.diameter}, {self.focus}, "
-                f"{self.points}"
-            )
-
-    @classmethod
-    def stopped_down(cls, camera: Camera, pixel_pitch: float, f_number: float) -> Lens:
-        """Return the lens of a camera, focused on its background.
-
-        Parameters
-        ----------
-        camera : whose picture gives the magnification
-        pixel_pitch : of its sensor, mm
-        f_number : focal length over aperture; of a telecentric lens that on the sensor's side
-        """
-        depth = _depth(camera, camera.plane)
-        on_axis = camera.centre + depth * camera.rotation[2]
-        return cls(diameter=depth * pixel_pitch / float(camera.pixel_size(on_axis)) / f_number)
-
-    def offsets(self) -> Float[Tensor, "n 2"]:
-        """Points spread evenly over the disc (sunflower spiral), mm; one for a pinhole."""
-        if self.diameter == 0:
-            return torch.zeros(1, 2, dtype=torch.float64)
-        i = torch.arange(self.points, dtype=torch.float64)
-        radius = self.diameter / 2 * torch.sqrt((i + 0.5) / self.points)
-        angle = i * math.pi * (3 - math.sqrt(5))
-        return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -180,41 +132,38 @@ def render(
     box: Box | None = None,
     n_ambient: float = 1.0,
     samples: int = 3,
-    lens: Lens | None = None,
     steps: int = STEPS,
 ) -> Float[Tensor, "row column"]:
     """Return the light that reaches each pixel, 0 (black) to 1 (white paper).
 
     Parameters
     ----------
-    camera : its own background plane plays no part: the texture's does
+    camera : its own background plane plays no part: the texture's does, to which a lens without focus is focused
     texture : what it looks at
     field, box : what lies between, of index excess, and where; None is the reference
     n_ambient : refractive index around the field
     samples : points along each edge of a pixel over which the texture is averaged. Rays are bent at pixel centres and
         their movement on the plane interpolated between them by cubic splines (tests/test_rendering.py: the difference
         to bending every one)
-    lens : None is a pinhole
     steps : Runge-Kutta steps through the box
     """
     if samples < 1:
         raise InputError(f"samples: expected at least one point along the edge of a pixel, got {samples}")
-    lens = lens or Lens()
     height, width = camera.image_size
     shift = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
-    focus = lens.focus or _depth(camera, texture.plane)
-    light = torch.zeros(height, width, dtype=torch.float64)
-    offsets = lens.offsets()
+    camera = replace(camera, background=texture.plane, lens=camera.lens or Lens())
+    assert camera.lens is not None
+    light, offsets = torch.zeros(height, width, dtype=torch.float64), camera.lens.offsets()
     for offset in offsets:
         movement = None
         if field is not None:
             assert box is not None
-            centres = _rays(camera, camera.pixel_grid().reshape(-1, 2), texture.plane, offset, focus)
+            centres = _rays(camera, camera.pixel_grid().reshape(-1, 2), offset)
             movement = _movement(field, centres, texture.plane, box, n_ambient, steps).reshape(height, width, 3)
         for dv in shift:
             for du in shift:
                 pixels = camera.pixel_grid() + torch.stack([du, dv])
-                rays = _rays(camera, pixels.reshape(-1, 2), texture.plane, offset, focus)
+                rays = _rays(camera, pixels.reshape(-1, 2), offset)
                 points = rays.end_points
                 if movement is not None:
                     points = points + _between(movement, float(dv), float(du)).reshape(-1, 3)
@@ -222,23 +171,9 @@ def render(
     return light / (len(offsets) * samples**2)
 
 
-def _depth(camera: Camera, plane: Plane) -> float:
-    """Where the optical axis meets a plane, mm from z_cam = 0."""
-    return float(plane.offset - camera.centre @ plane.normal) / float(camera.rotation[2] @ plane.normal)
-
-
-def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], plane: Plane, offset: Float[Tensor, 2], focus: float) -> Rays:
-    """Rays from a point of the lens through where each pixel is in focus, on to the plane."""
-    straight = camera.rays(pixels)
-    depth = straight.direction @ camera.rotation[2]
-    point = straight.origin + (focus / depth)[:, None] * straight.direction
-    origin = straight.origin + offset @ camera.rotation[:2]
-    direction = point - origin
-    direction = direction / direction.norm(dim=-1, keepdim=True)
-    reach = (plane.offset - origin @ plane.normal) / (direction @ plane.normal)
-    zero = torch.zeros_like(reach)
-    background = BackgroundPoints(straight.ends.sensitivity, reach)
-    return replace(straight, origin=origin, direction=direction, near=zero, far=zero, background=background)
+def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], offset: Float[Tensor, 2]) -> Rays:
+    """Rays from a point of the lens through where each pixel is in focus, on to the background."""
+    return camera.rays(pixels).through(offset.expand(len(pixels), 1, 2))
 
 
 def _movement(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float, steps: int) -> Float[Tensor, "n 3"]:

@@ -7,7 +7,7 @@ techniques see straight rays.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from nerif.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Scaled, make_phantom
-from nerif.geometry import Box, Camera, Grid
+from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.measurement import Measurement, measurement_of
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.path_integral import PathIntegral, project
@@ -43,18 +43,23 @@ def view_displacement(
 ) -> Float[Tensor, "row column 2"]:
     """Return d(p) = p - p0(p) in px for every pixel of a camera; p0 is where the bent ray's background point was seen.
 
-    Rays are bent inside the box only. Pixels whose ray misses it have d = 0.
+    Rays are bent inside the box only. Pixels whose ray misses it have d = 0; through a lens d is the mean over it.
     """
-    pixels = camera.pixel_grid().reshape(-1, 2)
-    rays = camera.rays(pixels).clip(box)
-    displacement = torch.zeros_like(pixels)
-    for part in torch.split(rays.crosses.nonzero()[:, 0], 1 << 14):
-        # rays in single precision choose the precision of the field; positions stay double inside
-        chosen = rays[part]
-        moved = background_points(field, chosen.to(dtype=torch.float32), steps, n_ambient)
-        x0 = chosen.end_points
-        displacement[part] = camera.project(x0) - camera.project(x0 + moved)
-    return displacement.reshape(*camera.image_size, 2).float()
+    rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box)
+    bundles: Iterable[Rays] = (rays,)
+    if camera.lens is not None:
+        bundles = (rays.through(offset.expand(len(rays), 1, 2)) for offset in camera.lens.offsets())
+    total, light = torch.zeros_like(rays.pixel), torch.zeros_like(rays.near)
+    for bundle in bundles:
+        carries = ~bundle.crosses | bundle.unobstructed
+        light += carries
+        for part in torch.split((bundle.crosses & carries).nonzero()[:, 0], 1 << 14):
+            # rays in single precision choose the precision of the field; positions stay double inside
+            chosen = bundle[part]
+            moved = background_points(field, chosen.to(dtype=torch.float32), steps, n_ambient)
+            x0 = chosen.end_points
+            total[part] += camera.project(x0) - camera.project(x0 + moved)
+    return (total / light.clamp_min(1)[:, None]).reshape(*camera.image_size, 2).float()
 
 
 def view_of(

@@ -17,6 +17,7 @@ from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import GasSettings, masked_lines
 from nerif.prediction import check_sees, reproject
+from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
 from nerif.reconstruction.files import checkpoints
@@ -107,6 +108,7 @@ def reconstruct_into(
     if not isinstance(measurement, Measurement):
         path = Path(measurement)
         measurement = Measurement.read(path)
+    measurement = seen_through(measurement, reconstructor.aperture)
     if voxels is None:
         voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
     if voxels < 1:

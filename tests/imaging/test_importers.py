@@ -15,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerif.conventions import InputError
-from nerif.geometry import TELECENTRIC, Camera, Plane
+from nerif.geometry import TELECENTRIC, Camera, Lens, Plane
 from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
 
@@ -109,6 +109,26 @@ def test_own_file_with_two_of_one_name_or_none(tmp_path):
         read_cameras(path)
     with pytest.raises(InputError, match="no such file"):
         read_cameras(tmp_path / "none.toml")
+
+
+def test_a_calibration_keeps_the_lenses_and_is_given_some(tmp_path):
+    path = tmp_path / "c.toml"
+    two = dataclasses.replace(ONE, name="two", lens=Lens(4.0, 900.0))
+    ones = (dataclasses.replace(ONE, lens=Lens(3.5)), two)
+    write_cameras(path, [CalibratedCamera.from_camera(c) for c in ones])
+    first, second = read_cameras(path)
+    assert first.camera().lens == Lens(3.5)
+    assert second.camera().lens == Lens(4.0, 900.0)
+    given = import_cameras(path, ImportSettings(aperture_diameter=6.25))
+    assert {camera.lens for camera in given} == {Lens(6.25)}
+    assert [camera.lens for camera in import_cameras(path)] == [Lens(3.5), Lens(4.0, 900.0)]
+    path.write_text(path.read_text().replace("aperture_diameter = 3.5", "aperture_diameter = -3.5"))
+    with pytest.raises(InputError, match=r"camera '.*': aperture_diameter: expected a lens of 0 mm or more, got -3\.5"):
+        read_cameras(path)
+    with pytest.raises(InputError, match="focus_distance: expected together with aperture_diameter"):
+        ImportSettings(focus_distance=900.0)
+    with pytest.raises(InputError, match="aperture_diameter: expected a lens"):
+        ImportSettings(aperture_diameter=-1.0)
 
 
 def test_what_is_not_known_is_asked_for(tmp_path):

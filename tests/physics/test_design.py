@@ -14,7 +14,6 @@ from nerif.conventions import InputError
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
 from nerif.physics.design import DesignSettings, expect
-from nerif.rendering import Lens, _rays
 from nerif.simulation import view_displacement
 
 RING = Ring(views=5, image_size=(160, 200))
@@ -61,10 +60,9 @@ def test_lengths_of_a_telecentric_lens_are_those_of_its_magnification():
 @pytest.mark.parametrize("ring", [RING, PARALLEL], ids=lambda r: r.projection)
 def test_the_cone_is_the_one_that_is_rendered(ring):
     camera = ring.cameras()[0]
-    lens = Lens.stopped_down(camera, ring.pixel_pitch, SETTINGS.f_number)
-    middle, depth = torch.tensor([[99.5, 79.5]], dtype=torch.float64), 1200.0
-    rim = torch.tensor([lens.diameter / 2, 0.0], dtype=torch.float64)
-    edges = [_rays(camera, middle, camera.plane, offset, depth) for offset in (rim, -rim)]
+    middle = camera.stopped_down(ring.pixel_pitch, SETTINGS.f_number).rays(torch.tensor([[99.5, 79.5]]).double())
+    rim = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64)
+    edges = [middle.through(offset) for offset in (rim, -rim)]
     assert torch.allclose(edges[0].end_points, edges[1].end_points, atol=1e-9)  # in focus on the background
     at_flow = [r.origin - r.origin[:, :1] / r.direction[:, :1] * r.direction for r in edges]  # on the plane x = 0
     assert float((at_flow[0] - at_flow[1]).norm()) == pytest.approx(expect(ring, SETTINGS).cone)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -73,7 +73,7 @@ def run(settings: Calibrate) -> None:
         say(f"{settings.out}: {len(cameras)} cameras taken over from {settings.source}")
     else:
         check_file(settings.out, settings.force, rig, errors)
-        calibration = _calibrate(settings)
+        calibration = replace(_calibrate(settings), lens=settings.taken_over.lens)
         cameras = calibration.cameras
         calibration.write(settings.out)
         _tell(calibration)

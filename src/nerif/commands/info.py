@@ -76,6 +76,10 @@ def _measurement(path: Path, m: Measurement) -> None:
         noise = "unknown" if sigma is None else f"rms {_rms(sigma, kind.unit)}"
         say(f"  {kind.name:<14} {len(rays)} rays cross the box; rms {kind.measured} {rms}; sigma {noise}")
     say(f"  masked         {m.bad_pixels} pixels whose value or sigma is NaN, infinite or impossible")
+    lenses = {c.lens for c in m.cameras if c.lens is not None}
+    for lens in sorted(lenses, key=lambda lens: lens.diameter):
+        focus = "their backgrounds" if lens.focus is None else f"{lens.focus:g} mm"
+        say(f"  aperture       {lens.diameter:.4g} mm, focused on {focus}")
     for name in m.about_views:
         say(f"  {name:<14} known of the views")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")

@@ -14,6 +14,7 @@ from nerif.conventions import InputError, with_unit
 from nerif.geometry import Ring
 from nerif.measurement import Measurement
 from nerif.prediction import predict
+from nerif.reconstruction.aperture import seen_through
 from nerif.result import ResultDirectory
 from nerif.techniques.registry import AUTO, model_of, technique, technique_of
 
@@ -32,6 +33,11 @@ class Project(Settings):
     """Measurement file whose cameras to use; without it, the ring described below."""
     names: tuple[str, ...] = ()
     """Names of the cameras of that file to use; none for all."""
+    f_number: float = 0.0
+    """Focal length over aperture of the ring's lenses, focused on the backgrounds; 0 for thin rays."""
+    aperture: str = "auto"
+    """Cameras of a file see through the whole of their lens where its aperture is known (auto, or on to insist), or by
+    thin rays (off)."""
     model: str | None = None
     """Forward model: lever_arm, paraxial, curved, or traced (Runge-Kutta); default: that of the reconstruction,
     where the technique has it."""
@@ -55,13 +61,13 @@ def run(settings: Project) -> Measurement:
     index, box, n_ambient = result.field()
     wavelength = settings.wavelength_nm
     if settings.cameras is not None:
-        given = Measurement.read(settings.cameras)
+        given = seen_through(Measurement.read(settings.cameras), settings.aperture)
         wavelength = wavelength or given.wavelength_nm
         cameras = (given.select(settings.names) if settings.names else given).cameras
     elif settings.names:
         raise InputError("names: expected together with --cameras FILE, got no file")
     else:
-        cameras = settings.ring.cameras()
+        cameras = settings.ring.cameras(settings.f_number)
     kind = technique(settings.technique) if settings.technique else technique_of(result.quantity())
     model = settings.model or model_of(kind, str(result.settings().get("model", AUTO)))
     with counting_bar("projecting") as bar:

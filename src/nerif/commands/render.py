@@ -39,6 +39,8 @@ class Render(Settings):
     """Edges of the box around the origin, along x y z, mm."""
     n_ambient: float = AMBIENT_INDEX
     """Refractive index around the flow."""
+    f_number: float = 0.0
+    """Focal length over aperture of the lenses, focused on the backgrounds; 0 for pinholes."""
     truth_voxels: int = 100
     """Voxels of the truth along the longest edge."""
     force: bool = False
@@ -50,13 +52,13 @@ class Render(Settings):
 def run(settings: Render) -> None:
     """Write pictures and truth."""
     ResultDirectory(settings.out).check_free(settings.force)
-    cameras, pictures = settings.ring.cameras(), settings.pictures
+    cameras, pictures = settings.ring.cameras(settings.f_number), settings.pictures
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
     with counting_bar("rendering", pictures.pictures(len(cameras))) as bar:
         pictures.write(
-            settings.out, cameras, phantom, box, settings.n_ambient, settings.ring.pixel_pitch, settings.truth_voxels,
+            settings.out, cameras, phantom, box, settings.n_ambient, settings.truth_voxels,
             lambda: bar(next(count)),
         )  # fmt: skip
     target = pictures.target_for(cameras)

@@ -26,6 +26,8 @@ class Simulate(Settings):
     """Measurement to write, NAME.nc; the truth becomes NAME.truth.nc. With --times NAME.zarr and NAME.truth.zarr."""
     times: str = ""
     """Many instants of the flame, FIRST:LAST:COUNT in s (0:2.3e-3:24): a sequence."""
+    f_number: float = 0.0
+    """Focal length over aperture of the lenses, focused on the backgrounds; 0 for thin rays."""
     force: bool = False
     """Overwrite existing files."""
     simulation: Annotated[Simulation, Flat] = field(default_factory=Simulation)
@@ -47,7 +49,7 @@ def run(settings: Simulate) -> None:
         return
     truth = truth_path(settings.out)
     check_file(settings.out, settings.force, truth)
-    cameras = settings.ring.cameras()
+    cameras = settings.ring.cameras(settings.f_number)
     with counting_bar("tracing rays", len(cameras)) as bar:
         measurement, volume = settings.simulation(cameras, bar)
     measurement.write(settings.out)
@@ -80,7 +82,7 @@ def instants(text: str) -> tuple[float, ...]:
 def run_over_time(settings: Simulate) -> None:
     """Write a measurement of every instant and its truth, as two stores."""
     times = instants(settings.times)
-    cameras, truth = settings.ring.cameras(), truth_path(settings.out)
+    cameras, truth = settings.ring.cameras(settings.f_number), truth_path(settings.out)
     for path in (settings.out, truth):
         if path.exists() and not settings.force:
             raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")

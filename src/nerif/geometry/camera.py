@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerif.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
 from nerif.geometry.distortion import distort, undistort
+from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.projection import PERSPECTIVE, Projection
 from nerif.geometry.rays import BackgroundPoints, Rays
 
@@ -49,6 +50,7 @@ class Camera:
     distortion : (5,) OpenCV's k1, k2, p1, p2, k3; of a telecentric camera of (x, y) in mm
     name : what the view is called
     projection : perspective or telecentric
+    lens : Lens whose whole disc a pixel sees through; None for a thin ray a pixel
 
     Raises
     ------
@@ -64,6 +66,7 @@ class Camera:
     distortion: Float[Tensor, 5]
     name: str = "camera"
     projection: Projection = PERSPECTIVE
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         plane = self.background
@@ -106,6 +109,12 @@ class Camera:
             raise InputError(
                 f"image_size of view '{self.name}': expected (height, width) between 1 and {LARGEST_IMAGE} px, "
                 f"got {self.image_size}"
+            )
+
+        if self.lens is not None and self.lens.focus is None and plane is None:
+            raise InputError(
+                f"focus_distance of view '{self.name}': expected mm along the optical axis for a lens of "
+                f"{self.lens.diameter:g} mm that looks at no background, got none"
             )
 
     @property
@@ -176,7 +185,51 @@ class Camera:
         zero = torch.zeros_like(pixels[..., 0])
         number = torch.full(zero.shape, view, dtype=torch.int16)
         ends = self._background_points(origin, direction, sensitivity)
-        return Rays(origin, direction, zero, zero, pixels, number, ends, self.projection.begin)
+        lens = self._lens_discs(direction, ends)
+        return Rays(origin, direction, zero, zero, pixels, number, ends, self.projection.begin, lens)
+
+    def depth(self, plane: Plane) -> float:
+        """Return where the optical axis meets a plane, mm from z_cam = 0."""
+        normal = plane.normal.to(self.rotation)
+        return float(plane.offset - self.centre @ normal) / float(self.rotation[2] @ normal)
+
+    def stopped_down(self, pixel_pitch: float, f_number: float) -> Camera:
+        """Return the camera with a lens that is focused on its background.
+
+        Parameters
+        ----------
+        pixel_pitch : of its sensor, mm
+        f_number : focal length over aperture; of a telecentric lens that on the sensor's side; 0 for thin rays
+        """
+        if not f_number >= 0:
+            raise InputError(f"f_number: expected above 0, or 0 for thin rays, got {f_number}")
+        if f_number == 0:
+            return replace(self, lens=None)
+        depth = self.depth(self.plane)
+        on_axis = self.centre + depth * self.rotation[2]
+        return replace(self, lens=Lens(depth * pixel_pitch / float(self.pixel_size(on_axis)) / f_number))
+
+    @property
+    def without_background(self) -> Camera:
+        """The camera that looks at none, in focus where it was."""
+        lens = self.lens
+        if lens is not None and lens.focus is None:
+            lens = replace(lens, focus=self.depth(self.plane))
+        return replace(self, background=None, lens=lens)
+
+    def _lens_discs(self, direction: Points, ends: BackgroundPoints | None) -> LensDiscs | None:
+        """The lens as rays see it."""
+        if self.lens is None:
+            return None
+        axis = self.rotation[2].to(direction)
+        if self.lens.focus is None:
+            assert ends is not None, "a lens without a focus looks at a background"
+            focus = ends.distance
+        else:
+            focus = self.lens.focus / (direction @ axis)
+        normal = axis if self.background is None else self.background.normal.to(direction)
+        radius = torch.full_like(focus, self.lens.diameter / 2)
+        return LensDiscs(axis.expand_as(direction), normal.expand_as(direction), radius, focus)
 
     def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
         """Where rays meet the background, and S there."""

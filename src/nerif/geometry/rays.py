@@ -8,39 +8,23 @@ ends on by (s_b - s) dn / n, and the sensitivity S (2 x 3, px/mm) turns that mov
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int16
 from torch import Tensor
 
 from nerif.conventions import InputError
+from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
+from nerif.geometry.lens import LensDiscs
 
 __all__ = ["BackgroundPoints", "Rays"]
 
 
-C = TypeVar("C", bound="_Columns")
-
-
-class _Columns:
-    """A record of arrays with one entry a ray, or of such records; None where there is nothing."""
-
-    def _each(self: C, change: Callable[..., Tensor], *others: C) -> C:
-        """Return the record of what `change` makes of every array and those of the others in its place."""
-        made: dict[str, Any] = {}
-        for f in fields(self):  # type: ignore[arg-type]
-            first, *more = (getattr(part, f.name) for part in (self, *others))
-            if isinstance(first, _Columns):
-                first = first._each(change, *more)
-            made[f.name] = change(first, *more) if isinstance(first, Tensor) else first
-        return type(self)(**made)
-
-
 @dataclass(frozen=True)
-class BackgroundPoints(_Columns):
+class BackgroundPoints(Columns):
     """Where rays end on a background, and how a movement there is seen.
 
     Parameters
@@ -54,7 +38,7 @@ class BackgroundPoints(_Columns):
 
 
 @dataclass(frozen=True)
-class Rays(_Columns):
+class Rays(Columns):
     """Back-traced rays, in the world frame.
 
     Parameters
@@ -66,6 +50,7 @@ class Rays(_Columns):
     view : (n,) number of the view
     background : what they see on a background, or None
     begin : path length before which there is no ray, mm: 0, or -inf for a camera that sees along parallel lines
+    lens : the lens that each passes in the middle, or None where a pixel sees a thin ray
     """
 
     origin: Float[Tensor, "n 3"]
@@ -76,17 +61,18 @@ class Rays(_Columns):
     view: Int16[Tensor, " n"]
     background: BackgroundPoints | None = None
     begin: float = 0.0
+    lens: LensDiscs | None = None
 
     def __len__(self) -> int:
         return self.origin.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
-        return self._each(lambda x: x[index])
+        return self.each(lambda x: x[index])
 
     @staticmethod
     def concatenate(parts: Sequence[Rays]) -> Rays:
         """Join rays end to end."""
-        return parts[0]._each(lambda *columns: torch.cat(columns), *parts[1:])
+        return parts[0].each(lambda *columns: torch.cat(columns), *parts[1:])
 
     @staticmethod
     def collect(parts: Iterable[Rays], most: int) -> Rays:
@@ -100,15 +86,15 @@ class Rays(_Columns):
         for part in parts:
             part = part.to(dtype=torch.float32)
             if whole is None:
-                whole = part._each(lambda x: torch.empty(most, *x.shape[1:], dtype=x.dtype))
-            whole._each(put, part)
+                whole = part.each(lambda x: torch.empty(most, *x.shape[1:], dtype=x.dtype))
+            whole.each(put, part)
             count += len(part)
         assert whole is not None, "there is a part at least"
         return whole[:count]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
         """Return the rays on another device or in another precision."""
-        return self._each(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
+        return self.each(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
     @property
     def crosses(self) -> Bool[Tensor, " n"]:
@@ -150,7 +136,61 @@ class Rays(_Columns):
         a, b = (lower - self.origin) / direction, (upper - self.origin) / direction
         near = torch.minimum(a, b).amax(dim=-1).clamp_min(self.begin)
         far = torch.maximum(a, b).amin(dim=-1)
-        return replace(self, near=near, far=torch.maximum(far, near))
+        lens = None if self.lens is None else replace(self.lens, box=box)
+        return replace(self, near=near, far=torch.maximum(far, near), lens=lens)
+
+    def through(self, disc: Float[Tensor, "n k 2"]) -> Rays:
+        """Return the n k rays through points of the lens to the point in focus of each, clipped to the same box.
+
+        A movement of the background point is seen as S has it, whatever ray it was that moved it in its plane:
+
+            s_b' = n . (X_0' - L) / n . t',      S' = S - S t' n^T / (n . t')
+
+        Parameters
+        ----------
+        disc : points of the lens, in shares of its radius
+
+        Raises
+        ------
+        InputError
+            If the rays pass no lens.
+        """
+        if self.lens is None:
+            raise InputError("aperture_diameter: expected rays through a lens, got thin ones")
+        each, shift = disc.shape[1], self.lens.points(disc)
+        direction = torch.nn.functional.normalize(
+            self.lens.focus[:, None, None] * self.direction[:, None] - shift, dim=-1
+        )
+        whole = replace(self, lens=None, background=None).each(lambda x: x.repeat_interleave(each, dim=0))
+        ends = self.background
+        if ends is not None:
+            normal = self.lens.normal[:, None]
+            along = (direction * normal).sum(-1)
+            to_plane = ends.distance[:, None, None] * self.direction[:, None] - shift
+            seen = torch.einsum("nij,nkj->nki", ends.sensitivity, direction)
+            sensitivity = ends.sensitivity[:, None] - seen[..., None] * (normal / along[..., None])[:, :, None]
+            distance = (to_plane * normal).sum(-1) / along
+            ends = BackgroundPoints(sensitivity.flatten(0, 1), distance.flatten(0, 1))
+        origin = (self.origin[:, None] + shift).flatten(0, 1)
+        whole = replace(whole, origin=origin, direction=direction.flatten(0, 1), background=ends)
+        return whole if self.lens.box is None else whole.clip(self.lens.box)
+
+    def mean_of(self, each: int, seen: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
+        """Return the mean of what the rays of a pixel see; one that a background ends before the box carries no light.
+
+        Parameters
+        ----------
+        each : rays of a pixel, which follow one another (`through`)
+        seen : of all of them
+        """
+        return (seen * self.shares(each)[:, None]).unflatten(0, (-1, each)).sum(dim=1)
+
+    def shares(self, each: int) -> Float[Tensor, " m"]:
+        """Return the share that each ray has in the mean of its pixel, which has so many."""
+        if self.background is None:
+            return torch.full_like(self.near, 1 / each)
+        carries = (~self.crosses | self.unobstructed).to(self.near).unflatten(0, (-1, each))
+        return (carries / carries.sum(dim=1, keepdim=True).clamp_min(1)).flatten()
 
     def exit_faces(self, box: Box, faces: Sequence[str]) -> Bool[Tensor, " n"]:
         """Which rays enter or leave the box through one of the named faces."""

@@ -77,12 +77,18 @@ class Ring:
         step = (last - first) / max(self.views - 1, 1)
         return tuple(first + i * step for i in range(self.views)) + tuple(self.extra_angles)
 
-    def cameras(self) -> tuple[Camera, ...]:
-        """Build the cameras, named by their azimuth."""
+    def cameras(self, f_number: float = 0.0) -> tuple[Camera, ...]:
+        """Build the cameras, named by their azimuth.
+
+        Parameters
+        ----------
+        f_number : focal length over aperture, of telecentric lenses on the sensor's side; 0 for thin rays
+        """
         names = [f"{angle:g}deg" for angle in self.angles]
         if len(set(names)) < len(names):
             raise InputError(f"views: expected cameras at different angles, got {', '.join(names)}")
-        return tuple(self._camera(angle, name) for angle, name in zip(self.angles, names, strict=True))
+        cameras = (self._camera(angle, name) for angle, name in zip(self.angles, names, strict=True))
+        return tuple(camera.stopped_down(self.pixel_pitch, f_number) for camera in cameras)
 
     def _camera(self, azimuth: float, name: str) -> Camera:
         a, e = math.radians(azimuth), math.radians(self.elevation)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from nerif.conventions import InputError
-from nerif.geometry import PERSPECTIVE, Plane, Projection
+from nerif.geometry import PERSPECTIVE, Lens, Plane, Projection
 from nerif.imaging.bundle import Bundle, Observation, Pose
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 
@@ -75,6 +75,7 @@ class Calibration:
     sigma_focal : (camera,) share of the focal length or scale
     residuals : (camera) arrays (n, 4) of u, v and the residual in u, v, px: to be drawn
     projection : of all cameras
+    lens : of all cameras, or None for thin rays
     """
 
     names: tuple[str, ...]
@@ -88,6 +89,7 @@ class Calibration:
     sigma_focal: Float[np.ndarray, " camera"]
     residuals: tuple[np.ndarray, ...]
     projection: Projection = PERSPECTIVE
+    lens: Lens | None = None
 
     @classmethod
     def of(
@@ -151,6 +153,7 @@ class Calibration:
             image_size=self.sizes[i],
             background=None if plane is None else Plane(torch.tensor(plane.normal, dtype=torch.float64), plane.offset),
             projection=self.projection,
+            lens=self.lens,
         )
 
     @property

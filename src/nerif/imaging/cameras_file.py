@@ -9,6 +9,8 @@ intrinsics = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]    # px; fx, s, fy of a telec
 distortion = [k1, k2, p1, p2, k3]       # may be left out
 rotation = [[...], [...], [...]]        # world to camera
 translation = [tx, ty, tz]              # mm
+aperture_diameter = 6.25                # mm, of the entrance pupil; may be left out: thin rays
+focus_distance = 1200.0                 # mm along the optical axis; may be left out: focused on the background
 [camera.background]                     # normal . x = offset; may be left out
 normal = [nx, ny, nz]
 offset = -500.0                         # mm
@@ -18,7 +20,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +29,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError, Matrix3
-from nerif.geometry import PERSPECTIVE, Camera, Plane, Projection, projection_named
+from nerif.geometry import PERSPECTIVE, Camera, Lens, Plane, Projection, projection_named
 from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = [
@@ -36,7 +38,8 @@ __all__ = [
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
-KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotation", "translation", "background")
+KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotation", "translation", "background",
+        "aperture_diameter", "focus_distance")  # fmt: skip
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
 """Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
 
@@ -55,6 +58,7 @@ class CalibratedCamera:
     image_size : (height, width), px, or None
     background : Plane, world frame, mm, or None
     projection : perspective or telecentric
+    lens : Lens, or None for thin rays
     """
 
     name: str
@@ -65,6 +69,7 @@ class CalibratedCamera:
     image_size: tuple[int, int] | None = None
     background: Plane | None = None
     projection: Projection = PERSPECTIVE
+    lens: Lens | None = None
 
     def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
         """Return the whole camera; without a background if none is known.
@@ -79,7 +84,7 @@ class CalibratedCamera:
             raise InputError(f"view '{self.name}' has no image size in its calibration; give --image-size HEIGHT WIDTH")
         return Camera(
             self.intrinsics, self.rotation, self.translation, image_size, background, self.distortion, self.name,
-            self.projection,
+            self.projection, self.lens,
         )  # fmt: skip
 
     @classmethod
@@ -87,14 +92,14 @@ class CalibratedCamera:
         """Take over a whole camera."""
         return cls(
             camera.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion,
-            camera.image_size, camera.background, camera.projection,
+            camera.image_size, camera.background, camera.projection, camera.lens,
         )  # fmt: skip
 
 
 def checked(camera: CalibratedCamera, source: str) -> CalibratedCamera:
     """Return the camera if it can be one, else raise an InputError that names the source."""
     try:
-        camera.camera(camera.image_size or (1, 1))
+        replace(camera, lens=None).camera(camera.image_size or (1, 1))  # a background may come, to focus it on
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
     return camera
@@ -210,6 +215,10 @@ def write_cameras(
             table["image_size"] = list(camera.image_size)
         for name in ("intrinsics", "distortion", "rotation", "translation"):
             table[name] = getattr(camera, name).tolist()
+        if camera.lens is not None:
+            table["aperture_diameter"] = camera.lens.diameter
+            if camera.lens.focus is not None:
+                table["focus_distance"] = camera.lens.focus
         if camera.background is not None:
             table["background"] = {"normal": camera.background.normal.tolist(), "offset": camera.background.offset}
         tables.append(table)
@@ -256,5 +265,20 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
         image_size=image_size(table["image_size"], f"{where}: image_size") if "image_size" in table else None,
         background=None if given is None else plane(given["normal"], given["offset"], f"{where}: background"),
         projection=projection_named(table.get("projection", PERSPECTIVE.name), f"{where}: projection"),
+        lens=_lens(table, where),
     )
     return checked(camera, path)
+
+
+def _lens(table: dict[str, Any], where: str) -> Lens | None:
+    """The lens of a camera; none where its aperture is not told."""
+    if "aperture_diameter" not in table:
+        return None
+    diameter, focus = (
+        None if key not in table else float(numbers(table[key], (), f"{where}: {key}"))
+        for key in ("aperture_diameter", "focus_distance")
+    )
+    try:
+        return Lens(diameter or 0.0, focus)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None

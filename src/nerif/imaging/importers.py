@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from nerif.conventions import InputError
-from nerif.geometry import Plane
+from nerif.geometry import Lens, Plane
 from nerif.geometry.distortion import POWERS
 from nerif.imaging.cameras_file import CalibratedCamera, checked
 from nerif.imaging.matlab import read_matlab
@@ -41,10 +41,23 @@ class ImportSettings:
     pictures too."""
     image_size: tuple[int, int] | None = None
     """Height and width of the pictures where the file does not say, px."""
+    aperture_diameter: float | None = None
+    """Of the entrance pupils (focal length over f-number), mm, through all of which a pixel then sees; from target
+    pictures too."""
+    focus_distance: float | None = None
+    """Where the lenses are focused, mm along the optical axis; default: on the background."""
 
     def __post_init__(self) -> None:
+        if self.focus_distance is not None and self.aperture_diameter is None:
+            raise InputError("focus_distance: expected together with aperture_diameter, got it alone")
+        _ = self.lens
         if not self.scale_mm > 0:
             raise InputError(f"scale_mm: expected a positive number, got {self.scale_mm}")
+
+    @property
+    def lens(self) -> Lens | None:
+        """The lens of every camera, or None for what the file says."""
+        return None if self.aperture_diameter is None else Lens(self.aperture_diameter, self.focus_distance)
 
 
 def is_calibration(path: Path) -> bool:
@@ -110,4 +123,5 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
         translation=scale * camera.translation,
         image_size=camera.image_size or settings.image_size,
         background=plane,
+        lens=settings.lens or camera.lens,
     )

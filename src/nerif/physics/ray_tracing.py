@@ -21,8 +21,8 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.geometry import Rays
-from nerif.physics.path_integral import Projector
+from nerif.geometry import Rays, disc_points
+from nerif.physics.path_integral import LENS_RAYS, Projector
 
 __all__ = ["CurvedRays", "background_points", "trace"]
 
@@ -90,5 +90,8 @@ class CurvedRays(Projector):
             raise InputError(f"steps: expected at least one step through the box, got {self.steps}")
 
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n 2"]:
+        if rays.lens is not None:
+            spread = rays.through(disc_points(len(rays), LENS_RAYS))
+            return spread.mean_of(LENS_RAYS, self(field, spread))
         moved = background_points(field, rays, self.steps, self.n_ambient)
         return torch.einsum("nij,nj->ni", rays.ends.sensitivity.to(moved), moved).to(rays.origin.dtype)

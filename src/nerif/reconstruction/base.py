@@ -159,6 +159,9 @@ class Reconstructor(ABC):
     refused when the record is made.
     """
 
+    aperture: str
+    """Whether pixels see through the whole of their lens (aperture.py)."""
+
     @abstractmethod
     def __call__(
         self,

@@ -22,6 +22,7 @@ from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.measurement import Measurement
+from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
@@ -61,6 +62,7 @@ class Descent:
         resume: State | None,
         start: Field | None,
     ) -> None:
+        measurement = seen_through(measurement, settings.aperture)
         self.settings, self.measurement, self.on_step, self.field_before = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
         self.faces = ambient_faces(measurement, settings.ambient_faces)

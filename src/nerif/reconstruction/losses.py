@@ -20,6 +20,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import NeuralField
+from nerif.geometry import Rays
 from nerif.physics.path_integral import places
 from nerif.reconstruction.target import Part
 from nerif.techniques.base import Weights
@@ -70,6 +71,7 @@ def loss_terms(
     field: NeuralField,
     network: Evaluator,
     part: Part,
+    rays: Rays,
     s: Float[Tensor, "n m"],
     step: Float[Tensor, "n m"],
     weights: LossWeights,
@@ -81,12 +83,17 @@ def loss_terms(
 
     Parameters
     ----------
-    part : rays, what they measured, and the forward model
-    s : path lengths of the samples, mm
+    part : pixels, what they measured, and the forward model
+    rays : those of the part, or several thin ones in a row for each, whose mean the pixel sees
+    s : path lengths of the samples on the rays, mm
     step : length that each sample stands for, mm; the central differences reach half of it to either side
     norm : "l2" (mean length of the residual vectors, the paper's) or "squared" (mean square)
     """
-    rays, model, shape = part.rays, part.model, s.shape
+    model, shape, each = part.model, s.shape, len(rays) // len(part)
+
+    def compared(seen: Float[Tensor, "n c"]) -> Tensor:
+        return reduce(part.residual(seen if each == 1 else rays.mean_of(each, seen)), norm)
+
     unit = field.scale / field.half_edge  # 1/mm of one unit of network gradient
     integral = model.weights(rays, s, step).in_units(field.scale, unit)
 
@@ -99,14 +106,14 @@ def loss_terms(
     tilt = None if tilt is None else tilt / unit
     p = field.normalise(points).reshape(-1, 3)
     if integral.slope is None:  # no gradient, so that what is asked in three ways is one
-        seen = reduce(part.residual(integral(network.value(p).float().reshape(shape), None)), norm)
+        seen = compared(integral(network.value(p).float().reshape(shape), None))
         return {name: seen for name in DATA if getattr(weights, name)}
 
     def data(value: Tensor | None, gradient: Float[Tensor, "p 3"]) -> Tensor:
         gradient = gradient.float().reshape(*shape, 3)
         gradient = gradient if tilt is None else gradient - tilt
         value = None if value is None else value.float().reshape(shape)
-        return reduce(part.residual(integral(value, gradient)), norm)
+        return compared(integral(value, gradient))
 
     terms = {}
     if weights.automatic or weights.head or weights.consistency:
@@ -124,7 +131,7 @@ def loss_terms(
         seen = by_differences(network.value, integral, p.reshape(*shape, 3), reach)
         if tilt is not None:
             seen = seen - Weights(integral.profile, slope=integral.slope)(None, tilt)
-        terms["numerical"] = reduce(part.residual(seen), norm)
+        terms["numerical"] = compared(seen)
     return terms
 
 

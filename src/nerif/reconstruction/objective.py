@@ -11,6 +11,8 @@ from torch import Tensor
 
 from nerif.fields.mlp import NeuralField
 from nerif.fields.space_time import AtTimes, with_time
+from nerif.geometry import Rays, disc_points
+from nerif.physics.path_integral import LENS_RAYS
 from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
@@ -22,7 +24,34 @@ from nerif.reconstruction.training_data import TrainingData
 __all__ = ["Objective", "Piece"]
 
 GAUGE_POINTS = 256  # a step
-JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a ray that is held back; such rays at once
+JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a ray that is held back; such pixels at once
+FEWEST = 4  # samples of a ray through a lens
+MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (benchmarks/rigs.py)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """How a pixel is sampled: by so many rays through its lens, with so many samples each.
+
+    Parameters
+    ----------
+    each : rays; 1 for a thin one
+    samples : of a ray
+    """
+
+    each: int
+    samples: int
+
+    @property
+    def points(self) -> int:
+        """Samples of a pixel."""
+        return self.each * self.samples
+
+    def rays_of(self, part: Part, generator: torch.Generator) -> Rays:
+        """Return the rays of pixels: their own, or so many through the lens in a row for each."""
+        if part.rays.lens is None:
+            return part.rays
+        return part.rays.through(disc_points(len(part), self.each, generator).to(part.rays.near.device))
 
 
 @dataclass(frozen=True)
@@ -31,12 +60,14 @@ class Piece:
 
     Parameters
     ----------
-    part : rays, what they measured, and the forward model
-    tau : (n,) their instants, or None
+    part : pixels, what they measured, and the forward model
+    rays : theirs, or several through the lens in a row for each
+    tau : (n,) instants of the rays, or None
     s, interval : (n, m) path lengths of the samples, and the length that each stands for, mm
     """
 
     part: Part
+    rays: Rays
     tau: Tensor | None
     s: Tensor
     interval: Tensor
@@ -63,25 +94,40 @@ class Objective:
         self.generator, self.ranks = generator, ranks
         self.density = SamplingDensity(field)
 
-    def samples(self, progress: float) -> int:
-        """Draw how many samples a ray has in a step at that progress."""
+    def draw(self, progress: float) -> Draw:
+        """Draw how a pixel is sampled in a step at that progress."""
         settings = self.settings
-        return sample_count(progress, *settings.samples, settings.sample_jitter, self.generator)
+        samples = sample_count(progress, *settings.samples, settings.sample_jitter, self.generator)
+        last = self.data.lens_rays
+        if last == 1:
+            return Draw(1, samples)
+        first = max(2, 2 * (last // 6))
+        each = 2 * round((first + (last - first) * min(progress, 1.0)) / 2)
+        return Draw(each, max(FEWEST, round((1 + (last - 2) / MORE) * samples / each)))
 
-    def rays(self, count: int) -> int:
-        """Return how many rays a step has, of so many samples each."""
-        return min(max(self.ranks.size, self.settings.points_per_batch // count), len(self.data))
+    def pixels(self, draw: Draw) -> int:
+        """Return how many pixels a step has that are sampled so."""
+        return min(max(self.ranks.size, self.settings.points_per_batch // draw.points), len(self.data))
 
-    def batch(self, index: Int[Tensor, " b"], count: int) -> tuple[list[Piece], int]:
-        """Return this process's share of the rays of those numbers, with `count` samples each, and how many measured
-        numbers all processes have.
+    def batch(self, index: Int[Tensor, " b"], draw: Draw) -> tuple[list[Piece], int]:
+        """Return this process's share of the pixels of those numbers, sampled so, and how many measured numbers all
+        processes have.
         """
-        batch, sampling = self.data.batch(index), self.settings.sampling
-        pieces, mine = [], self.ranks.share
-        for part, tau in batch:
-            s, interval = sample_rays(part.rays, count, self.generator, sampling, self.density)
-            pieces.append(Piece(part[mine], None if tau is None else tau[mine], s[mine], interval[mine]))
+        batch = self.data.batch(index)
+        pieces = [self._piece(part, tau, draw) for part, tau in batch]
         return [p for p in pieces if len(p.part)], sum(part.measured.numel() for part, _ in batch)
+
+    def _piece(self, part: Part, tau: Tensor | None, draw: Draw) -> Piece:
+        """This process's share of a part, with its samples."""
+        rays, mine = draw.rays_of(part, self.generator), self.ranks.share
+        each = len(rays) // max(len(part), 1)
+        s, interval = sample_rays(rays, draw.samples, self.generator, self.settings.sampling, self.density, each)
+        if self.ranks.size > 1:
+            chosen = torch.arange(len(part), device=rays.near.device)[mine]
+            own = (chosen[:, None] * each + torch.arange(each, device=chosen.device)).flatten()
+            rays, s, interval = rays[own], s[own], interval[own]
+        own_tau = None if tau is None else tau[mine].repeat_interleave(each)
+        return Piece(part[mine], rays, own_tau, s, interval)
 
     def terms(self, pieces: list[Piece]) -> dict[str, Tensor]:
         """Return the terms of the loss, each the mean over all measured numbers of the pieces."""
@@ -89,8 +135,9 @@ class Objective:
         terms: dict[str, Tensor] = {}
         for piece, share in shares(pieces):
             found = loss_terms(
-                self.field, self._at(piece.tau), piece.part, piece.s, piece.interval, settings.weights, settings.norm
-            )
+                self.field, self._at(piece.tau), piece.part, piece.rays, piece.s, piece.interval, settings.weights,
+                settings.norm,
+            )  # fmt: skip
             for name, term in found.items():
                 terms[name] = terms[name] + share * term if name in terms else share * term
         ambient = self.at_ambient(GAUGE_POINTS, self.generator)
@@ -125,8 +172,10 @@ class Objective:
         for part in held.parts:
             for first in range(0, len(part), JUDGED_AT_ONCE):
                 some = part[first : first + JUDGED_AT_ONCE]
-                s, interval = sample_rays(some.rays, JUDGED_SAMPLES, drawn, "adaptive", self.density)
-                terms = loss_terms(self.field, self.network, some, s, interval, weights, "squared")
+                draw = Draw(1 if some.rays.lens is None else LENS_RAYS, JUDGED_SAMPLES)
+                rays = draw.rays_of(some, drawn)
+                s, interval = sample_rays(rays, draw.samples, drawn, "adaptive", self.density, draw.each)
+                terms = loss_terms(self.field, self.network, some, rays, s, interval, weights, "squared")
                 data = [(getattr(weights, name), float(terms[name])) for name in DATA if name in terms]
                 mean = sum(weight * term for weight, term in data) / sum(weight for weight, _ in data)
                 total += mean * some.measured.numel()

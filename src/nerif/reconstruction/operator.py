@@ -12,15 +12,18 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
-from nerif.geometry import Grid, Rays
+from nerif.geometry import Grid, Rays, disc_points
 from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.planes import Bundle
 from nerif.techniques.base import ForwardModel
 
-__all__ = ["STEPS", "VoxelOperator", "check_step", "operator_norm"]
+__all__ = ["STEPS", "VoxelOperator", "check_step", "operator_norm", "rays_through"]
 
 STEPS = {"linear": 0.5, "cubic": 1.0}
 """Voxels between planes, at most: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
+
+PAIRS, MOST_PAIRS = 2.0, 8
+"""Of rays through a lens, for each voxel that the cone's radius is wide in the middle of the box, and at most."""
 
 
 class VoxelOperator:
@@ -30,7 +33,7 @@ class VoxelOperator:
 
     Profile w, A and B are the model's (techniques/base.py); samples stand where rays cross evenly spaced planes
     (planes.py). `A(c)` applies the operator, `A.T(y)` its exact adjoint. On a CPU it runs on all cores (Numba), on CUDA
-    in PyTorch.
+    in PyTorch. What a ray with a lens sees is the mean over thin rays through it, the more the wider they spread.
 
     Parameters
     ----------
@@ -79,6 +82,11 @@ class VoxelOperator:
         self.inner = torch.float64 if self.compiled else dtype
         self.domain_shape = grid.shape
         self.range_shape = (len(rays), len(model.channels))
+        self.shares: Tensor | None = None  # of rays through a lens, in what a pixel sees
+        if rays.lens is not None:
+            each = rays_through(rays, min(grid.spacing))
+            rays = rays.through(disc_points(len(rays), each).to(rays.near.device))
+            self.shares = rays.shares(each).reshape(-1, each, 1).to(self.device, dtype)
         if min(grid.shape) < self.layers:
             raise InputError(
                 f"voxels: expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}"
@@ -107,7 +115,7 @@ class VoxelOperator:
     def through(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n c"]:
         """Return what every ray sees of coefficients that go on beyond the box already."""
         padded = padded.to(self.device, self.dtype)
-        seen = torch.zeros(self.range_shape, dtype=self.dtype, device=self.device)
+        seen = self._of_rays(None)
         integrate, _ = self._kernels()
         for bundle in self.bundles:
             value, slope = bundle.planes.cut(padded, self.inner)
@@ -117,7 +125,7 @@ class VoxelOperator:
             if bundle.value is not None:
                 own += _made(bundle.value, integrate(self.degree, value, None, bundle.path))
             seen[bundle.index] = own
-        return seen
+        return seen if self.shares is None else (seen.reshape(*self.shares.shape[:2], -1) * self.shares).sum(dim=1)
 
     def T(self, seen: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
         """Return the adjoint of the operator, applied to what rays see."""
@@ -125,7 +133,7 @@ class VoxelOperator:
             raise InputError(f"seen: expected {self.range_shape}, got {tuple(seen.shape)}")
         shape = tuple(n + 2 * self.layers for n in self.domain_shape)
         padded = torch.zeros(shape, dtype=self.dtype, device=self.device)
-        seen = seen.to(self.device, self.dtype)
+        seen = self._of_rays(seen.to(self.device, self.dtype))
         _, spread = self._kernels()
         for bundle in self.bundles:
             for matrix in (bundle.gradient, bundle.value):
@@ -134,6 +142,14 @@ class VoxelOperator:
                     value, *slope = spread(self.degree, q, bundle.path, bundle.planes.shape(shape))
                     bundle.planes.mend(value, slope[0] if slope else None, padded)
         return self.boundary.fold(padded, self.layers)
+
+    def _of_rays(self, seen: Float[Tensor, "n c"] | None) -> Float[Tensor, "m c"]:
+        """Of what pixels see the part of each of their rays; 0 where nothing is given."""
+        pixels, channels = self.range_shape
+        if seen is None:
+            rays = pixels if self.shares is None else self.shares.numel()
+            return torch.zeros(rays, channels, dtype=self.dtype, device=self.device)
+        return seen if self.shares is None else (seen[:, None] * self.shares).flatten(0, 1)
 
     def _kernels(self) -> tuple[Callable[..., Tensor], Callable[..., list[Tensor]]]:
         """The kernels to run."""
@@ -167,6 +183,15 @@ class VoxelOperator:
         padded = math.prod(n + 2 * layers for n in grid.shape)
         held = 8 * inner + 3 * channels * dtype.itemsize + 16  # numbers of a path, B, whole numbers
         return rays * held + padded * (2 * dtype.itemsize + each * (4 * inner + 6 * dtype.itemsize))
+
+
+def rays_through(rays: Rays, length: float) -> int:
+    """Return how many rays through the lens of a pixel tell what it sees of a field that changes over a length, mm."""
+    if rays.lens is None:
+        return 1
+    middle = 0.5 * (rays.near + rays.far)
+    spread = float((rays.lens.radius * (1 - middle / rays.lens.focus)).abs().max())
+    return 2 * min(MOST_PAIRS, math.ceil(PAIRS * spread / length)) or 1
 
 
 def check_step(step: float, basis: str) -> None:

@@ -65,8 +65,9 @@ def sample_count(progress: float, first: int, last: int, jitter: int, generator:
 
 
 def sample_rays(
-    rays: Rays, count: int, generator: torch.Generator, sampling: str = "random", density: SamplingDensity | None = None
-) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+    rays: Rays, count: int, generator: torch.Generator, sampling: str = "random",
+    density: SamplingDensity | None = None, of_pixel: int = 1,
+) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:  # fmt: skip
     """Return path lengths t_i ~ U(t_n + (i-1)/N (t_f - t_n), t_n + i/N (t_f - t_n)) and the length each stands for, mm.
 
     Parameters
@@ -74,6 +75,7 @@ def sample_rays(
     sampling : "random" (one draw an interval, the paper's), "shifted" (one draw a ray, the same in each interval),
         "adaptive" (as shifted, in intervals as the density has them) or "regular" (midpoints)
     density : for "adaptive"; equal intervals as long as it knows nothing
+    of_pixel : rays in a row that are those of a pixel; where one draw serves a ray, theirs are evenly apart
     """
     n, device = len(rays), rays.near.device
     if sampling == "random":
@@ -81,7 +83,8 @@ def sample_rays(
     elif sampling == "regular":
         draw = torch.full((1, 1), 0.5)
     else:
-        draw = torch.rand(n, 1, generator=generator)
+        draw = torch.rand(n // of_pixel, 1, generator=generator)
+        draw = ((draw + torch.arange(of_pixel) / of_pixel) % 1).reshape(n, 1)
     share = (torch.arange(count, device=device) + draw.to(device)) / count
     length = (rays.far - rays.near)[:, None]
     if sampling != "adaptive" or density is None or density.values is None:

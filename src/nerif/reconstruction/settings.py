@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from nerif.conventions import InputError, parse_faces
 from nerif.fields.mlp import NetworkShape
+from nerif.reconstruction.aperture import check_aperture
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.losses import LossWeights
@@ -49,6 +50,12 @@ class TrainingSettings(Reconstructor):
     sampling: str = "adaptive"
     """In equal intervals, one draw each ("random", the paper's), one a ray ("shifted") or midpoints ("regular"), or
     "adaptive", where the field varies."""
+    aperture: str = "auto"
+    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
+    (off)."""
+    lens_rays: int = 0
+    """Rays through the lens of a pixel at the end, an even number, and a third of them at the start; 0: 2 to 12,
+    as the cone is wide in pixels."""
     points_per_batch: int = 8192
     """Sample points of a step; a step takes points_per_batch / N rays."""
     optimiser: str = "muon"
@@ -122,6 +129,8 @@ class TrainingSettings(Reconstructor):
             raise InputError(
                 f"samples: expected two counts above sample_jitter ({self.sample_jitter}), got {self.samples}"
             )
+        if self.lens_rays < 0 or self.lens_rays % 2:
+            raise InputError(f"lens_rays: expected an even number, or 0 for as many as it takes, got {self.lens_rays}")
         if self.points_per_batch < max(self.samples) + self.sample_jitter:
             raise InputError(
                 f"points_per_batch: expected room for one ray ({max(self.samples) + self.sample_jitter} points), "
@@ -130,6 +139,7 @@ class TrainingSettings(Reconstructor):
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
             raise InputError("weights: the head and consistency terms need gradient_head = true")
         check_model(self.model)
+        check_aperture(self.aperture)
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")

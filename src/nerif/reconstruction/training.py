@@ -188,14 +188,14 @@ class Training:
     def _batch(self) -> tuple[list[Piece], int]:
         """The next rays, of a random order that has each once an epoch."""
         budget, objective = self.budget, self.objective
-        samples = objective.samples(budget.progress)
-        rays = objective.rays(samples)
+        draw = objective.draw(budget.progress)
+        rays = objective.pixels(draw)
         index = shuffled(budget.rays_done, rays, len(self.data), self.settings.seed)
         budget.rays_done += rays
         self.drawn += rays
         if self.settings.sampling == "adaptive" and budget.step and budget.step % DENSITY_EVERY == 0:
             objective.look()
-        return objective.batch(index, samples)
+        return objective.batch(index, draw)
 
     def _settle(self) -> None:
         """Go on with the smallest bins of which the rest of the run can see all."""

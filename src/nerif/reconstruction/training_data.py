@@ -17,6 +17,7 @@ from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 from nerif.measurement import Measurement
+from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.bins import coarsest_edge
 from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
@@ -55,6 +56,9 @@ class TrainingData(ABC):
     """Edge of the largest bins that the data can be given in, px."""
     noise: float = 0.0
     """Mean square of the noise over that of what was measured; 0 where it is not known."""
+
+    lens_rays: int = 1
+    """Rays through the lens of a pixel at the end of a run; 1 for a thin one."""
 
     held_back: Target | None = None
     """Rays that are in no batch, to judge by them; None where there are none."""
@@ -101,6 +105,7 @@ class FrameData(TrainingData):
     def __init__(
         self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, judged: bool = False
     ) -> None:
+        measurement = seen_through(measurement, settings.aperture)
         super().__init__(
             resolve_device(settings.device), measurement.box, measurement.n_ambient,
             fingerprint(measurement, settings.open_faces), is_open(measurement), measurement.quantity,
@@ -109,6 +114,7 @@ class FrameData(TrainingData):
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
+        self.lens_rays = lens_rays(measurement, settings.lens_rays)
         if judged:
             rest, held = hold_back(measurement, self.coarsest)
             with suppress(InputError):  # all that would be held back crosses an open face

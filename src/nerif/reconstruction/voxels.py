@@ -20,11 +20,12 @@ from nerif.fields.grid import DEGREES
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction import kernels_torch
+from nerif.reconstruction.aperture import check_aperture
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.descent import Descent
 from nerif.reconstruction.levels import bins_at_last
-from nerif.reconstruction.operator import VoxelOperator, check_step
+from nerif.reconstruction.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.techniques.registry import AUTO, check_model
 
@@ -45,6 +46,9 @@ class VoxelReconstructor(Reconstructor):
     """Between voxel centres: cubic B-splines, or trilinear (less accurate, little faster)."""
     model: str = AUTO
     """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
+    aperture: str = "auto"
+    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
+    (off)."""
     step: float | None = None
     """Longest distance between the planes on which rays are sampled, in voxels: at most, and by default, 1 (cubic) or
     0.5 (linear)."""
@@ -84,6 +88,7 @@ class VoxelReconstructor(Reconstructor):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         check_model(self.model)
+        check_aperture(self.aperture)
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")
@@ -113,9 +118,9 @@ class VoxelReconstructor(Reconstructor):
 
     def operator_bytes(self, measurement: Measurement, grid: Grid) -> int:
         """Return what the operators of all techniques hold."""
-        dtype = getattr(torch, self.precision)
+        dtype, each = getattr(torch, self.precision), _lens_rays(measurement, grid)
         return sum(
-            VoxelOperator.memory_bytes(rays, grid, self.basis, dtype, channels, self.step)
+            VoxelOperator.memory_bytes(each * rays, grid, self.basis, dtype, channels, self.step)
             for rays, channels in _seen(measurement, grid)
         )
 
@@ -162,3 +167,12 @@ def _seen(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
     pixels = bins_at_last(measurement, grid) ** 2
     observations = measurement.observations
     return [(int(measurement.usable_for(o).sum()) // pixels + 1, len(o.technique.channels)) for o in observations]
+
+
+def _lens_rays(measurement: Measurement, grid: Grid) -> int:
+    """The most rays that a pixel has, as those through the middles of the pictures tell."""
+    most = 1
+    for camera in measurement.cameras:
+        middle = torch.tensor([[(n - 1) / 2 for n in camera.image_size[::-1]]], dtype=camera.intrinsics.dtype)
+        most = max(most, rays_through(camera.rays(middle).clip(measurement.box), min(grid.spacing)))
+    return most

@@ -59,7 +59,7 @@ class ChunkData(TrainingData):
         like = frames[0]
         device = resolve_device(settings.device)
         super().__init__(device, like.box, like.n_ambient, parts, like.open, like.quantity)
-        self.bounds = like.bounds
+        self.bounds, self.lens_rays = like.bounds, like.lens_rays
         self.tau, self.time_octaves = tau, time_octaves
         self.regions = [frame.ambient for frame in frames]
         targets = [frame.target for frame in frames]

@@ -25,6 +25,7 @@ from nerif.measurement_sequence import MeasurementSequence
 from nerif.metrics import correlation
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.quantities import derive
+from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Step
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
@@ -113,7 +114,8 @@ def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurem
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
     found = Volume.of(field.sample(grid, device), grid, measurement.quantity, measurement.n_ambient)
     volumes = [derive(found, wanted, plan.settings.gas) for wanted in plan.settings.quantities]
-    scores = _against_measured(plan.cold.model, field, measurement, device)
+    seen = seen_through(measurement, plan.cold.aperture)
+    scores = _against_measured(plan.cold.model, field, seen, device)
     return Frame(field, volumes, scores, seconds=0.0, steps=0)
 
 

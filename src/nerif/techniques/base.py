@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import torch
@@ -151,7 +151,7 @@ class ForwardModel(ABC):
     @classmethod
     def seen_by(cls, camera: Camera) -> Camera:
         """Return the camera, without its background if the technique looks at none."""
-        return camera if cls.background or camera.background is None else replace(camera, background=None)
+        return camera if cls.background or camera.background is None else camera.without_background
 
     def bend(
         self,
@@ -216,8 +216,13 @@ class ForwardModel(ABC):
         return float((measured / sizes[:, None]).square().mean().sqrt()) / self.fill
 
 
-def midpoints(rays: Rays, samples: int) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
-    """Return the midpoints of `samples` equal intervals between near and far, and their length, both mm."""
+def midpoints(rays: Rays, samples: int, of_pixel: int = 1) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+    """Return the midpoints of `samples` equal intervals between near and far, and their length, both mm.
+
+    Where several rays in a row are those of a pixel, the samples of each stand elsewhere in their intervals, evenly.
+    """
     step = ((rays.far - rays.near) / samples)[:, None].expand(-1, samples)
-    index = torch.arange(samples, dtype=rays.near.dtype, device=rays.near.device) + 0.5
+    place = (torch.arange(of_pixel, dtype=rays.near.dtype, device=rays.near.device) + 0.5) / of_pixel
+    index = torch.arange(samples, dtype=rays.near.dtype, device=rays.near.device)
+    index = index + place.repeat(len(rays) // of_pixel)[:, None]
     return rays.near[:, None] + index * step, step

@@ -1,0 +1,132 @@
+"""A pixel sees through the whole of a lens: its rays, where they meet, and how they are seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.geometry import PROJECTIONS, Box, Lens, Plane, Ring, disc_points
+
+BOX = Box.cube(40.0)
+RING = Ring(views=2, arc=(20.0, 70.0), elevation=6.0, image_size=(8, 10), pixel_pitch=0.2)
+
+
+def camera(lens: Lens | None, projection: str = "perspective"):
+    """One that looks at a tilted background."""
+    found = replace(RING, projection=projection).cameras()[0]
+    normal = torch.nn.functional.normalize(found.background.normal + torch.tensor([0.0, 0.1, 0.2]).double(), dim=0)
+    return replace(found, background=Plane(normal, found.background.offset), lens=lens)
+
+
+def spread(lens: Lens, projection: str = "perspective", each: int = 6):
+    """The rays of all pixels, and those through points of the lens."""
+    seen = camera(lens, projection)
+    rays = seen.rays(seen.pixel_grid().reshape(-1, 2), view=3).clip(BOX)
+    return seen, rays, rays.through(disc_points(len(rays), each))
+
+
+@pytest.mark.parametrize("projection", sorted(PROJECTIONS))
+@pytest.mark.parametrize("focus", [None, 500.0])
+def test_rays_through_a_lens_meet_where_it_is_focused(focus, projection):
+    lens = Lens(12.0, focus)
+    seen, rays, through = spread(lens, projection)
+    assert len(through) == 6 * len(rays)
+    axis = seen.rotation[2]
+    away = through.origin.reshape(-1, 6, 3) - rays.origin[:, None]
+    assert float((away @ axis).abs().max()) < 1e-9  # across the optical axis
+    assert float(away.norm(dim=-1).max()) <= 6.0
+    depth = seen.depth(seen.plane) if focus is None else focus
+    if focus is None:
+        ends = through.end_points.reshape(-1, 6, 3)
+        assert torch.allclose(ends, rays.end_points[:, None].expand_as(ends), atol=1e-8)
+    else:
+        start = through.origin - seen.centre
+        reach = (depth - start @ axis) / (through.direction @ axis)
+        points = (through.origin + reach[:, None] * through.direction).reshape(-1, 6, 3)
+        assert float((points - points[:, :1]).abs().max()) < 1e-8
+        plane = seen.plane
+        assert torch.allclose(through.end_points @ plane.normal, torch.tensor(plane.offset).double(), atol=1e-8)
+    assert torch.equal(through.view, torch.full((len(through),), 3, dtype=torch.int16))
+    assert torch.equal(through.pixel, rays.pixel.repeat_interleave(6, 0))
+    again = through.clip(BOX)
+    assert torch.equal(again.near, through.near)
+    assert through.lens is None
+
+
+@pytest.mark.parametrize("projection", sorted(PROJECTIONS))
+def test_a_movement_in_the_background_is_seen_alike_by_all_rays_of_a_pixel(projection):
+    """S' of a ray is S on the plane, and 0 along the ray."""
+    seen, rays, through = spread(Lens(20.0), projection, 4)
+    normal = seen.plane.normal
+    along = torch.linalg.cross(normal, torch.tensor([0.3, 0.2, 0.9]).double())
+    for vector in (along, torch.linalg.cross(normal, along)):
+        each = (through.ends.sensitivity @ vector).reshape(-1, 4, 2)
+        assert torch.allclose(each, (rays.ends.sensitivity @ vector)[:, None].expand_as(each), atol=1e-12)
+    blind = torch.einsum("nij,nj->ni", through.ends.sensitivity, through.direction)
+    assert float(blind.abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize(("count", "degree"), [(4, 3), (6, 3), (8, 3), (12, 5), (16, 7)])
+def test_points_of_the_disc_have_its_mean(count, degree):
+    """Source: moments of the unit disc, x^a y^b with a, b even: 2 / (a + b + 2) times the mean of cos^a sin^b."""
+    points = disc_points(50, count, torch.Generator().manual_seed(1)).double()
+    assert not torch.allclose(points[0], points[1])
+    theta = torch.arange(64, dtype=torch.float64) * (2 * math.pi / 64)
+    for a in range(degree + 1):
+        for b in range(degree + 1 - a):
+            around = (theta.cos() ** a * theta.sin() ** b).mean()
+            expected = (2 / (a + b + 2) * around).expand(50)
+            found = (points[..., 0] ** a * points[..., 1] ** b).mean(dim=1)
+            assert torch.allclose(found, expected, atol=1e-6), (a, b)
+    assert torch.equal(disc_points(5, 4), disc_points(5, 4))
+    assert torch.equal(disc_points(3, 1), torch.zeros(3, 1, 2))
+
+
+def test_what_a_background_hides_from_a_part_of_the_lens_carries_no_light():
+    """A background that cuts the box before some of the rays have left it."""
+    _, rays, through = spread(Lens(30.0), each=4)
+    ends = replace(through.ends, distance=torch.where(torch.arange(len(through)) % 4 == 0, 1.0, through.ends.distance))
+    cut = replace(through, background=ends)
+    shares = cut.shares(4).reshape(-1, 4)
+    crossing = cut.crosses.reshape(-1, 4).all(dim=1)
+    assert torch.equal(shares[crossing], torch.tensor([0, 1, 1, 1]).double().div(3).expand(int(crossing.sum()), 4))
+    seen = torch.arange(4.0).repeat(len(rays))[:, None].double()
+    assert torch.allclose(cut.mean_of(4, seen)[crossing], torch.tensor(2.0).double())
+    assert torch.allclose(through.mean_of(4, seen), torch.tensor(1.5).double())
+
+
+def test_a_lens_by_its_f_number():
+    seen = RING.cameras(f_number=8.0)[0]
+    # the image of the background is sharp: the distance of the image from the lens over the f-number
+    assert seen.lens.diameter == pytest.approx(RING.focal_length / 8.0)
+    assert RING.cameras()[0].lens is None
+    with pytest.raises(InputError, match="f_number: expected above 0"):
+        RING.cameras(f_number=-1.0)
+
+
+def test_a_camera_that_looks_at_no_background_keeps_its_focus():
+    seen = camera(Lens(5.0)).without_background
+    assert seen.background is None
+    assert seen.lens.focus == pytest.approx(camera(None).depth(camera(None).plane))
+    with pytest.raises(InputError, match="focus_distance of view '20deg': expected mm along the optical axis"):
+        replace(camera(Lens(5.0)), background=None)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [((-1.0,), "aperture_diameter"), ((math.inf,), "aperture_diameter"), ((1.0, 0.0), "focus_distance"),
+     ((1.0, None, 0), "points")],
+)  # fmt: skip
+def test_lenses_that_cannot_be(wrong, words):
+    with pytest.raises(InputError, match=words):
+        Lens(*wrong)
+
+
+def test_thin_rays_pass_no_lens():
+    seen = camera(None)
+    with pytest.raises(InputError, match="expected rays through a lens, got thin ones"):
+        seen.rays(seen.pixel_grid().reshape(-1, 2)).through(torch.zeros(80, 1, 2))

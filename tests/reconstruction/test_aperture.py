@@ -1,0 +1,185 @@
+"""Reconstruction through lenses: what their cones see is what is compared, and knowing of them pays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerif.cli import main
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_volume
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Grid, Lens, Ring
+from nerif.measurement import Measurement
+from nerif.physics.path_integral import PathIntegral, project
+from nerif.prediction import predict_view
+from nerif.reconstruction.aperture import lens_rays, seen_through
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.operator import VoxelOperator, rays_through
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.total_variation import TotalVariation
+from nerif.simulation import simulate, view_displacement
+from nerif.techniques.registry import forward_model
+from nerif.volume_file import read_volume
+
+BOX = Box.cube(50.0)
+RING = Ring(views=4, arc=(0.0, 135.0), image_size=(14, 16), pixel_pitch=0.25)
+RIGS = Path(__file__).parents[3] / "shared" / "data" / "rigs"
+
+
+def flame():
+    return make_phantom("flame", BOX, seed=3)
+
+
+@pytest.fixture(scope="module")
+def wide() -> Measurement:
+    """Through lenses of 12.5 mm, whose cones are some 5 mm wide in the flow."""
+    cameras = tuple(replace(c, lens=Lens(12.5, points=12)) for c in RING.cameras())
+    return simulate(flame(), cameras, BOX, 1.00027, 0.02, 1, 40)
+
+
+def test_the_path_integral_through_a_lens_is_what_curved_rays_see(wide):
+    camera, ball = replace(wide.cameras[1], lens=Lens(12.5, points=100)), make_phantom("gaussians", BOX, seed=1)
+    exact = view_displacement(ball, camera, BOX, 1.00027, 40)
+    thin = view_displacement(ball, replace(camera, lens=None), BOX, 1.00027, 40)
+    found = predict_view(ball, camera, PathIntegral(forward_model(wide.techniques[0], wide), 80), BOX)
+    scale = float(exact.std())
+    assert float((exact - thin).std()) > 0.03 * scale
+    assert float((exact - found).std()) < 0.005 * scale
+
+
+def test_the_focus_is_where_a_lens_sees_like_a_pinhole(wide):
+    """Focused in the middle of the flow the cone is narrow there, and the background is blurred instead."""
+    thin = replace(wide.cameras[0], lens=None)
+    pinhole, background, flow = (
+        view_displacement(make_phantom("gaussians", BOX, seed=1), camera, BOX, 1.00027, 20)
+        for camera in (thin, replace(thin, lens=Lens(12.5)), replace(thin, lens=Lens(12.5, RING.distance)))
+    )
+    assert float((flow - pinhole).std()) < 0.5 * float((background - pinhole).std())
+
+
+@pytest.mark.parametrize("basis", ["linear", "cubic"])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_adjoint_of_an_operator_through_lenses(basis, compiled, wide):
+    rays, values, _ = wide.rays()
+    grid = Grid.of_resolution(BOX, 12)
+    operator = VoxelOperator(rays, grid, forward_model(wide.techniques[0], wide), basis, dtype=torch.float64)
+    operator.compiled = compiled
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(grid.shape, generator=generator, dtype=torch.float64)
+    y = torch.rand(values.shape, generator=generator, dtype=torch.float64)
+    assert operator.range_shape == tuple(values.shape)
+    assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-9)
+
+
+def test_the_operator_sees_what_the_path_integral_does(wide):
+    rays, _, _ = wide.rays()
+    grid = Grid.of_resolution(BOX, 40)
+    model = forward_model(wide.techniques[0], wide)
+    operator = VoxelOperator(rays, grid, model, "cubic")
+    field = operator.field(flame().sample(grid))
+    exact = project(PathIntegral(model, 120), field, rays)
+    seen = operator(flame().sample(grid))
+    assert float((seen - exact).std()) < 0.04 * float(exact.std())
+    assert rays_through(rays, 1.0) > rays_through(rays, 10.0) >= 2
+    assert rays_through(rays, 1e-3) == 16
+    assert rays_through(replace(rays, lens=None), 1.0) == 1
+    assert operator.for_rays(rays[:10], model).range_shape == (10, 2)
+
+
+def test_the_aperture_can_be_turned_off_and_insisted_on(wide):
+    thin = seen_through(wide, "off")
+    assert all(camera.lens is None for camera in thin.cameras)
+    assert seen_through(wide, "auto") is seen_through(wide, "on") is wide
+    assert seen_through(thin, "off") is thin
+    with pytest.raises(InputError, match="aperture: expected a measurement that knows aperture_diameter"):
+        seen_through(thin, "on")
+    for kind in (NeRIF, Tikhonov):
+        with pytest.raises(InputError, match="aperture: expected one of auto, on, off, got 'f/8'"):
+            kind(aperture="f/8")
+        with pytest.raises(InputError, match="knows aperture_diameter"):
+            kind(aperture="on")(thin)
+    with pytest.raises(InputError, match="lens_rays: expected an even number"):
+        NeRIF(lens_rays=3)
+
+
+def test_a_wider_cone_is_followed_by_more_rays(wide):
+    def of(diameter: float, asked: int = 0) -> int:
+        cameras = tuple(replace(c, lens=Lens(diameter)) for c in wide.cameras)
+        return lens_rays(replace(wide, cameras=cameras), asked)
+
+    assert lens_rays(seen_through(wide, "off")) == 1
+    assert [of(0.0), of(1.0), of(100.0)] == [2, 2, 12]
+    assert 2 <= of(4.0) <= of(8.0) <= of(16.0) <= 12
+    assert of(4.0, 8) == 8
+
+
+def test_lenses_are_known_of_all_views_or_of_none(wide):
+    one = replace(wide.cameras[0], lens=None)
+    with pytest.raises(InputError, match="aperture_diameter: expected of every view or of none"):
+        replace(wide, cameras=(one, *wide.cameras[1:]))
+
+
+def test_a_file_keeps_the_lenses(wide, tmp_path):
+    cameras = tuple(replace(c, lens=Lens(float(i), 600.0 if i == 2 else None)) for i, c in enumerate(wide.cameras))
+    replace(wide, cameras=cameras).write(tmp_path / "m.nc")
+    back = Measurement.read(tmp_path / "m.nc")
+    assert [c.lens for c in back.cameras] == [c.lens for c in cameras]
+    dataset = replace(wide, cameras=cameras).to_dataset()
+    assert dataset.attrs["Conventions"] == "BOST-1.1"
+    dataset["aperture_diameter"][1] = -1.0
+    with pytest.raises(InputError, match="view '45deg': aperture_diameter: expected a lens of 0 mm or more"):
+        Measurement.from_dataset(dataset)
+    dataset["aperture_diameter"][:] = 0.0
+    assert all(c.lens is None for c in Measurement.from_dataset(dataset).cameras)
+
+
+def test_knowing_the_lens_pays(wide):
+    truth = flame().sample(grid := Grid.of_resolution(BOX, 32))
+    errors = []
+    for aperture in ("auto", "off"):
+        method = NeRIF(max_steps=150, points_per_batch=2048, device="cpu", aperture=aperture)
+        errors.append(float((method(wide).field.sample(grid) - truth).norm() / truth.norm()))
+    assert errors[0] < 0.95 * errors[1]
+
+
+def test_a_run_through_lenses_is_repeated_exactly_and_resumed(wide):
+    settings = NeRIF(max_steps=20, points_per_batch=1024, device="cpu", lens_rays=6)
+    points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 40 - 20
+    whole = settings(wide)
+    half = settings(wide, on_step=lambda step: step.step == 10)
+    assert torch.equal(whole.field(points), settings(wide, resume=half.state).field(points))
+    with pytest.raises(InputError, match="got other cameras"):
+        settings(seen_through(wide, "off"), resume=half.state)
+
+
+def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
+    path, out = tmp_path / "m.nc", tmp_path / "r"
+    wide.write(path)
+    quick = ["--max-steps", "2", "--network.width", "8", "--voxels", "8", "--no-report"]
+    assert main(["info", str(path)]) == 0
+    assert "aperture       12.5 mm, focused on their backgrounds" in capsys.readouterr().out
+    assert main(["reconstruct", str(path), "-o", str(out), "--aperture", "off", *quick]) == 0
+    assert main(["evaluate", str(out), "--measurement", str(path)]) == 0
+    seen_through(wide, "off").write(tmp_path / "thin.nc")
+    capsys.readouterr()
+    assert main(["reconstruct", str(tmp_path / "thin.nc"), "-o", str(tmp_path / "t"), "--aperture", "on", *quick]) == 2
+    told = capsys.readouterr().err
+    assert "expected a measurement that knows aperture_diameter" in told
+    assert len(told.splitlines()) == 1
+    assert not (tmp_path / "t").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not RIGS.is_dir(), reason="the measurements of others are not beside the project (shared/data)")
+@pytest.mark.parametrize("method", [NeRIF(time_limit=45.0, epochs=1e9), TotalVariation(voxels=48)], ids=["nerif", "tv"])
+def test_the_cone_of_a_rig_of_others_is_known(method):
+    measurement, truth = Measurement.read(RIGS / "f4.nc"), read_volume(RIGS / "truth.nc")
+    errors = [
+        evaluate_volume(replace(method, aperture=aperture)(measurement).field, truth, measurement.n_ambient)["l2"]
+        for aperture in ("auto", "off")
+    ]
+    assert errors[0] < 0.8 * errors[1]
