@@ -16,6 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = (
     "index", "tutorial", "images", "sequences", "particles", "python", "choosing", "limits", "conventions", "method",
+    "pixels",
     "formats", "benchmarks", "api", "contributing", "architecture", "changelog", "api/geometry", "api/reconstruction",
     "repository/benchmarks/results/methods-cpu", "repository/examples/own_data",
 )  # fmt: skip

@@ -77,7 +77,8 @@ def evaluate(
     if data is not None:
         asked = directory.settings()
         held_out = _held_out(hold_out, asked, data)
-        data = with_gains(seen_through(data, str(asked.get("aperture", "off"))), gains_of(asked))
+        aperture = "off" if asked.get("aperture", "off") == "off" else "auto"
+        data = with_gains(seen_through(data, aperture), gains_of(asked))
         views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
         metrics["measurement"] = str(Path(str(measurement)).resolve())

@@ -113,8 +113,7 @@ class Experiment:
             "background_scale": background_scale(cameras),
             "target": asdict(self.target_for(cameras)),
         }
-        if cameras[0].lens is not None:
-            settings["aperture_diameter"] = cameras[0].lens.diameter
+        settings |= _lens_as_calibrated(cameras[0])
         if not cameras[0].projection.shows_depth:
             settings["projection"] = cameras[0].projection.name
             settings["side"] = side_of_one(cameras)
@@ -181,6 +180,17 @@ class Experiment:
         # a 16-bit file tells that only so many bits of it are used
         tags = [(281, "H", 1, 2**self.sensor.bits - 1, False)]
         tifffile.imwrite(path, counts, extratags=tags)
+
+
+def _lens_as_calibrated(camera: Camera) -> dict[str, float]:
+    """The options of nerif calibrate for the lens: of a telecentric camera calibration has z_cam = 0 at the origin."""
+    if camera.lens is None or camera.lens.diameter == 0:
+        return {}
+    diameter, focus = camera.lens.diameter, camera.lens.focus
+    if not camera.projection.shows_depth:
+        depth, origin = focus or camera.depth(camera.plane), float(camera.local(ORIGIN)[2])
+        diameter, focus = diameter * abs(1 - origin / depth), None if focus is None else focus - origin
+    return {"aperture_diameter": diameter, **({} if focus is None else {"focus_distance": focus})}
 
 
 def background_scale(cameras: Sequence[Camera]) -> float:

@@ -119,6 +119,7 @@ def test_a_camera_that_looks_at_no_background_keeps_its_focus():
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [((-1.0,), "aperture_diameter"), ((math.inf,), "aperture_diameter"), ((1.0, 0.0), "focus_distance"),
+     ((1.0, math.inf), "focus_distance"),
      ((1.0, None, 0), "points")],
 )  # fmt: skip
 def test_lenses_that_cannot_be(wrong, words):
@@ -130,3 +131,28 @@ def test_thin_rays_pass_no_lens():
     seen = camera(None)
     with pytest.raises(InputError, match="expected rays through a lens, got thin ones"):
         seen.rays(seen.pixel_grid().reshape(-1, 2)).through(torch.zeros(80, 1, 2))
+
+
+def test_where_a_telecentric_camera_counts_its_depth_from_changes_nothing():
+    """z_cam = 0 before, in and behind the flow, the diameter of the cone there with it."""
+    depth = camera(None).depth(camera(None).plane)
+    seen, disc = camera(Lens(12.0, depth), "telecentric"), torch.tensor([[[0.6, -0.3], [0.0, 0.0]]]).double()
+    pixel = torch.tensor([[4.0, 3.0]], dtype=torch.float64)
+    first = seen.rays(pixel).clip(BOX).through(disc)
+    for shift in (700.0, depth + 300.0):
+        moved = replace(seen, translation=seen.translation - torch.tensor([0.0, 0.0, shift]).double())
+        moved = replace(moved, lens=Lens(12.0 * abs(1 - shift / depth), depth - shift))
+        turned = disc if shift < depth else -disc  # beyond the focus the cone is upside down
+        other = moved.rays(pixel).clip(BOX).through(turned)
+        assert torch.allclose(other.direction, first.direction, atol=1e-9)
+        enter = [r.origin + r.near[:, None] * r.direction for r in (first, other)]
+        assert torch.allclose(*enter, atol=1e-6)
+        assert torch.allclose(other.end_points, first.end_points, atol=1e-6)
+        assert bool(other.unobstructed.all())
+
+
+def test_a_pinhole_is_not_in_focus_behind_itself():
+    with pytest.raises(InputError, match="focus_distance of view '20deg': expected a lens in focus before the camera"):
+        camera(Lens(3.0, -500.0))
+    thin = replace(camera(Lens(0.0)), background=None)  # beside views whose lens is known
+    assert float(thin.rays(torch.zeros(1, 2).double()).lens.radius) == 0

@@ -10,17 +10,18 @@ import torch
 
 from nerif.cli import main
 from nerif.conventions import InputError
-from nerif.evaluation import evaluate_volume
+from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral, project
-from nerif.prediction import predict_view
+from nerif.prediction import predict_view, reproject
 from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.operator import VoxelOperator, rays_through
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
+from nerif.result import ResultDirectory
 from nerif.simulation import simulate, view_displacement
 from nerif.techniques.registry import forward_model
 from nerif.volume_file import read_volume
@@ -95,6 +96,8 @@ def test_the_aperture_can_be_turned_off_and_insisted_on(wide):
     assert all(camera.lens is None for camera in thin.cameras)
     assert seen_through(wide, "auto") is seen_through(wide, "on") is wide
     assert seen_through(thin, "off") is thin
+    none = replace(wide, cameras=tuple(replace(camera, lens=Lens(0.0)) for camera in wide.cameras))
+    assert all(camera.lens is None for camera in seen_through(none, "auto").cameras)
     with pytest.raises(InputError, match="aperture: expected a measurement that knows aperture_diameter"):
         seen_through(thin, "on")
     for kind in (NeRIF, Tikhonov):
@@ -112,7 +115,7 @@ def test_a_wider_cone_is_followed_by_more_rays(wide):
         return lens_rays(replace(wide, cameras=cameras), asked)
 
     assert lens_rays(seen_through(wide, "off")) == 1
-    assert [of(0.0), of(1.0), of(100.0)] == [2, 2, 12]
+    assert [of(0.0), of(1.0), of(100.0)] == [1, 2, 12]
     assert 2 <= of(4.0) <= of(8.0) <= of(16.0) <= 12
     assert of(4.0, 8) == 8
 
@@ -164,6 +167,18 @@ def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
     assert "aperture       12.5 mm, focused on their backgrounds" in capsys.readouterr().out
     assert main(["reconstruct", str(path), "-o", str(out), "--aperture", "off", *quick]) == 0
     assert main(["evaluate", str(out), "--measurement", str(path)]) == 0
+    field, _, _ = ResultDirectory(out).field()
+    seen = {name: reproject(field, seen_through(wide, name)) for name in ("auto", "off")}
+    scores = {name: evaluate_views(reprojection)[0]["rms"] for name, reprojection in seen.items()}
+    assert ResultDirectory(out).metrics()["views"][0]["rms"] == pytest.approx(scores["off"], rel=1e-4)
+    assert scores["auto"] != pytest.approx(scores["off"], rel=1e-3)
+    assert main(["project", str(out), "-o", str(tmp_path / "p.nc"), "--cameras", str(path), "--f-number", "8"]) == 2
+    assert main(["project", str(out), "-o", str(tmp_path / "p.nc"), "--aperture", "off"]) == 2
+    ring = ["--views", "2", "--image-size", "5", "6", "--pixel-pitch", "0.6", "--f-number", "4"]
+    assert main(["project", str(out), "-o", str(tmp_path / "p.nc"), *ring, "--samples", "20"]) == 0
+    assert [c.lens.diameter for c in Measurement.read(tmp_path / "p.nc").cameras] == pytest.approx([12.5, 12.5])
+    assert main(["simulate", "-o", str(tmp_path / "s.nc"), *ring, "--steps", "5", "--truth-voxels", "4"]) == 0
+    assert [c.lens.diameter for c in Measurement.read(tmp_path / "s.nc").cameras] == pytest.approx([12.5, 12.5])
     seen_through(wide, "off").write(tmp_path / "thin.nc")
     capsys.readouterr()
     assert main(["reconstruct", str(tmp_path / "thin.nc"), "-o", str(tmp_path / "t"), "--aperture", "on", *quick]) == 2

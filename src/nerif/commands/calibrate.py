@@ -134,7 +134,7 @@ def _draw(path: Path, cameras: Sequence[CalibratedCamera] | Sequence[Camera], bo
             whole.append(camera)
             continue
         try:
-            whole.append(camera.camera())
+            whole.append(replace(camera, lens=None).camera())
         except InputError as error:
             say(f"note: not drawn: {error}")
     if not whole:

@@ -60,6 +60,10 @@ def run(settings: Project) -> Measurement:
     result = ResultDirectory(settings.result)
     index, box, n_ambient = result.field()
     wavelength = settings.wavelength_nm
+    if settings.cameras is not None and settings.f_number:
+        raise InputError("f_number: expected for the ring, got cameras of a file, which know their own aperture")
+    if settings.cameras is None and settings.aperture != "auto":
+        raise InputError("aperture: expected together with --cameras FILE, got no file; the ring takes --f-number")
     if settings.cameras is not None:
         given = seen_through(Measurement.read(settings.cameras), settings.aperture)
         wavelength = wavelength or given.wavelength_nm

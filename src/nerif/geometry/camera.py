@@ -111,10 +111,21 @@ class Camera:
                 f"got {self.image_size}"
             )
 
-        if self.lens is not None and self.lens.focus is None and plane is None:
+        if self.lens is not None and self.lens.diameter > 0:
+            self._check_focus(self.lens)
+
+    def _check_focus(self, lens: Lens) -> None:
+        """Refuse a lens of which it is not known where it is in focus, or that is in focus where it is."""
+        if lens.focus is None and self.background is None:
             raise InputError(
                 f"focus_distance of view '{self.name}': expected mm along the optical axis for a lens of "
-                f"{self.lens.diameter:g} mm that looks at no background, got none"
+                f"{lens.diameter:g} mm that looks at no background, got none"
+            )
+        depth = self.depth(self.plane) if lens.focus is None else lens.focus
+        if not (depth > 0 or (depth < 0 and not self.projection.shows_depth)):
+            raise InputError(
+                f"focus_distance of view '{self.name}': expected a lens in focus before the camera, got a depth of "
+                f"{depth:g} mm; check background_offset, or give the distance"
             )
 
     @property
@@ -213,7 +224,7 @@ class Camera:
     def without_background(self) -> Camera:
         """The camera that looks at none, in focus where it was."""
         lens = self.lens
-        if lens is not None and lens.focus is None:
+        if lens is not None and lens.diameter > 0 and lens.focus is None:
             lens = replace(lens, focus=self.depth(self.plane))
         return replace(self, background=None, lens=lens)
 
@@ -222,11 +233,12 @@ class Camera:
         if self.lens is None:
             return None
         axis = self.rotation[2].to(direction)
-        if self.lens.focus is None:
-            assert ends is not None, "a lens without a focus looks at a background"
-            focus = ends.distance
-        else:
+        if self.lens.focus is not None:
             focus = self.lens.focus / (direction @ axis)
+        elif ends is not None:
+            focus = ends.distance
+        else:  # a thin ray beside others that are none
+            focus = torch.full_like(direction[..., 0], torch.inf)
         normal = axis if self.background is None else self.background.normal.to(direction)
         radius = torch.full_like(focus, self.lens.diameter / 2)
         return LensDiscs(axis.expand_as(direction), normal.expand_as(direction), radius, focus)

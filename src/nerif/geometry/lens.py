@@ -32,7 +32,8 @@ class Lens:
     ----------
     diameter : of the entrance pupil (focal length / f-number) or, of a telecentric lens, of the cone of rays to a point
         in focus where it passes z_cam = 0; mm; 0 for a thin ray a pixel
-    focus : depth of the plane in focus along the optical axis, mm; None for the background's
+    focus : depth of the plane in focus along the optical axis, mm, below 0 only of a telecentric lens; None for the
+        background's
     points : number of points on the disc, where pictures are rendered and measurements simulated
 
     Raises
@@ -48,8 +49,8 @@ class Lens:
     def __post_init__(self) -> None:
         if not 0 <= self.diameter <= LARGEST_LENGTH:
             raise InputError(f"aperture_diameter: expected a lens of 0 mm or more, got {self.diameter}")
-        if self.focus is not None and not 0 < self.focus <= LARGEST_LENGTH:
-            raise InputError(f"focus_distance: expected a lens in focus at more than 0 mm, got {self.focus}")
+        if self.focus is not None and not 0 < abs(self.focus) <= LARGEST_LENGTH:
+            raise InputError(f"focus_distance: expected a lens in focus elsewhere than at 0 mm, got {self.focus}")
         if self.points < 1:
             raise InputError(f"points: expected at least one point on the lens, got {self.points}")
 

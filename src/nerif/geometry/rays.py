@@ -158,8 +158,9 @@ class Rays(Columns):
         if self.lens is None:
             raise InputError("aperture_diameter: expected rays through a lens, got thin ones")
         each, shift = disc.shape[1], self.lens.points(disc)
+        # of either sign: a telecentric camera's z_cam = 0 may be behind what is in focus
         direction = torch.nn.functional.normalize(
-            self.lens.focus[:, None, None] * self.direction[:, None] - shift, dim=-1
+            self.direction[:, None] - shift / self.lens.focus[:, None, None], dim=-1
         )
         whole = replace(self, lens=None, background=None).each(lambda x: x.repeat_interleave(each, dim=0))
         ends = self.background

@@ -273,6 +273,8 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
 def _lens(table: dict[str, Any], where: str) -> Lens | None:
     """The lens of a camera; none where its aperture is not told."""
     if "aperture_diameter" not in table:
+        if "focus_distance" in table:
+            raise InputError(f"{where}: focus_distance: expected together with aperture_diameter, got it alone")
         return None
     diameter, focus = (
         None if key not in table else float(numbers(table[key], (), f"{where}: {key}"))

@@ -42,8 +42,8 @@ class ImportSettings:
     image_size: tuple[int, int] | None = None
     """Height and width of the pictures where the file does not say, px."""
     aperture_diameter: float | None = None
-    """Of the entrance pupils (focal length over f-number), mm, through all of which a pixel then sees; from target
-    pictures too."""
+    """Of the entrance pupils (focal length over f-number), mm, through all of which a pixel then sees; of telecentric
+    lenses of the cone where it passes z_cam = 0, which calibration has at the origin. From target pictures too."""
     focus_distance: float | None = None
     """Where the lenses are focused, mm along the optical axis; default: on the background."""
 
@@ -57,7 +57,8 @@ class ImportSettings:
     @property
     def lens(self) -> Lens | None:
         """The lens of every camera, or None for what the file says."""
-        return None if self.aperture_diameter is None else Lens(self.aperture_diameter, self.focus_distance)
+        lens = Lens(self.aperture_diameter or 0.0, self.focus_distance)
+        return lens if lens.diameter else None
 
 
 def is_calibration(path: Path) -> bool:
@@ -105,6 +106,13 @@ def import_cameras(
     return tuple(checked(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
 
 
+def _scaled(lens: Lens | None, scale: float) -> Lens | None:
+    """A lens in mm, of lengths in another unit."""
+    if lens is None:
+        return None
+    return replace(lens, diameter=scale * lens.diameter, focus=None if lens.focus is None else scale * lens.focus)
+
+
 def _completed(camera: CalibratedCamera, settings: ImportSettings) -> CalibratedCamera:
     """The camera in mm, with what the file does not say."""
     plane, scale = camera.background, settings.scale_mm
@@ -123,5 +131,5 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
         translation=scale * camera.translation,
         image_size=camera.image_size or settings.image_size,
         background=plane,
-        lens=settings.lens or camera.lens,
+        lens=settings.lens or _scaled(camera.lens, scale),
     )

@@ -19,7 +19,7 @@ from nerif.techniques.base import ForwardModel, midpoints
 __all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]
 
 LENS_RAYS = 16
-"""Rays through the lens of a pixel, each with half as many samples as a thin ray (benchmarks/rigs.py)."""
+"""Rays through the lens of a pixel, each with half as many samples as a thin ray."""
 
 
 class Projector(ABC):
@@ -102,6 +102,8 @@ def project(
     """Return what many rays see of a field, chunk by chunk; 0 where a ray misses the box."""
     if chunk is None:  # arrays that stay in the cache of a CPU, and fill a GPU
         chunk = 32 if torch.device(device).type == "cpu" else 4096
+    if rays.lens is not None:
+        chunk = max(1, chunk * 2 // LENS_RAYS)
     result = torch.zeros(len(rays), projector.channels, dtype=rays.origin.dtype)
     index, field = rays.crosses.nonzero()[:, 0], field.to(device)
     for part in torch.split(index, chunk):

@@ -31,13 +31,13 @@ def seen_through(measurement: Measurement, aperture: str) -> Measurement:
         If it is "on" and no aperture is known.
     """
     check_aperture(aperture)
-    known = any(camera.lens is not None for camera in measurement.cameras)
+    known = any(camera.lens is not None and camera.lens.diameter > 0 for camera in measurement.cameras)
     if aperture == "on" and not known:
         raise InputError(
             "aperture: expected a measurement that knows aperture_diameter (mm), got one that does not; add it to the "
             "calibration (nerif calibrate --aperture-diameter) or measurement file, or leave --aperture on out"
         )
-    if aperture != "off" or not known:
+    if (aperture != "off" and known) or all(camera.lens is None for camera in measurement.cameras):
         return measurement
     return replace(measurement, cameras=tuple(replace(camera, lens=None) for camera in measurement.cameras))
 
@@ -51,7 +51,7 @@ def lens_rays(measurement: Measurement, asked: int = 0) -> int:
     """
     centre, widths = torch.tensor(measurement.box.centre, dtype=torch.float64), []
     for camera in measurement.cameras:
-        if camera.lens is not None:
+        if camera.lens is not None and camera.lens.diameter > 0:
             focus = camera.lens.focus or camera.depth(camera.plane)
             depth = float(camera.local(centre)[2])
             radius = camera.lens.diameter / 2 * abs(1 - depth / focus)

@@ -86,7 +86,8 @@ def loss_terms(
     part : pixels, what they measured, and the forward model
     rays : those of the part, or several thin ones in a row for each, whose mean the pixel sees
     s : path lengths of the samples on the rays, mm
-    step : length that each sample stands for, mm; the central differences reach half of it to either side
+    step : length that each sample stands for, mm; the central differences reach half of it to either side, shared
+        among the rays of a pixel, whose samples stand between one another
     norm : "l2" (mean length of the residual vectors, the paper's) or "squared" (mean square)
     """
     model, shape, each = part.model, s.shape, len(rays) // len(part)
@@ -127,7 +128,7 @@ def loss_terms(
             if weights.consistency:
                 terms["consistency"] = reduce(automatic.float() - head.float(), norm)
     if weights.numerical:
-        reach = step / (2 * field.half_edge)
+        reach = step / (2 * each * field.half_edge)
         seen = by_differences(network.value, integral, p.reshape(*shape, 3), reach)
         if tilt is not None:
             seen = seen - Weights(integral.profile, slope=integral.slope)(None, tilt)

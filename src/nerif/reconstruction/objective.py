@@ -24,9 +24,9 @@ from nerif.reconstruction.training_data import TrainingData
 __all__ = ["Objective", "Piece"]
 
 GAUGE_POINTS = 256  # a step
-JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a ray that is held back; such pixels at once
+JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a thin ray that is held back, of a pixel with a lens four times as many
 FEWEST = 4  # samples of a ray through a lens
-MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (benchmarks/rigs.py)
+MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (docs/architecture.md)
 
 
 @dataclass(frozen=True)
@@ -170,9 +170,11 @@ class Objective:
         held, weights, total = self.data.held_back, self.settings.weights, 0.0
         assert held is not None
         for part in held.parts:
-            for first in range(0, len(part), JUDGED_AT_ONCE):
-                some = part[first : first + JUDGED_AT_ONCE]
-                draw = Draw(1 if some.rays.lens is None else LENS_RAYS, JUDGED_SAMPLES)
+            thin = part.rays.lens is None
+            at_once = JUDGED_AT_ONCE if thin else JUDGED_AT_ONCE // 4
+            for first in range(0, len(part), at_once):
+                some = part[first : first + at_once]
+                draw = Draw(1, JUDGED_SAMPLES) if thin else Draw(LENS_RAYS, 4 * JUDGED_SAMPLES // LENS_RAYS)
                 rays = draw.rays_of(some, drawn)
                 s, interval = sample_rays(rays, draw.samples, drawn, "adaptive", self.density, draw.each)
                 terms = loss_terms(self.field, self.network, some, rays, s, interval, weights, "squared")

@@ -189,9 +189,13 @@ def rays_through(rays: Rays, length: float) -> int:
     """Return how many rays through the lens of a pixel tell what it sees of a field that changes over a length, mm."""
     if rays.lens is None:
         return 1
+    rays = rays[rays.crosses]
+    assert rays.lens is not None
+    if not len(rays):
+        return 2
     middle = 0.5 * (rays.near + rays.far)
     spread = float((rays.lens.radius * (1 - middle / rays.lens.focus)).abs().max())
-    return 2 * min(MOST_PAIRS, math.ceil(PAIRS * spread / length)) or 1
+    return 2 * min(MOST_PAIRS, max(1, math.ceil(PAIRS * spread / length)))
 
 
 def check_step(step: float, basis: str) -> None:

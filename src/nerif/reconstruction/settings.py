@@ -54,10 +54,10 @@ class TrainingSettings(Reconstructor):
     """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
     (off)."""
     lens_rays: int = 0
-    """Rays through the lens of a pixel at the end, an even number, and a third of them at the start; 0: 2 to 12,
-    as the cone is wide in pixels."""
+    """Rays through the lens of a pixel at the end, an even number, and about a third of them at the start; 0: 2
+    to 12, as the cone is wide in pixels."""
     points_per_batch: int = 8192
-    """Sample points of a step; a step takes points_per_batch / N rays."""
+    """Sample points of a step; a step takes points_per_batch / N pixels of N points each."""
     optimiser: str = "muon"
     """Muon for weight matrices and Adam for the rest, or adam for all (the paper's)."""
     learning_rate: float = 1.5e-2

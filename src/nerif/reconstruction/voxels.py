@@ -129,7 +129,8 @@ class VoxelReconstructor(Reconstructor):
         seen = _seen(measurement, grid)
         rays, numbers = sum(n for n, _ in seen), sum(n * channels for n, channels in seen)
         volumes, data = VOLUMES * math.prod(grid.shape) * self.itemsize, DATA * numbers * self.itemsize
-        preparing = 40 * 8 * rays  # rays in double precision, while the operator is made
+        each = _lens_rays(measurement, grid)
+        preparing = 40 * 8 * rays * each  # rays in double precision, while the operator is made
         around = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
         return self.operator_bytes(measurement, grid) + volumes + data + preparing + around
 
@@ -170,9 +171,10 @@ def _seen(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
 
 
 def _lens_rays(measurement: Measurement, grid: Grid) -> int:
-    """The most rays that a pixel has, as those through the middles of the pictures tell."""
+    """The most rays that a pixel has, as some pixels of each picture tell."""
     most = 1
     for camera in measurement.cameras:
-        middle = torch.tensor([[(n - 1) / 2 for n in camera.image_size[::-1]]], dtype=camera.intrinsics.dtype)
-        most = max(most, rays_through(camera.rays(middle).clip(measurement.box), min(grid.spacing)))
+        some = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
+        rays = camera.rays(torch.cartesian_prod(*some).reshape(-1, 2)).clip(measurement.box)
+        most = max(most, rays_through(rays, min(grid.spacing)))
     return most

@@ -11,6 +11,7 @@ from pathlib import Path
 from nerif.conventions import InputError
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.cluster import check_workers, open_cluster
@@ -70,7 +71,7 @@ def reconstruct_sequence(
     if reconstructor.time_limit:
         raise InputError("time_limit: expected none in a sequence, whose frames are to be repeatable; give --max-steps")
     sequence = MeasurementSequence.read(measurement)
-    like = sequence.first_good()
+    like = seen_through(sequence.first_good(), reconstructor.aperture)
     like.without(settings.hold_out)
     settings = settings.for_measurement(like)
     plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)
