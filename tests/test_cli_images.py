@@ -78,9 +78,13 @@ def test_measurement_holds_what_was_rendered(experiment):
 
     phantom = make_phantom("gaussians", measurement.box, 0)
     truth = {c.name: c.camera() for c in read_cameras(experiment / "pictures" / "truth" / "calibration.toml")}
+    displaced, taken = measurement.observations
+    assert taken.technique.name == "pictures"
+    assert float(measurement.usable_for(taken).float().mean()) > 0.98
+    found = measurement.usable_for(displaced)
     for i, name in enumerate(measurement.names):
         d = view_displacement(phantom, truth[name], measurement.box, measurement.n_ambient, steps=40)
-        good = measurement.usable[i]
+        good = found[i]
         assert float(good.float().mean()) > 0.9
         error = (measurement.displacement[i] - d)[good]
         assert float(error.norm(dim=-1).median()) < 0.05

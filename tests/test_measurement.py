@@ -57,7 +57,7 @@ def test_file_opens_with_plain_xarray_and_states_its_units(full, tmp_path):
         assert dataset.attrs["Conventions"] == "BOST-1.0"
         assert dataset.attrs["ambient_faces"] == "x- z+"
         known = variables()
-        others = {name for k in TECHNIQUES.values() if k is not Deflection for name in (k.measured, k.sigma)}
+        others = {name for k in TECHNIQUES.values() if k is not Deflection for name in (k.measured, k.sigma, *k.beside)}
         lenses = {"aperture_diameter", "focus_distance"}
         assert set(dataset.data_vars) == set(known) - set(ABOUT_VIEWS) - lenses - others
         for name in dataset.data_vars:

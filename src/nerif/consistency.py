@@ -17,7 +17,7 @@ from torch import Tensor
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.mistakes import Correction, everywhere, exchanges, of_one_view
-from nerif.observation import Observation
+from nerif.observation import Observation, integrals_of
 from nerif.quick_views import (
     binned,
     compare,
@@ -93,11 +93,12 @@ def check_consistency(
     voxels : of the quick reconstructions, along the longest edge
     on_step : called with the number of reconstructions done, and of those in this round
     """
-    several = len(measurement.observations) > 1
+    observations = integrals_of(measurement)
+    several = len(observations) > 1
     views: list[ViewAgreement] = []
     findings: list[str] = []
     remarks: list[str] = []
-    for observation in measurement.observations:
+    for observation in observations:
         own = _check(observation, measurement, voxels, on_step)
         of = f"{observation.technique.name}: " if several else ""
         views += own.views

@@ -194,6 +194,7 @@ class Measurement:
             sigma = o.sigma if sigmas is None else sigmas.get(o.technique.name)
             if sigma is not None:
                 new[o.technique.sigma] = sigma
+            new |= {name: self.maps[name] for name in o.technique.beside if name in self.maps}
         return replace(self, **arguments_of(new))
 
     @property

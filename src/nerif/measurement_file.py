@@ -74,8 +74,9 @@ def variables() -> dict[str, tuple[tuple[str, ...], str]]:
     """Return dimensions and unit of every variable that a file may have."""
     measured: dict[str, tuple[tuple[str, ...], str]] = {}
     for kind in TECHNIQUES.values():
-        dimensions = PIXELS if len(kind.channels) == 1 else (*PIXELS, _component(len(kind.channels)))
-        measured |= {kind.measured: (dimensions, kind.unit), kind.sigma: (dimensions, kind.unit)}
+        own = (len(kind.channels), kind.unit)
+        for name, (channels, unit) in {kind.measured: own, kind.sigma: own, **kind.beside}.items():
+            measured[name] = (PIXELS if channels == 1 else (*PIXELS, _component(channels)), unit)
     return {**measured, **RIG, **ABOUT_VIEWS}
 
 
@@ -194,13 +195,17 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
     if not isinstance(faces, str):
         raise InputError(f"attribute ambient_faces: expected a text such as 'x- x+ y- y+', got {faces!r}")
     own = ("displacement", "sigma", *MASKS)
+    maps = {name: _map(dataset, name) for name in map_names() if name in dataset and name not in own}
+    for kind in TECHNIQUES.values():
+        if kind.measured in maps:
+            maps = kind.completed(maps, dataset.attrs)
     index = any(kind.quantity == Deflection.quantity for kind in _techniques(dataset))
     return {
         "cameras": _cameras(dataset),
         "box": _box(dataset),
         "displacement": None,
         **{name: _map(dataset, name) for name in own if name in dataset},
-        "maps": {name: _map(dataset, name) for name in map_names() if name in dataset and name not in own},
+        "maps": maps,
         "about_views": {name: _array(dataset, name) for name in ABOUT_VIEWS if name in dataset},
         "n_ambient": _number(dataset, "n_ambient", "the index around the flow, e.g. 1.00027", None if index else 1.0),
         "wavelength_nm": _number(dataset, "wavelength_nm", "nm") if "wavelength_nm" in dataset.attrs else None,

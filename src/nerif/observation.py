@@ -16,7 +16,7 @@ from nerif.techniques.registry import TECHNIQUES, forward_model
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
-__all__ = ["Observation", "arguments_of", "check_maps", "check_observations"]
+__all__ = ["Observation", "arguments_of", "check_maps", "check_observations", "integrals_of"]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,8 @@ class Observation:
         kind = self.technique
         usable = measurement.usable_for(self).flatten(1).any(dim=1).tolist()
         some = measurement.select([name for name, seen in zip(measurement.names, usable, strict=True) if seen])
-        own = {name: value for name, value in some.measured_maps.items() if name in (kind.measured, kind.sigma)}
+        names = (kind.measured, kind.sigma, *kind.beside)
+        own = {name: value for name, value in some.measured_maps.items() if name in names}
         return replace(some, cameras=tuple(kind.seen_by(c) for c in some.cameras), **arguments_of(own))
 
     def measured(self, view: int) -> Bool[Tensor, "row column"]:
@@ -81,6 +82,21 @@ class Observation:
         if self.sigma is not None:
             mask &= ((self.sigma[view] >= least) & (self.sigma[view] <= most)).all(dim=-1)
         return mask
+
+
+def integrals_of(measurement: Measurement) -> tuple[Observation, ...]:
+    """Return the observations whose values are path integrals: all but pictures of a pattern.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    found = tuple(o for o in measurement.observations if not o.technique.derived)
+    if not found:
+        names = " and ".join(o.technique.measured for o in measurement.observations)
+        raise InputError(f"measurement: expected displacements, got {names} alone; nerif displacement finds them")
+    return found
 
 
 def arguments_of(maps: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -108,6 +124,8 @@ def check_maps(measurement: Measurement) -> None:
     for kind in known.values():
         whole = (*shape, len(kind.channels)) if len(kind.channels) > 1 else tuple(shape)
         expected |= {kind.measured: whole, kind.sigma: whole}
+        for name, (channels, _) in kind.beside.items():
+            expected[name] = (*shape, channels) if channels > 1 else tuple(shape)
     for name, value in {**given, "valid": measurement.valid, "flow_mask": measurement.flow_mask}.items():
         if name not in expected:
             raise InputError(f"maps: expected names out of {', '.join(sorted(expected))}, got '{name}'")
@@ -128,9 +146,6 @@ def check_observations(measurement: Measurement) -> None:
     names = " and ".join(o.technique.name for o in observations)
     if len({o.technique.quantity for o in observations}) > 1:
         raise InputError(f"technique: expected techniques of one field, got {names}; split them into two measurements")
-    if len(observations) > 1 and any(o.sigma is None for o in observations):
-        wanted = " and ".join(o.technique.sigma for o in observations)
-        raise InputError(f"technique: {names} together are weighed by their noise: expected {wanted}, got not both")
     _check_backgrounds(measurement, names)
     for o in observations:
         forward_model(o.technique, measurement)  # refuses what it lacks

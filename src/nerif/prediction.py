@@ -20,7 +20,7 @@ from nerif.physics.ray_tracing import CurvedRays
 from nerif.reconstruction.operator import VoxelOperator, rays_through
 from nerif.reprojection import Accuracy, Reprojection
 from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import ASSUMED, AUTO, TECHNIQUES, forward_model, forward_models
+from nerif.techniques.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
 from nerif.volume import name_of
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
@@ -46,7 +46,7 @@ def check_sees(techniques: Sequence[type[ForwardModel]], quantity: str, what: st
     """
     for kind in techniques:
         if kind.quantity != quantity:
-            names = ", ".join(k.name for k in TECHNIQUES.values() if k.quantity == quantity)
+            names = ", ".join(k.name for k in TECHNIQUES.values() if k.quantity == quantity and not k.derived)
             field = f"the field of {name_of(quantity)}"
             raise InputError(f"{what}: expected a technique that sees {field} ({names}), got {kind.name}")
 
@@ -111,6 +111,7 @@ def predict(
     InputError
         If there is no such model, the technique sees another quantity, or needs what is not given.
     """
+    check_simulated((technique,))
     if quantity is not None:
         check_sees((technique,), quantity, "technique")
     shape = (len(cameras), *(max(c.image_size[i] for c in cameras) for i in (0, 1)), len(technique.channels))
@@ -149,31 +150,38 @@ def reproject(
     on_view : told how many views are done, out of how many
     model : forward model that the field was reconstructed with
     """
-    box, maps, accuracies, done = measurement.box, {}, [], 0
+    box, maps, accuracies, done = measurement.box, {}, {}, 0
+    known: dict[tuple[ForwardModel, int], Tensor] = {}  # pictures and displacements are of one integral
     many = _work(field, measurement.cameras) > EXACT_WORK[torch.device(device).type]
     voxels = on_voxels(field, box, device) if many else None
     total = sum(len(_seeing(kind, measurement.cameras)) for kind in measurement.techniques)
     for observation in measurement.observations:
         kind = observation.technique
-        projector = PathIntegral(forward_model(kind, measurement, model), SAMPLES)
+        forward = forward_model(kind, measurement, model)
+        projector = PathIntegral(forward.integral, SAMPLES)
         sampled = None if voxels is None else SampledViews(field, voxels, box, projector, device)
         predicted = torch.full_like(observation.values, float("nan"))
+        integral = forward.integral
         views = [(i, kind.seen_by(measurement.cameras[i])) for i in _seeing(kind, measurement.cameras)]
         for i, camera in views:
             height, width = camera.image_size
-            if sampled:
+            if (integral, i) not in known and sampled:
                 seen = measurement.sees_box[i, :height, :width, None]
-                predicted[i, :height, :width] = sampled(camera).where(seen, torch.zeros(()))
-            else:
-                predicted[i, :height, :width] = predict_view(field, camera, projector, box, device)
+                known[integral, i] = sampled(camera).where(seen, torch.zeros(()))
+            elif (integral, i) not in known:
+                known[integral, i] = predict_view(field, camera, projector, box, device)
+            predicted[i, :height, :width] = forward.mapped(known[integral, i], i)
             done += 1
             on_view(done, total)
         maps[kind.name] = predicted
-        found = Accuracy(kind)
-        if sampled:
-            found = sampled.accuracy(kind, [camera for _, camera in views], predicted[[i for i, _ in views]])
-        accuracies.append(found)
-    return Reprojection(measurement, maps, tuple(held_out), tuple(accuracies))
+        seen_as = type(integral) if forward.integral is not forward else kind
+        if seen_as.measured not in accuracies:
+            found = Accuracy(seen_as)
+            if sampled:
+                integrals = [known[integral, i] for i, _ in views]
+                found = sampled.accuracy(seen_as, [camera for _, camera in views], integrals)
+            accuracies[seen_as.measured] = found
+    return Reprojection(measurement, maps, tuple(held_out), tuple(accuracies.values()))
 
 
 def _seeing(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
@@ -247,7 +255,7 @@ class SampledViews:
         return bent - straight
 
     def accuracy(
-        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Float[Tensor, "view row column c"]
+        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Sequence[Float[Tensor, "row column c"]]
     ) -> Accuracy:
         """Compare what was predicted with the path integral through the network, on pixels picked at random."""
         generator = torch.Generator().manual_seed(0)

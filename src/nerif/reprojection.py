@@ -96,7 +96,8 @@ class Reprojection:
         dataset["held_out"] = (("view",), held, about)
         for accuracy in self.accuracies:
             dataset.attrs["predicted_by"] = accuracy.how
-            dataset[accuracy.technique.measured].attrs["predicted_error"] = accuracy.error
+            if accuracy.technique.measured in dataset:  # a displacement may have been seen in pictures alone
+                dataset[accuracy.technique.measured].attrs["predicted_error"] = accuracy.error
             if accuracy.technique.in_pixels():
                 dataset.attrs["predicted_error_px"] = accuracy.error
         with atomic(path) as part:

@@ -25,7 +25,7 @@ from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.ray_tracing import background_points
 from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import ASSUMED, TECHNIQUES, forward_model, technique
+from nerif.techniques.registry import ASSUMED, TECHNIQUES, check_simulated, forward_model, technique
 from nerif.volume import INDEX, Volume
 from nerif.volume_file import read_volume
 from nerif.volume_sequence import VolumeSequence
@@ -195,6 +195,7 @@ class Simulation:
         if not self.technique:
             raise InputError(f"technique: expected one or more of {', '.join(TECHNIQUES)}, got none")
         kinds = [technique(name) for name in self.technique]
+        check_simulated(kinds)
         for name in ("peak", "counts"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")

@@ -21,6 +21,7 @@ from nerif.imaging.over_time import frame_numbers, instants_of, measure_recordin
 from nerif.imaging.views import find_views
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.techniques.deflection import Deflection
 
 __all__ = ["Displacement", "main", "run"]
 
@@ -58,6 +59,8 @@ class Displacement(Settings):
     """Most reference pictures to read; 0 for all."""
     mask: float = 0.0
     """Flow mask (for the visual hull) where |d| exceeds this many sigma; 0 for none. 4 is a good value."""
+    pictures: bool = True
+    """Keep the pictures beside the displacements, to reconstruct straight from them (not of averages or sequences)."""
     force: bool = False
     """Overwrite existing files."""
     surroundings: Annotated[Surroundings, Flat] = field(default_factory=Surroundings)
@@ -71,7 +74,7 @@ class Displacement(Settings):
         masks = MaskSettings(self.mask) if self.mask else None
         views = find_views(self.folder, self.views)
         cameras = {c.name: c for c in import_cameras(self.calibration)}
-        return Recording(views, cameras, scene, self.method, masks, self.references)
+        return Recording(views, cameras, scene, self.method, masks, self.references, self.pictures)
 
 
 def run(settings: Displacement) -> Measurement:
@@ -113,7 +116,8 @@ def run_over_time(settings: Displacement, recording: Recording) -> MeasurementSe
 def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
     say(f"{'view':<12}{'valid':>8}{'rms d [px]':>12}{'max |d| [px]':>14}{'sigma [px]':>12}  noise from")
     assert measurement.sigma is not None
-    usable = measurement.usable
+    (found,) = (o for o in measurement.observations if o.technique is Deflection)
+    usable = measurement.usable_for(found)
     for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
         d, sigma = measurement.displacements[i][usable[i]], measurement.sigma[i][usable[i]]
         share = len(d) / (camera.image_size[0] * camera.image_size[1])

@@ -30,6 +30,9 @@ T = TypeVar("T")
 Flat = tyro.conf.arg(name="")
 """Marks a field whose record stands among the other settings, without a prefix."""
 
+ALIASES = {"from": "source"}
+"""Names that settings may be given by, beside their own: words that Python keeps for itself."""
+
 IGNORED = ("about",)  # the table of run.toml that tells what came out
 
 
@@ -114,7 +117,7 @@ def merge(default: T, values: dict[str, Any], source: str) -> T:
     names = flat_names(cls)
     groups: dict[str, dict[str, Any]] = {}
     changes: dict[str, Any] = {}
-    values = {key.replace("-", "_"): value for key, value in values.items()}
+    values = {ALIASES.get(key, key.replace("-", "_")): value for key, value in values.items()}
     check_known(values, names, source)
     for key, value in values.items():
         where = names[key]
@@ -158,7 +161,9 @@ def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
     InputError
         In one line, where the library would draw a box.
     """
-    arguments = [re.sub(r"^(--[\w.-]+)", lambda m: m[1].replace("_", "-"), a) for a in arguments]
+    arguments = [
+        re.sub(r"^--([\w.-]+)", lambda m: f"--{ALIASES.get(m[1], m[1].replace('_', '-'))}", a) for a in arguments
+    ]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):

@@ -39,13 +39,18 @@ class Scene:
     surroundings: Surroundings = Surroundings()
 
 
-def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], scene: Scene) -> Measurement:
+def join_views(
+    views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], scene: Scene, pictures: bool = False
+) -> Measurement:
     """Return one measurement of all views; smaller pictures are padded.
+
+    With pictures a pixel is valid where one of the two says something, and the other is NaN there.
 
     Parameters
     ----------
     views : camera, displacement and flow mask (or None) of each, held one at a time
     scene : box and surroundings
+    pictures : whether to keep those that the displacements were found in
     """
     cameras: list[Camera] = []
     maps: dict[str, list[np.ndarray]] = {"displacement": [], "sigma": [], "valid": [], "flow_mask": []}
@@ -54,9 +59,14 @@ def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], sce
         cameras.append(camera)
         everywhere = np.ones(found.valid.shape, dtype=bool)  # no mask says nothing about where the flow is
         masked |= mask is not None
-        own = (found.displacement, found.sigma, found.valid, everywhere if mask is None else mask)
-        for arrays, array in zip(maps.values(), own, strict=True):
-            arrays.append(array)
+        own = {"displacement": found.displacement, "sigma": found.sigma, "valid": found.valid}
+        own["flow_mask"] = everywhere if mask is None else mask
+        if pictures and found.pair is not None:
+            own["displacement"] = np.where(found.valid[..., None], found.displacement, np.float32(np.nan))
+            own["valid"] = found.valid | np.isfinite(found.pair.flow)
+            own |= {"reference": found.pair.reference, "flow": found.pair.flow, "picture_sigma": found.pair.sigma}
+        for name, array in own.items():
+            maps.setdefault(name, []).append(array)
     size = tuple(max(v.shape[k] for v in maps["valid"]) for k in range(2))
 
     def stack(name: str) -> torch.Tensor:
@@ -75,6 +85,7 @@ def join_views(views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], sce
         n_ambient=scene.surroundings.n_ambient,
         sigma=stack("sigma"),
         valid=stack("valid"),
+        maps={name: stack(name) for name in ("reference", "flow", "picture_sigma") if name in maps},
         flow_mask=stack("flow_mask") if masked else None,
         wavelength_nm=scene.surroundings.wavelength_nm,
         ambient_faces=scene.surroundings.ambient_faces,

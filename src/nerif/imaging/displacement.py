@@ -21,6 +21,7 @@ from nerif.conventions import InputError
 from nerif.imaging.exposure import saturated
 from nerif.imaging.noise import FLOOR, local_correlation, smoothed_away, structure_variance
 from nerif.imaging.optical_flow import FLOWS
+from nerif.imaging.photometry import CameraNoise, PicturePair
 from nerif.imaging.shake import border, remove_shake
 from nerif.imaging.warping import warp
 
@@ -87,12 +88,14 @@ class DisplacementMap:
     sigma : (row, column, 2) standard deviation of its noise, px
     valid : (row, column) where it holds
     noise_from : "repeats" (of the reference, and residual) or "structure tensor"
+    pair : the pictures that it was found in; None where it is the mean of several
     """
 
     displacement: Float[np.ndarray, "row column 2"]
     sigma: Float[np.ndarray, "row column 2"]
     valid: Bool[np.ndarray, "row column"]
     noise_from: str
+    pair: PicturePair | None = None
 
 
 def displacement(reference: Image, flow: Image, settings: DisplacementSettings) -> Float[np.ndarray, "row column 2"]:
@@ -123,6 +126,8 @@ class AtRest:
     full_scale : grey value at which it is; infinite if not known
     averaged : number of flow frames whose displacements are averaged
     noise : (row, column, 2) of repeats: as seen, and by the gradients, px; None with fewer than three frames
+    frames : number of frames
+    camera : noise of the grey values; None with fewer than two frames
     """
 
     mean: Image
@@ -131,6 +136,8 @@ class AtRest:
     full_scale: float
     averaged: int
     noise: tuple[Float[np.ndarray, "row column 2"], Float[np.ndarray, "row column 2"]] | None
+    frames: int = 1
+    camera: CameraNoise | None = None
 
     @classmethod
     def of(
@@ -148,7 +155,9 @@ class AtRest:
             total += picture
             full |= saturated(picture, full_scale)
         noise = _repeat_sigma(reference, total, averaged, settings) if len(reference) >= 3 else None
-        return cls((total / len(reference)).astype(np.float32), settings, full, full_scale, averaged, noise)
+        mean, count = total / len(reference), len(reference)
+        camera = CameraNoise.of_repeats(reference[:MOST_REPEATS], mean) if count >= 2 else None
+        return cls(mean.astype(np.float32), settings, full, full_scale, averaged, noise, count, camera)
 
 
 def measure(
@@ -179,14 +188,17 @@ def measure_against(
     """Return displacement, noise and validity of a view whose reference is known already; see measure."""
     settings, reach = rest.settings, rest.settings.reach
     full = rest.full.copy()
+    shaken = np.zeros(1)
 
     def one(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        nonlocal full
+        nonlocal full, shaken
         grey = np.asarray(picture, dtype=np.float32)
         seen = displacement(rest.mean, grey, settings)
         full |= saturated(picture, rest.full_scale)
         pair = _even_out(grey, warp(rest.mean, -seen), 0)
-        return _still(seen, settings), local_correlation(*pair, max(3.0, reach)), structure_variance(*pair, reach)
+        still = _still(seen, settings)
+        shaken = seen - still
+        return still, local_correlation(*pair, max(3.0, reach)), structure_variance(*pair, reach)
 
     d, agreement, variance = _means(map(one, flow))
     sigma, source = np.sqrt(variance / len(flow)) + FLOOR, "structure tensor"
@@ -201,7 +213,13 @@ def measure_against(
     valid &= ~_grown(full, 2)
     if region is not None:
         valid &= region
-    return DisplacementMap(d, sigma, valid, source)
+    pair = None
+    if len(flow) == 1:
+        usable = ~_grown(full, 2) if region is None else region & ~_grown(full, 2)
+        reference = warp(rest.mean, -shaken) if settings.shake_border else rest.mean
+        grey = np.asarray(flow[0], dtype=np.float32)
+        pair = PicturePair.of(reference, grey, d, rest.camera, rest.frames, usable, valid)
+    return DisplacementMap(d, sigma, valid, source, pair)
 
 
 def _means(samples: Iterator[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from nerif.conventions import InputError, unit_shown
 from nerif.imaging.readers import open_frames
 from nerif.measurement import Measurement
-from nerif.observation import Observation
+from nerif.observation import Observation, integrals_of
 
 __all__ = ["MaskSettings", "drawn_masks", "flow_mask", "read_mask", "with_flow_masks"]
 
@@ -134,10 +134,11 @@ def with_flow_masks(
         If there is no noise to measure by, or one for several techniques, or a mask holds no flow.
     """
     drawn = drawn or {}
-    if sigma is not None and len(measurement.observations) > 1:
-        names = " and ".join(o.technique.measured for o in measurement.observations)
+    observations = integrals_of(measurement)
+    if sigma is not None and len(observations) > 1:
+        names = " and ".join(o.technique.measured for o in observations)
         raise InputError(f"sigma: expected none for {names}, which have units and noise of their own, got {sigma:g}")
-    seen = [(o, measurement.usable_for(o)) for o in measurement.observations]
+    seen = [(o, measurement.usable_for(o)) for o in observations]
     masks = torch.zeros(measurement.shape, dtype=torch.bool)
     for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
         height, width = camera.image_size

@@ -42,6 +42,7 @@ class Recording:
     method : of the displacements
     masks : of the flow, or None; views with a drawn mask have that
     references : most reference pictures to look at; 0 for all
+    pictures : whether a measurement of one instant keeps the pictures beside the displacements
     """
 
     views: tuple[View, ...]
@@ -50,6 +51,7 @@ class Recording:
     method: DisplacementSettings = field(default_factory=DisplacementSettings)
     masks: MaskSettings | None = None
     references: int = 100
+    pictures: bool = True
 
     def __post_init__(self) -> None:
         for view in self.views:
@@ -205,7 +207,8 @@ def measure_instant(
         raise InputError(f"displacement: no view could be used; the first: {lost[0]}")
     order = sorted(found)
     noise = {views[i].name: found[i][1].noise_from for i in order}
-    return join_views((found.pop(i) for i in order), recording.scene), noise
+    kept = recording.pictures and len(numbers) == 1
+    return join_views((found.pop(i) for i in order), recording.scene, kept), noise
 
 
 def _view(recording: Recording, task: tuple[View, Sequence[int]]) -> tuple[Found | InputError, list[str]]:

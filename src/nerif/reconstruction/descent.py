@@ -32,6 +32,7 @@ from nerif.reconstruction.levels import Level, coarser, levels
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.some_pixels import some_pixels
+from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.weight import FIRST, choose_weight
 
@@ -62,7 +63,7 @@ class Descent:
         resume: State | None,
         start: Field | None,
     ) -> None:
-        measurement = seen_through(measurement, settings.aperture)
+        measurement = seen_through(of_source(measurement, settings.source), settings.aperture)
         self.settings, self.measurement, self.on_step, self.field_before = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
         self.faces = ambient_faces(measurement, settings.ambient_faces)

@@ -30,7 +30,7 @@ def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> d
         own = measurement.usable_for(o)
         seen[o.technique.measured] = digest([o.values[own]])
         seen[o.technique.sigma] = digest([None if o.sigma is None else o.sigma[own]])
-        for name, value in vars(forward_model(o.technique, measurement)).items():
+        for name, value in forward_model(o.technique, measurement).constants.items():
             light.setdefault(name, []).append(value)
     return {
         "views": digest(measurement.names),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Int
@@ -12,7 +12,7 @@ from torch import Tensor
 from nerif.fields.mlp import NeuralField
 from nerif.fields.space_time import AtTimes, with_time
 from nerif.geometry import Rays, disc_points
-from nerif.physics.path_integral import LENS_RAYS
+from nerif.physics.path_integral import LENS_RAYS, PathIntegral, project
 from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
@@ -25,6 +25,7 @@ __all__ = ["Objective", "Piece"]
 
 GAUGE_POINTS = 256  # a step
 JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a thin ray that is held back, of a pixel with a lens four times as many
+SETTLING = 24  # samples of a ray that brightness is fitted by
 FEWEST = 4  # samples of a ray through a lens
 MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (docs/architecture.md)
 
@@ -155,6 +156,15 @@ class Objective:
         """Look at where the field varies."""
         self.density.update(*(self._at(tau) for tau in self.data.instants))
 
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Fit what is open beside the field, such as the brightness of pictures, to the field so far."""
+        for part in self.data.unsettled:
+            rays = replace(part.rays, lens=None)
+            seen = project(PathIntegral(part.model.integral, SETTLING), self.field, rays, self.data.device)
+            seen = seen.to(part.measured.device)
+            part.model.settle(seen, part.measured, part.inverse_scale, rays)
+
     def at_ambient(self, count: int, generator: torch.Generator) -> Tensor | None:
         """Return what the network gives where it should give 0, in full precision; None where no place is known."""
         found = self.data.ambient_points(count, generator)
@@ -167,6 +177,7 @@ class Objective:
     def held_back(self) -> float:
         """Return the mean square of the residual over sigma (over 1, where it is not known) on the rays held back."""
         low, self.network.low, drawn = self.network.low, False, torch.Generator().manual_seed(0)
+        self.data.judge_alike()
         held, weights, total = self.data.held_back, self.settings.weights, 0.0
         assert held is not None
         for part in held.parts:

@@ -11,6 +11,7 @@ from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS
+from nerif.reconstruction.sources import check_source
 from nerif.techniques.registry import AUTO, check_model
 
 __all__ = ["TrainingSettings"]
@@ -53,6 +54,9 @@ class TrainingSettings(Reconstructor):
     aperture: str = "auto"
     """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
     (off)."""
+    source: str = "auto"
+    """What to go by (also --from): displacements, pictures (each pixel, after a start from displacements, or from
+    blurred pictures), both, or auto: pictures where there are some."""
     lens_rays: int = 0
     """Rays through the lens of a pixel at the end, an even number, and about a third of them at the start; 0: 2
     to 12, as the cone is wide in pixels."""
@@ -140,6 +144,7 @@ class TrainingSettings(Reconstructor):
             raise InputError("weights: the head and consistency terms need gradient_head = true")
         check_model(self.model)
         check_aperture(self.aperture)
+        check_source(self.source)
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")

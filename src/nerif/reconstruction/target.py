@@ -49,14 +49,15 @@ class Part:
         """Return the same on another device."""
         return Part(self.model, self.rays.to(device), self.measured.to(device), self.inverse_scale.to(device))
 
-    def residual(self, prediction: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+    def residual(self, prediction: Float[Tensor, "n k"]) -> Float[Tensor, "n c"]:
         """Return the scaled difference between a path integral and what was measured."""
-        return (self.model.read(prediction) - self.measured) * self.inverse_scale
+        return self.model.residual(prediction, self.measured, self.rays) * self.inverse_scale
 
     @property
     def of_nothing(self) -> Float[Tensor, "n c"]:
         """The scaled residual of the ambient field."""
-        return self.residual(torch.zeros_like(self.measured))
+        integrals = self.model.integrals or self.measured.shape[1]
+        return self.residual(self.measured.new_zeros(len(self), integrals))
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,16 @@ class Target:
         models = forward_models(measurement.techniques, measurement, model, linear)
         parts, scales = [], []
         known = all(o.sigma is not None for o in measurement.observations)
+        if not known and len(measurement.observations) > 1:
+            names, wanted = ([getattr(o.technique, a) for o in measurement.observations] for a in ("name", "sigma"))
+            raise InputError(
+                f"technique: {' and '.join(names)} together are weighed by their noise: expected "
+                f"{' and '.join(wanted)}, got not both"
+            )
         for forward, observation in zip(models, measurement.observations, strict=True):
             rays, values, sigma = _rays(measurement, observation, open_faces, edge)
             scales.append(forward.field_scale(rays, values))
-            read, noise = forward.reading(values, sigma if observation.sigma is not None else None)
+            read, noise = forward.reading(values, sigma if observation.sigma is not None else None, rays)
             noise = sigma if observation.sigma is None else noise  # of bins: by how many pixels they have
             inverse = torch.ones_like(read) if noise is None else 1 / noise
             parts.append(Part(forward, rays, read, inverse))
@@ -144,7 +151,7 @@ def _rays(
     measurement: Measurement, observation: Observation, open_faces: tuple[str, ...], edge: int
 ) -> tuple[Rays, Tensor, Tensor | None]:
     """Rays that cross none of the open faces, what they measured, and its sigma."""
-    if edge > 1:
+    if edge > 1 and observation.technique.averaged:
         found: tuple[Rays, Tensor, Tensor | None] = binned_rays(measurement, observation, edge, open_faces)
     else:
         found = measurement.rays(observation)

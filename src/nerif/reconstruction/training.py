@@ -70,9 +70,7 @@ class Training:
         self.ranks = Ranks.from_environment()
         self.ranks.join(self.device)
         if len(data) < self.ranks.size:
-            raise InputError(
-                f"torchrun: expected at least a ray a process, got {len(data)} rays for {self.ranks.size}"
-            )
+            raise InputError(f"torchrun: expected at least a ray a process, got {len(data)} rays for {self.ranks.size}")
         self.generator = torch.Generator().manual_seed(settings.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -112,6 +110,8 @@ class Training:
             if not self.settled and budget.progress >= PIONEERS:
                 self._settle()
                 clock, rays_then = time.perf_counter(), budget.rays_done
+            if self.data.advance(budget.progress):
+                self._begin_part()
             pieces, whole = self._batch()
             self.network.low = budget.progress < settings.full_precision_from
             terms, mine = self.objective.terms(pieces), sum(piece.part.measured.numel() for piece in pieces)
@@ -209,9 +209,18 @@ class Training:
     def _refine(self, edge: int) -> None:
         self.edge = edge
         self.data.refine(edge)
+        self._recount()
+        self._log({"bin_edge": float(edge)})
+
+    def _begin_part(self) -> None:
+        """Meet what the data give from now on, what is open beside the field fitted to the field so far."""
+        self._recount()
+        self.objective.settle()
+        self._log({"part": float(self.data.stage)})
+
+    def _recount(self) -> None:
         self.budget.recount(len(self.data))
         self.watch.noise = self.data.noise
-        self._log({"bin_edge": float(edge)})
 
     def _learning_rate(self) -> float:
         """Adam's, of the next step."""
@@ -309,11 +318,13 @@ class Training:
         if self.objective.density.values is not None:
             tensors["density"] = self.objective.density.values.clone()
         tensors |= {f"best.{k}": v.clone() for k, v in self.best.items()}
+        tensors |= {f"data.{k}": v for k, v in self.data.kept().items()}
         names = ("retries", "rate", "initial_loss", "running", "settled", "drawn")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
         scalars |= {"scale": self.field.scale, "offset": self.field.offset}
         kept = {"budget": self.budget.used(), "history": list(self.history), "fingerprint": self.data.fingerprint}
-        return State(tensors, {**scalars, **kept, "edge": self.edge, "watch": self.watch.kept()})
+        scalars |= {"edge": self.edge, "stage": self.data.stage, "watch": self.watch.kept()}
+        return State(tensors, {**scalars, **kept})
 
     def _restore(self, state: State) -> None:
         tensors, scalars = state.tensors, {k: v for k, v in state.scalars.items() if k != "fingerprint"}
@@ -337,6 +348,8 @@ class Training:
         if edge != self.edge:
             self._refine(edge)
             self.history.pop()
+        self.data.restore(int(scalars.pop("stage", 0)), {k[5:]: v for k, v in tensors.items() if k.startswith("data.")})
+        self._recount()
         self.budget.restore(scalars.pop("budget"))
         for name, value in scalars.items():
             setattr(self, name, value)
@@ -367,4 +380,3 @@ class Training:
             state=state,
             quantity=self.data.quantity,
         )
-

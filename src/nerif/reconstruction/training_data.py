@@ -25,7 +25,9 @@ from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.gauge import AmbientRegion, is_open
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.some_pixels import hold_back
+from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Part, Target
+from nerif.techniques.base import ForwardModel
 
 __all__ = ["FrameData", "TrainingData"]
 
@@ -63,6 +65,30 @@ class TrainingData(ABC):
     held_back: Target | None = None
     """Rays that are in no batch, to judge by them; None where there are none."""
 
+    stage: int = 0
+    """Part of the run that the data are given for."""
+
+    def advance(self, progress: float) -> bool:
+        """Give what is to be met at that share of a run, or of its first cycle; return whether a new part began."""
+        return False
+
+    @property
+    def unsettled(self) -> list[Part]:
+        """Some rays of whatever has to be fitted beside the field (ForwardModel.settle)."""
+        return []
+
+    def kept(self) -> dict[str, Tensor]:
+        """Return what has been fitted beside the field, as a checkpoint keeps it."""
+        return {}
+
+    def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
+        """Go on in that part of a run with what was fitted beside the field."""
+        assert stage == 0, "these data have one part only"
+
+    def judge_alike(self) -> None:
+        """Let rays that are held back be judged by what was fitted beside the field."""
+        return
+
     def refine(self, edge: int) -> None:
         """Give bins of another edge, px, from now on."""
         assert edge == 1, "these data are pixels always"
@@ -91,6 +117,9 @@ class TrainingData(ABC):
         """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
 
 
+SETTLED_BY = 1024  # pixels a view
+
+
 class FrameData(TrainingData):
     """One measurement.
 
@@ -106,9 +135,10 @@ class FrameData(TrainingData):
         self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, judged: bool = False
     ) -> None:
         measurement = seen_through(measurement, settings.aperture)
+        final = of_source(measurement, settings.source)
         super().__init__(
             resolve_device(settings.device), measurement.box, measurement.n_ambient,
-            fingerprint(measurement, settings.open_faces), is_open(measurement), measurement.quantity,
+            fingerprint(final, settings.open_faces), is_open(measurement), measurement.quantity,
         )  # fmt: skip
         self.settings, self.measurement = settings, measurement
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
@@ -119,14 +149,52 @@ class FrameData(TrainingData):
             rest, held = hold_back(measurement, self.coarsest)
             with suppress(InputError):  # all that would be held back crosses an open face
                 if held is not None:
-                    self.held_back = Target.of(held, settings.open_faces, model=settings.model).to(self.device)
+                    judges = of_source(held, settings.source)
+                    self.judging = judges.names
+                    self.held_back = Target.of(judges, settings.open_faces, model=settings.model).to(self.device)
                     self.measurement = rest
+        self.stages, self.edge = stages(self.measurement, settings.source), self.coarsest
         self.refine(self.coarsest)
 
     def refine(self, edge: int) -> None:
-        settings = self.settings
-        self.target = Target.of(self.measurement, settings.open_faces, edge, settings.model).to(self.device)
+        settings, self.edge = self.settings, edge
+        seen = self.stages[self.stage].measurement()
+        self.target = Target.of(seen, settings.open_faces, edge, settings.model).to(self.device)
+        self.names = seen.names
         self.noise = self.target.noise or 0.0
+
+    def advance(self, progress: float) -> bool:
+        reached = max(i for i, stage in enumerate(self.stages) if stage.begin <= progress)
+        if reached <= self.stage:
+            return False
+        other = self.stages[reached].measurement is not self.stages[self.stage].measurement
+        self.stage = reached
+        if other:
+            self.refine(self.edge)
+        return True
+
+    @property
+    def unsettled(self) -> list[Part]:
+        drawn = torch.Generator().manual_seed(self.stage)
+        parts = [part for part in self.target.parts if part.model.settles]
+        some = [torch.randperm(len(part), generator=drawn)[: SETTLED_BY * len(self.names)] for part in parts]
+        return [part[index.to(self.device)] for part, index in zip(parts, some, strict=True)]
+
+    def kept(self) -> dict[str, Tensor]:
+        return {str(i): model.settled.clone() for i, model in enumerate(_settling(self.target))}
+
+    def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
+        if stage != self.stage:
+            self.stage = stage
+            self.refine(self.edge)
+        for i, model in enumerate(_settling(self.target)):
+            model.adopt(kept[str(i)])
+
+    def judge_alike(self) -> None:
+        """Let the pictures that are held back be as bright as those that are not."""
+        if self.held_back is not None:
+            for model, judge in zip(_settling(self.target), _settling(self.held_back), strict=False):
+                judge.adopt(model.settled[[self.names.index(name) for name in self.judging]])
 
     def __len__(self) -> int:
         return len(self.target)
@@ -144,3 +212,8 @@ class FrameData(TrainingData):
     def untrained(self, shape: NetworkShape) -> NeuralField:
         network = Network(shape, bounds=in_units(self.bounds, self.target.scale)).to(self.device)
         return NeuralField(network, self.box, self.target.scale)
+
+
+def _settling(target: Target) -> list[ForwardModel]:
+    """The models with something to fit beside the field."""
+    return [part.model for part in target.parts if part.model.settles]

@@ -27,6 +27,7 @@ from nerif.reconstruction.descent import Descent
 from nerif.reconstruction.levels import bins_at_last
 from nerif.reconstruction.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.problem import Iterate, Problem
+from nerif.reconstruction.sources import check_source
 from nerif.techniques.registry import AUTO, check_model
 
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
@@ -49,6 +50,9 @@ class VoxelReconstructor(Reconstructor):
     aperture: str = "auto"
     """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
     (off)."""
+    source: str = "auto"
+    """What to go by (also --from): displacements, pictures (each pixel, linear around the displacements), both, or
+    auto: pictures where there are some."""
     step: float | None = None
     """Longest distance between the planes on which rays are sampled, in voxels: at most, and by default, 1 (cubic) or
     0.5 (linear)."""
@@ -89,6 +93,7 @@ class VoxelReconstructor(Reconstructor):
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         check_model(self.model)
         check_aperture(self.aperture)
+        check_source(self.source)
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")
@@ -165,9 +170,11 @@ class WeightedVoxelReconstructor(VoxelReconstructor):
 
 def _seen(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
     """Rays, those of bins, and channels of each technique."""
-    pixels = bins_at_last(measurement, grid) ** 2
-    observations = measurement.observations
-    return [(int(measurement.usable_for(o).sum()) // pixels + 1, len(o.technique.channels)) for o in observations]
+    pixels, seen = bins_at_last(measurement, grid) ** 2, []
+    for o in measurement.observations:
+        count = int(measurement.usable_for(o).sum()) // (pixels if o.technique.averaged else 1)
+        seen.append((count + 1, len(o.technique.channels)))
+    return seen
 
 
 def _lens_rays(measurement: Measurement, grid: Grid) -> int:

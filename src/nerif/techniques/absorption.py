@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.conventions import InputError
+from nerif.geometry import Rays
 from nerif.techniques.base import ForwardModel, Light
 from nerif.techniques.line_integral import LineIntegral
 from nerif.techniques.plausible import IMPOSSIBLE, share_below
@@ -94,13 +95,13 @@ class Intensity(Absorption):
     def linear_twin(self) -> ForwardModel:
         return Absorption()
 
-    def read(self, prediction: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+    def read(self, prediction: Float[Tensor, "n k"], rays: Rays) -> Float[Tensor, "n c"]:
         return torch.exp(-self.power * prediction)
 
     def reading(
-        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None
+        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None, rays: Rays
     ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
-        read = self.read(values)
+        read = self.read(values, rays)
         return read, None if sigma is None else self.power * read * sigma
 
 

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from jaxtyping import Bool, Float
@@ -38,6 +39,14 @@ class Light(Protocol):
     @property
     def wavelength_nm(self) -> float | None:
         """Wavelength of the light, nm."""
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """Of the views."""
+
+    @property
+    def maps(self) -> Mapping[str, Tensor]:
+        """What has a value a pixel, displacements apart, by its name in the file."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +107,12 @@ class ForwardModel(ABC):
     """What a pixel measures: the variable of the file."""
     sigma: ClassVar[str]
     """The variable with its standard deviation."""
+    beside: ClassVar[Mapping[str, tuple[int, str]]] = {}
+    """Further maps that it takes: numbers a pixel and unit, by their names."""
     channels: ClassVar[tuple[str, ...]]
     """Names of the components of what a pixel measures."""
+    integrals: ClassVar[int] = 0
+    """Numbers that the path integral of a pixel has; 0 for one a channel."""
     unit: ClassVar[str]
     """Of what a pixel measures."""
     misscaled: ClassVar[str] = "another scale"
@@ -125,6 +138,14 @@ class ForwardModel(ABC):
     """Share of the path through the box that counts towards what is measured, at about: for the size of the field."""
     gains: ClassVar[bool] = False
     """Whether cameras may be of different brightness, which a fit can tell."""
+    averaged: ClassVar[bool] = True
+    """Whether the mean over neighbouring pixels is what their mean ray measures."""
+    derived: ClassVar[str] = ""
+    """Technique whose values are found in these, such as displacements in pictures, by a window's reach of them."""
+    guess: ClassVar[str] = ""
+    """Map that holds what those values are about."""
+    settles: ClassVar[bool] = False
+    """Whether something of what is measured beside the field has to be fitted to a prediction (`settle`)."""
     linear: ClassVar[bool] = True
     """Whether the weights say all: neither `bend` nor `read` changes anything."""
 
@@ -147,6 +168,16 @@ class ForwardModel(ABC):
         """The linear model of the same integral: itself, if it is linear."""
         assert self.linear, f"{type(self).__name__} has to name its linear twin"
         return self
+
+    @property
+    def integral(self) -> ForwardModel:
+        """The model of the path integral alone, before it is read: itself, where the maps of files hold integrals."""
+        return self
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """What it knows of the light, by names."""
+        return dict(vars(self))
 
     @classmethod
     def seen_by(cls, camera: Camera) -> Camera:
@@ -197,14 +228,66 @@ class ForwardModel(ABC):
         raise InputError(f"counts: expected a technique that counts quanta, got {cls.name}; give --noise")
 
     def reading(
-        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None
+        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None, rays: Rays
     ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
         """Return what was measured, and its sigma, as `read` has it."""
         return values, sigma
 
-    def read(self, prediction: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
-        """Return what the pixel reads of the integral: the integral itself."""
+    def read(self, prediction: Float[Tensor, "n k"], rays: Rays) -> Float[Tensor, "n c"]:
+        """Return what the pixels of rays read of the integral: the integral itself."""
         return prediction
+
+    def residual(
+        self, prediction: Float[Tensor, "n k"], measured: Float[Tensor, "n c"], rays: Rays
+    ) -> Float[Tensor, "n c"]:
+        """Return the difference of what pixels read of the integral and what was measured, as `reading` has it."""
+        return self.read(prediction, rays) - measured
+
+    def settle(
+        self,
+        prediction: Float[Tensor, "n k"],
+        measured: Float[Tensor, "n c"],
+        inverse_sigma: Float[Tensor, "n c"],
+        rays: Rays,
+    ) -> None:
+        """Fit what is open beside the field, such as the brightness of pictures, to the integral that is predicted."""
+        return
+
+    @property
+    def settled(self) -> Tensor:
+        """What `settle` fitted, view by view."""
+        raise NotImplementedError(f"{type(self).__name__} settles nothing")
+
+    def adopt(self, settled: Tensor) -> None:
+        """Take over what `settle` fitted elsewhere."""
+        raise NotImplementedError(f"{type(self).__name__} settles nothing")
+
+    @classmethod
+    def completed(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return the maps, and those that attributes of their file stand for.
+
+        Raises
+        ------
+        InputError
+            If an attribute is not what it should be.
+        """
+        return dict(maps)
+
+    @classmethod
+    def softened(
+        cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float
+    ) -> dict[str, Tensor]:
+        """Return maps blurred by a Gaussian of that standard deviation; as they are, where that makes them no easier.
+
+        Parameters
+        ----------
+        sizes : (height, width) of each view, px
+        """
+        return dict(maps)
+
+    def mapped(self, integral: Float[Tensor, "row column k"], view: int) -> Float[Tensor, "row column c"]:
+        """Return what the map of a view holds of the integral: the integral itself."""
+        return integral
 
     def field_scale(self, rays: Rays, measured: Float[Tensor, "n c"]) -> float:
         """Return the size of field that makes measurements of the size given; 0 where all of them are 0."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -37,7 +38,7 @@ class Deflection(ForwardModel):
     name = "deflection"
     tomography = "background-oriented schlieren tomography"
     measured, sigma = "displacement", "sigma"
-    channels = ("u", "v")
+    channels: ClassVar[tuple[str, ...]] = ("u", "v")
     unit = "px"
     misscaled = "binning, or another lever arm"
     limits = (1e-6, 1e5)

@@ -11,13 +11,16 @@ from nerif.techniques.base import ForwardModel, Light
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.emission import Emission
 from nerif.techniques.interferometry import Interferometry
+from nerif.techniques.pictures import Pictures
 
 __all__ = [
-    "AUTO", "MODELS", "TECHNIQUES", "check_model", "forward_model", "forward_models", "model_of",
+    "AUTO", "MODELS", "TECHNIQUES", "check_model", "check_simulated", "forward_model", "forward_models", "model_of",
     "technique", "technique_of",
 ]  # fmt: skip
 
-TECHNIQUES: dict[str, type[ForwardModel]] = {c.name: c for c in (Deflection, Absorption, Emission, Interferometry)}
+TECHNIQUES: dict[str, type[ForwardModel]] = {
+    c.name: c for c in (Deflection, Pictures, Absorption, Emission, Interferometry)
+}
 """By the name that files have for them; a technique of your own is one entry more."""
 
 ASSUMED = Deflection
@@ -42,6 +45,13 @@ def technique(name: str) -> type[ForwardModel]:
     if name not in TECHNIQUES:
         raise InputError(f"technique: expected one of {', '.join(TECHNIQUES)}, got '{name}'")
     return TECHNIQUES[name]
+
+
+def check_simulated(kinds: Sequence[type[ForwardModel]]) -> None:
+    """Refuse techniques whose maps need more than field and cameras, such as pictures of a pattern."""
+    for kind in kinds:
+        if kind.derived:
+            raise InputError(f"technique: {kind.name} show a pattern, and are made by nerif render; got '{kind.name}'")
 
 
 def technique_of(quantity: str) -> type[ForwardModel]:
@@ -90,7 +100,9 @@ def forward_models(
         names = " and ".join(kind.name for kind in kinds)
         raise InputError(f"model: expected one of {', '.join((AUTO, *offered))} for {names}, got '{model}'")
     models = tuple(forward_model(kind, light, model) for kind in kinds)
-    for found in models:
-        if linear and not found.linear:
+    if not linear:
+        return models
+    for kind, found in zip(kinds, models, strict=True):
+        if not found.linear and model in MODELS.get(kind.name, ()):
             raise InputError(f"model: expected a linear one, got '{model}', which only --method nerif can fit")
-    return models
+    return tuple(found.linear_twin for found in models)

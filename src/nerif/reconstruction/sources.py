@@ -1,0 +1,130 @@
+"""What a reconstruction goes by, where a measurement holds displacements and the pictures they were found in.
+
+Pictures are met only where the pattern is already at the right dot. So a network begins with the displacements, where
+there are some, else with pictures blurred by several pixels, and goes on with pictures that are SOFT. Between pixels a
+sharp pattern is not known: that much blur takes more from what cubic splines get wrong than from the pattern
+(docs/architecture.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.measurement import Measurement
+from nerif.observation import Observation
+
+__all__ = ["SOURCES", "Stage", "check_source", "of_source", "stages"]
+
+SOURCES = ("auto", "pictures", "displacements", "both")
+
+SOFT = 0.6  # px, standard deviation
+BLURS = (4.0, 2.0, 1.0)  # px
+FILLED = 6.0  # px, over which a displacement goes on where it was not measured
+SHARP_FROM = 0.3  # of a run
+SETTLED = (0.5, 0.75)  # of a run: what is open beside the field is fitted again
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a run.
+
+    Parameters
+    ----------
+    begin : share of the run at which it begins
+    measurement : gives what is to be met
+    """
+
+    begin: float
+    measurement: Callable[[], Measurement]
+
+
+def check_source(source: str) -> None:
+    """Raise InputError unless it is one of SOURCES."""
+    if source not in SOURCES:
+        raise InputError(f"from: expected one of {', '.join(SOURCES)}, got '{source}'")
+
+
+def of_source(measurement: Measurement, source: str, blur: float = SOFT) -> Measurement:
+    """Return the measurement with what a reconstruction is to go by: pictures, displacements, or both.
+
+    "auto" takes the pictures where there are some; what is measured by other techniques is left as it is. Pictures
+    keep what displacements tell, as a guess.
+
+    Parameters
+    ----------
+    source : one of SOURCES
+    blur : of the pictures, standard deviation in px
+
+    Raises
+    ------
+    InputError
+        If the measurement does not hold what is asked for.
+    """
+    check_source(source)
+    pictures, found = _pair(measurement)
+    if pictures is None:
+        if source in ("pictures", "both"):
+            names = " and ".join(o.technique.measured for o in measurement.observations)
+            raise InputError(
+                f"from: expected a measurement with pictures (variables reference and flow) for '{source}', got "
+                f"{names}; nerif displacement writes them"
+            )
+        return measurement
+    if found is None and source in ("displacements", "both"):
+        raise InputError(f"from: expected displacements for '{source}', got pictures alone; give --from pictures")
+    if found is not None and source == "displacements":
+        return found.alone(measurement)
+    whole = measurement if source == "both" else pictures.alone(measurement)
+    sizes = [camera.image_size for camera in whole.cameras]
+    maps = pictures.technique.softened(whole.maps, sizes, blur)
+    if found is not None:
+        known = [measurement.names.index(name) for name in whole.names]
+        maps[pictures.technique.guess] = _filled(measurement, found)[known]
+    return replace(whole, maps=maps)
+
+
+def stages(measurement: Measurement, source: str) -> list[Stage]:
+    """Return the parts of a network's run on a measurement (see the head of this file)."""
+    pictures, found = _pair(measurement)
+    final = of_source(measurement, source)
+
+    def last() -> Measurement:
+        return final
+
+    if pictures is None or source == "displacements":
+        return [Stage(0.0, last)]
+    ends = [Stage(begin, last) for begin in (SHARP_FROM, *SETTLED)]
+    if found is not None:
+        return [Stage(0.0, partial(of_source, measurement, "displacements")), *ends]
+    blurred = [partial(of_source, measurement, source, px) for px in BLURS]
+    return [*(Stage(SHARP_FROM * i / len(BLURS), part) for i, part in enumerate(blurred)), *ends]
+
+
+def _pair(measurement: Measurement) -> tuple[Observation | None, Observation | None]:
+    """The pictures, and the displacements that were found in them, as far as there are any."""
+    by_name = {o.technique.name: o for o in measurement.observations}
+    pictures = next((o for o in by_name.values() if o.technique.derived), None)
+    return pictures, None if pictures is None else by_name.get(pictures.technique.derived)
+
+
+def _filled(measurement: Measurement, found: Observation) -> Float[Tensor, "view row column 2"]:
+    """The displacement, and where it was not measured the mean of what is around."""
+    from scipy.ndimage import gaussian_filter
+
+    d, usable = found.values, measurement.usable_for(found)
+    whole = torch.zeros_like(d)
+    for i, camera in enumerate(measurement.cameras):
+        inside = i, slice(0, camera.image_size[0]), slice(0, camera.image_size[1])
+        good = usable[inside][..., None]
+        known = torch.where(good, d[inside], 0.0).double()
+        weight = torch.from_numpy(gaussian_filter(good[..., 0].double().numpy(), FILLED)).clamp(min=1e-6)
+        mean = torch.from_numpy(gaussian_filter(known.numpy(), (FILLED, FILLED, 0))) / weight[..., None]
+        whole[inside] = torch.where(good, d[inside], mean.to(d))
+    return whole

@@ -1,0 +1,266 @@
+"""Pictures: background-oriented schlieren without optical flow. The flow picture is compared with the reference, moved.
+
+    flow(p) = g(p) reference(p - d(p)) + o(p),     d the path integral of deflection (deflection.py)
+
+Every pixel counts as it was measured, with the noise of the camera. Around a displacement d_0 that is known, from
+windows or as 0, the difference is linear in the field:
+
+    g reference(p - d) = g reference(p - d_0) - g grad(reference)(p - d_0) . (d - d_0)
+
+Source: Grauer and Steinberg, Exp. Fluids 61 (2020) 80 (unified BOS, linear); the warped form is nonlinear.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.geometry import Rays
+from nerif.techniques.base import ForwardModel, Light, Weights
+from nerif.techniques.deflection import LeverArm
+from nerif.techniques.warped import References
+
+__all__ = ["LinearPictures", "Pictures"]
+
+GUESS = "displacement_guess"
+"""Map of what the displacement is about, px: where to begin, and where to be linear."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures(LeverArm):
+    """Grey values of the flow picture, by the reference picture moved.
+
+    Parameters
+    ----------
+    n_ambient : refractive index the excess is counted from
+    maps : reference, flow and, if something is known of it, the displacement, by their names
+    sizes : (height, width) of each view, px
+    """
+
+    name = "pictures"
+    measured, sigma = "flow", "picture_sigma"
+    beside = MappingProxyType({"reference": (1, "grey value"), GUESS: (2, "px")})
+    channels = ("",)
+    integrals = 2
+    unit = "grey value"
+    misscaled = "another exposure"
+    limits = (1e-9, 1e9)
+    traced = False
+    linear = False
+    averaged = False
+    derived, guess = "deflection", GUESS
+    settles = True
+
+    maps: Mapping[str, Tensor] = field(default_factory=dict)
+    sizes: Sequence[tuple[int, int]] = ()
+
+    @classmethod
+    def of(cls, light: Light, model: str) -> ForwardModel:
+        reference, flow = light.maps.get("reference"), light.maps.get(cls.measured)
+        if reference is None or flow is None:
+            raise InputError(
+                "reference: expected pictures without flow (variable reference) beside those with it (flow), got none; "
+                "nerif displacement writes both"
+            )
+        return cls(light.n_ambient, light.maps, tuple(camera.image_size for camera in light.cameras))
+
+    @classmethod
+    def check(
+        cls,
+        values: Float[Tensor, "row column c"],
+        sigma: Float[Tensor, "row column c"] | None,
+        usable: Bool[Tensor, "row column"],
+    ) -> None:
+        if bool(usable.any()) and not float(values[usable].std(correction=0)) > 0:
+            raise InputError("flow: expected a picture of a pattern, got one of a single grey")
+
+    @cached_property
+    def references(self) -> References:
+        """The reference pictures, as bright as the flow pictures."""
+        found = References(self.maps["reference"], self.sizes)
+        found.match(self.maps["flow"])
+        if GUESS in self.maps:
+            for i, (height, width) in enumerate(self.sizes):
+                row, column = self.maps["flow"][i, :height, :width].isfinite().nonzero().unbind(-1)
+                view = torch.full_like(row, i)
+                guess, flow = self.maps[GUESS][i, row, column], self.maps["flow"][i, row, column]
+                pixel = torch.stack([column, row], dim=-1).float()
+                found.fit(view, pixel, guess, flow, self._inverse_sigma(i, row, column))
+        return found
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        return {"n_ambient": self.n_ambient, **{name: self.maps.get(name) for name in self.beside}}
+
+    @property
+    def integral(self) -> ForwardModel:
+        return LeverArm(self.n_ambient)
+
+    @property
+    def linear_twin(self) -> ForwardModel:
+        return LinearPictures(self.n_ambient, self.maps, self.sizes)
+
+    def read(self, prediction: Float[Tensor, "n k"], rays: Rays) -> Float[Tensor, "n c"]:
+        return self.references.seen(rays.view, rays.pixel, prediction)[:, None]
+
+    def residual(
+        self, prediction: Float[Tensor, "n k"], measured: Float[Tensor, "n c"], rays: Rays
+    ) -> Float[Tensor, "n c"]:
+        """Return the difference; 0 where what is seen lies beyond the reference."""
+        known = self.references.known(rays.view, rays.pixel - prediction.detach())
+        return torch.where(known[:, None], self.read(prediction, rays) - measured, 0.0)
+
+    def settle(
+        self,
+        prediction: Float[Tensor, "n k"],
+        measured: Float[Tensor, "n c"],
+        inverse_sigma: Float[Tensor, "n c"],
+        rays: Rays,
+    ) -> None:
+        """Fit gain and offset of every view to what is predicted."""
+        self.references.fit(rays.view, rays.pixel, prediction, measured[:, 0], inverse_sigma[:, 0])
+
+    @property
+    def settled(self) -> Tensor:
+        return self.references.brightness
+
+    def adopt(self, settled: Tensor) -> None:
+        self.references.brightness = settled.to(self.references.brightness)
+
+    @classmethod
+    def completed(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return the maps, with picture_sigma by the noise of the cameras where a file tells that instead.
+
+        sigma^2 = read_noise^2 + max(flow, 0) / electrons_per_grey_value
+        """
+        names, otherwise = ("read_noise", "electrons_per_grey_value"), (0.0, math.inf)
+        if cls.sigma in maps or not any(name in attributes for name in names):
+            return dict(maps)
+        views, of_view = len(maps[cls.measured]), []
+        for name, default in zip(names, otherwise, strict=True):
+            value = np.asarray(attributes.get(name, default))
+            good = value.dtype.kind in "fiu" and value.shape in ((), (1,), (views,)) and bool(np.all(value >= 0))
+            if not good:
+                raise InputError(f"attribute {name}: expected a number, or one for each of {views} views, got {value}")
+            of_view.append(torch.tensor(value, dtype=torch.float32).expand(views)[:, None, None])
+        return {**maps, cls.sigma: (of_view[0].square() + maps[cls.measured].clamp(min=0) / of_view[1]).sqrt()}
+
+    @classmethod
+    def softened(
+        cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float
+    ) -> dict[str, Tensor]:
+        from scipy.ndimage import gaussian_filter
+
+        def blurred(picture: Float[Tensor, "row column"], squares: bool) -> Tensor:
+            good = picture.isfinite()
+            weight = torch.from_numpy(gaussian_filter(good.double().numpy(), px)).clamp(min=1e-6)
+            filled = torch.where(good, picture, 0.0).double()
+            filled = filled.square() if squares else filled
+            mean = torch.from_numpy(gaussian_filter(filled.numpy(), px)) / weight
+            # so many pixels have that much less of the noise
+            mean = (mean / max(4 * math.pi * px**2, 1.0)).sqrt() if squares else mean
+            return torch.where(good, mean, math.nan).float()
+
+        found = dict(maps)
+        for name in ("reference", cls.measured, cls.sigma):
+            if name in maps:
+                found[name] = torch.full_like(maps[name], math.nan)
+                for i, (height, width) in enumerate(sizes):
+                    found[name][i, :height, :width] = blurred(maps[name][i, :height, :width], name == cls.sigma)
+        return found
+
+    def mapped(self, integral: Float[Tensor, "row column k"], view: int) -> Float[Tensor, "row column c"]:
+        """Return the flow picture that displacements make, gain and offset fitted to the one that was taken."""
+        height, width, _ = integral.shape
+        row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        pixel = torch.stack([column, row], dim=-1).reshape(-1, 2).float()
+        number, d = torch.full((len(pixel),), view), integral.reshape(-1, 2).float()
+        flow = self.maps["flow"][view, :height, :width].reshape(-1)
+        weight = self._inverse_sigma(view, row.flatten(), column.flatten())
+        self.references.fit(number, pixel, d, flow, weight)
+        return self.references.seen(number, pixel, d).reshape(height, width, 1)
+
+    def _inverse_sigma(self, view: int, row: Tensor, column: Tensor) -> Float[Tensor, " n"]:
+        """One over sigma at pixels of a view; 1 where it is not known of the measurement."""
+        if self.sigma not in self.maps:
+            return torch.ones(len(row))
+        return 1 / self.maps[self.sigma][view, row, column]
+
+    def field_scale(self, rays: Rays, measured: Float[Tensor, "n c"]) -> float:
+        return self.integral.field_scale(rays, torch.full((len(rays), 2), self._displaced()))
+
+    def _displaced(self) -> float:
+        """The rms displacement, px: as guessed, else by the difference of the pictures over their gradient."""
+        if GUESS in self.maps:
+            d = self.maps[GUESS]
+            return float(d[d.isfinite().all(dim=-1)].square().mean().sqrt())
+        change, steep = [], []
+        for i, (height, width) in enumerate(self.sizes):
+            row, column = self.maps["flow"][i, :height, :width].isfinite().nonzero().unbind(-1)
+            view, pixel = torch.full_like(row, i), torch.stack([column, row], dim=-1).float()
+            seen = self.references.seen(view, pixel, torch.zeros_like(pixel))
+            change.append((seen - self.maps["flow"][i, row, column]).square())
+            gain, _ = self.references.gain_and_offset(view, pixel)
+            steep.append((gain[:, None] * self.references.slope(view, pixel)).square().mean(dim=-1))
+        return float((torch.cat(change).mean() / torch.cat(steep).mean().clamp(min=1e-30) / 2).sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPictures(Pictures):
+    """The same, linear around the displacement that is guessed, or around none."""
+
+    linear = True
+    integrals = 1
+    settles = False
+
+    @property
+    def linear_twin(self) -> ForwardModel:
+        return self
+
+    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+        plain = super().weights(rays, s, step)
+        assert plain.slope is not None
+        steep = -self._slope(rays).to(plain.slope)
+        return Weights(plain.profile, slope=torch.einsum("ni,nij->nj", steep, plain.slope)[:, None])
+
+    def read(self, prediction: Float[Tensor, "n k"], rays: Rays) -> Float[Tensor, "n c"]:
+        return prediction
+
+    def residual(
+        self, prediction: Float[Tensor, "n k"], measured: Float[Tensor, "n c"], rays: Rays
+    ) -> Float[Tensor, "n c"]:
+        return prediction - measured
+
+    def reading(
+        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None, rays: Rays
+    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
+        """Return flow - g reference(p - d_0) - o - g grad(reference) . d_0; 0 where that is not known."""
+        guess = self._guess(rays)
+        seen = self.references.seen(rays.view, rays.pixel.float(), guess)
+        left = values[:, 0] - seen - (self._slope(rays) * guess).sum(dim=-1)
+        known = self.references.known(rays.view, rays.pixel.float() - guess)
+        return torch.where(known, left, 0.0)[:, None], sigma
+
+    def _guess(self, rays: Rays) -> Float[Tensor, "n 2"]:
+        if GUESS not in self.maps:
+            return torch.zeros(len(rays), 2)
+        column, row = rays.pixel.round().long().unbind(-1)
+        return self.maps[GUESS][rays.view.long(), row, column].nan_to_num(0.0)
+
+    def _slope(self, rays: Rays) -> Float[Tensor, "n 2"]:
+        """g grad(reference) at p - d_0; 0 where that is not known."""
+        pixel = rays.pixel.float()
+        place = pixel - self._guess(rays).to(pixel)
+        gain, _ = self.references.gain_and_offset(rays.view, pixel)
+        known = self.references.known(rays.view, place)
+        return torch.where(known[:, None], gain[:, None] * self.references.slope(rays.view, place), 0.0)

@@ -1,0 +1,80 @@
+"""Noise of cameras from their pictures, and pairs of pictures with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from nerif.imaging.displacement import DisplacementSettings, measure
+from nerif.imaging.photometry import CameraNoise
+from nerif.imaging.warping import warp
+
+READ, ELECTRONS = 6.0, 3.0  # grey values; electrons a grey value
+
+
+def scene(seed: int = 0) -> np.ndarray:
+    """A smooth pattern of 200 to 3000 grey values."""
+    blurred = gaussian_filter(np.random.default_rng(seed).normal(size=(90, 100)), 1.6)
+    return 200 + 2800 * (blurred - blurred.min()) / np.ptp(blurred)
+
+
+def exposed(light: np.ndarray, seed: int) -> np.ndarray:
+    draw = np.random.default_rng(seed)
+    return np.round(draw.poisson(light * ELECTRONS) / ELECTRONS + READ * draw.standard_normal(light.shape))
+
+
+def variance(light: np.ndarray) -> np.ndarray:
+    return READ**2 + light / ELECTRONS
+
+
+@pytest.mark.parametrize("repeats", [2, 8])
+def test_repeats_tell_the_noise_of_a_flickering_lamp(repeats):
+    light = scene()
+    pictures = [exposed(light * (1 + 0.02 * (-1) ** i), i) for i in range(repeats)]
+    noise = CameraNoise.of_repeats(pictures, np.mean(pictures, axis=0))
+    assert noise.variance(light) == pytest.approx(variance(light), rel=0.15)
+
+
+def test_a_single_reference_leaves_it_to_what_is_left():
+    light = scene()
+    still, other = exposed(light, 1), exposed(light, 2)
+    other[::10, ::7] += 500  # a few that the prediction misses
+    noise = CameraNoise.of_residual(other, still, np.ones(light.shape, dtype=bool))
+    ratio = noise.variance(light) / variance(light)
+    assert float(np.median(ratio)) == pytest.approx(1, abs=0.15)
+    assert 0.6 < float(ratio.min()) < float(ratio.max()) < 1.5
+
+
+@pytest.mark.parametrize("references", [1, 5])
+def test_a_pair_holds_the_pictures_and_their_noise(references):
+    light = scene()
+    row, column = np.mgrid[: light.shape[0], : light.shape[1]]
+    d = np.stack([0.6 * np.exp(-((column - 50) ** 2 + (row - 45) ** 2) / 600), np.zeros(light.shape)], axis=-1)
+    repeats = [exposed(light, i) for i in range(references)]
+    flow = exposed(1.04 * warp(light, -d), 99)
+    flow[10:14, 20:24] = 4095
+    found = measure(repeats, [flow], DisplacementSettings("dis"), full_scale=4095)
+    pair = found.pair
+    assert pair is not None
+    assert np.isnan(pair.flow[10:14, 20:24]).all()
+    assert np.nanmean(np.isfinite(pair.flow)) > 0.99
+    inner = (slice(20, -15), slice(15, -15))
+    left = (pair.flow - 1.04 * warp(pair.reference, -d))[inner] / pair.sigma[inner]
+    assert 0.75 < float(np.sqrt(np.nanmean(left**2))) < 1.15
+
+
+def test_shake_is_taken_from_the_reference():
+    light = scene()
+    shaken = warp(light, np.full((*light.shape, 2), -1.3))  # d = 1.3 everywhere
+    found = measure([exposed(light, 0)], [exposed(shaken, 1)], DisplacementSettings(shake_border=12))
+    assert found.pair is not None
+    inner = (slice(8, -8), slice(8, -8))
+    left = (found.pair.flow - found.pair.reference)[inner]
+    assert float(left.std()) < 0.3 * float((found.pair.flow - light)[inner].std())
+
+
+def test_the_mean_of_several_pictures_is_no_picture():
+    light = scene()
+    pictures = [exposed(light, i) for i in range(4)]
+    assert measure(pictures[:2], pictures[2:], DisplacementSettings("dis")).pair is None

@@ -1,0 +1,298 @@
+"""Pictures: references moved by what a field does to the light are what flow pictures are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from scipy.ndimage import map_coordinates
+
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views, evaluate_volume
+from nerif.fields.phantoms import GaussianBalls
+from nerif.geometry import Box, Grid, Ring
+from nerif.measurement import Measurement
+from nerif.prediction import predict, reproject
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.sources import of_source, stages
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.training import Training
+from nerif.reconstruction.training_data import FrameData
+from nerif.techniques.deflection import LeverArm
+from nerif.techniques.pictures import Pictures
+from nerif.techniques.registry import forward_model
+from nerif.techniques.warped import References
+from nerif.volume import Volume
+
+BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
+RING = Ring(views=4, image_size=(38, 43), pixel_pitch=0.06, distance=400.0, background_distance=300.0)
+NETWORK = NeRIF(points_per_batch=2048, max_steps=160, device="cpu", samples=(6, 10), sample_jitter=2)
+WAVES = 60
+GREYS = 20.0  # sigma
+
+
+def pattern(view: int, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Grey values of a background of so many waves, none shorter than 4 px, anywhere between pixels."""
+    draw = np.random.default_rng(view)
+    angle, length = draw.uniform(0, math.pi, WAVES), draw.uniform(4, 12, WAVES)
+    phase = draw.uniform(0, 2 * math.pi, WAVES)
+    along = column[..., None] * np.cos(angle) + row[..., None] * np.sin(angle)
+    return 2000 + 3000 / math.sqrt(WAVES) * np.cos(2 * math.pi * along / length + phase).sum(axis=-1)
+
+
+def photographed(balls: GaussianBalls, gain: float = 0.0, noise: float = GREYS, focal: float = 1.0) -> Measurement:
+    """Flow pictures of a field, their references, and the displacement as windows see it; gains drift over a view."""
+    cameras = replace(RING, pixel_pitch=RING.pixel_pitch / focal).cameras()
+    seen = predict(balls, cameras, BOX, 1.00027)
+    d = seen.displacements
+    row, column = (x.astype(float) for x in np.mgrid[: d.shape[1], : d.shape[2]])
+    draw = np.random.default_rng(5)
+    references, flows = [], []
+    for i, own in enumerate(d.double().numpy()):
+        bright = 1 + gain * column / d.shape[2]
+        references.append(pattern(i, column, row) + noise / 3 * draw.standard_normal(row.shape))
+        moved = pattern(i, column - own[..., 0], row - own[..., 1])
+        flows.append(bright * moved + 300 * gain + noise * draw.standard_normal(row.shape))
+    maps = {
+        name: torch.tensor(np.stack(pictures)).float()
+        for name, pictures in (("reference", references), ("flow", flows))
+    }
+    maps["picture_sigma"] = torch.full_like(maps["flow"], 1.05 * noise)
+    return replace(seen, maps=maps, displacement=None)
+
+
+@pytest.fixture(scope="module")
+def balls() -> GaussianBalls:
+    """A few balls of index, displacements up to half a pixel."""
+    centres = torch.tensor([[-3.0, 0.0, 1.0], [3.0, 4.0, -1.0], [1.0, -1.5, 1.5]])
+    return GaussianBalls(centres, torch.tensor([2.6, 2.4, 2.2]), torch.tensor([4e-4, 3.2e-4, 4.8e-4]))
+
+
+@pytest.fixture(scope="module")
+def taken(balls) -> Measurement:
+    return photographed(balls)
+
+
+def error(balls: GaussianBalls, result) -> float:
+    grid = Grid.of_resolution(BOX, 30)
+    truth = Volume.of(balls.sample(grid), grid, "index_excess", 1.00027)
+    return float(evaluate_volume(result.field, truth, 1.00027)["l2_variation"])
+
+
+# -- the reference between pixels ------------------------------------------------------------------------------------
+
+
+def test_the_reference_between_pixels_is_the_cubic_spline():
+    draw = np.random.default_rng(0)
+    pictures = torch.tensor(draw.normal(100, 30, (2, 21, 26))).float()
+    references = References(pictures, [(21, 26), (17, 26)])
+    place = torch.tensor(draw.uniform(0, 1, (300, 2))).float() * torch.tensor([25.0, 16.0])
+    for view, rows in ((0, 21), (1, 17)):
+        number = torch.full((300,), view, dtype=torch.int16)
+        picture = pictures[view, :rows].double().numpy()
+        right = map_coordinates(picture, [place[:, 1], place[:, 0]], order=3, mode="mirror")
+        assert np.abs(references.at(number, place).numpy() - right).max() < 1e-3
+        at = place.clone().requires_grad_(True)
+        (slope,) = torch.autograd.grad(references.at(number, at).sum(), at)
+        assert torch.allclose(slope, references.slope(number, place), atol=1e-3)
+    beyond = torch.tensor([[-3.0, 5.0], [25.5, 5.0], [5.0, 17.0]])
+    assert references.known(torch.ones(3, dtype=torch.int16), beyond).tolist() == [False, False, False]
+
+
+def test_pixels_without_a_reference_are_not_known():
+    pictures = torch.rand(1, 20, 20) * 100
+    pictures[0, 4:7, 4:7] = torch.nan
+    references = References(pictures, [(20, 20)])
+    place = torch.tensor([[5.2, 4.9], [12.0, 12.0]])
+    assert references.known(torch.zeros(2, dtype=torch.int16), place).tolist() == [False, True]
+    assert bool(references.at(torch.zeros(2, dtype=torch.int16), place).isfinite().all())
+
+
+def test_gain_and_offset_are_found_among_outliers():
+    draw = torch.Generator().manual_seed(0)
+    references = References(torch.rand(1, 60, 60, generator=draw) * 1000, [(60, 60)])
+    pixel = torch.rand(3000, 2, generator=draw) * 57 + 1
+    view, still = torch.zeros(3000, dtype=torch.int16), torch.zeros(3000, 2)
+    right = (1.2 + 0.002 * pixel[:, 0]) * references.at(view, pixel) + 40 - 0.5 * pixel[:, 1]
+    spoiled = right.clone()
+    spoiled[::20] += 800
+    references.fit(view, pixel, still, spoiled, torch.ones(3000))
+    assert float((references.seen(view, pixel, still) - right).square().mean().sqrt()) < 3
+
+
+# -- the model -------------------------------------------------------------------------------------------------------
+
+
+def test_the_truth_leaves_the_noise(balls, taken):
+    (observation,) = taken.observations
+    rays, values, sigma = taken.rays(observation)
+    model = forward_model(Pictures, taken)
+    d = predict(balls, taken.cameras, BOX, 1.00027).displacements[rays.view.long(), *rays.pixel.long().flip(-1).T]
+    left = model.residual(d, values, rays) / sigma
+    assert float(left.square().mean().sqrt()) == pytest.approx(1, abs=0.12)  # noise, and what splines miss
+    assert float((model.residual(0 * d, values, rays) / sigma).square().mean().sqrt()) > 3
+
+
+def test_the_linear_model_is_the_slope_of_the_warped_one(taken):
+    seen = of_source(taken, "pictures", 0.0)
+    guess = torch.full((*seen.shape, 2), 0.3)
+    seen = replace(seen, maps={**seen.maps, Pictures.guess: guess})
+    rays, values, _ = seen.rays()
+    inner = ((rays.pixel - 20).abs() < 14).all(dim=-1)
+    rays, values = rays[inner], values[inner]
+    model = forward_model(Pictures, seen)
+    twin = model.linear_twin
+    measured, _ = twin.reading(values, None, rays)
+    s, step = (rays.near + rays.far)[:, None] / 2, (rays.far - rays.near)[:, None]
+    gradient = 1e-6 * torch.randn(len(rays), 1, 3, generator=torch.Generator().manual_seed(0))
+    straight = LeverArm(taken.n_ambient).weights(rays, s, step)(None, gradient)
+    d = torch.full((len(rays), 2), 0.3) + straight
+    linear = twin.weights(rays, s, step)(None, gradient) - (measured - 0)
+    at_guess = twin.weights(rays, s, step)
+    moved = model.residual(d, values, rays) - model.residual(torch.full_like(d, 0.3), values, rays)
+    assert torch.allclose(at_guess(None, gradient), moved, rtol=0.05, atol=1.0)
+    # at a displacement of the guess itself, what is left is that of the warped picture
+    slope = -twin._slope(rays)  # type: ignore[attr-defined]
+    there = (slope * 0.3).sum(dim=-1, keepdim=True) - measured
+    assert torch.allclose(there, model.residual(torch.full_like(d, 0.3), values, rays), atol=0.5)
+    assert linear.shape == values.shape
+
+
+@pytest.mark.parametrize("cone", [None, 8.0])
+def test_the_adjoint_of_linear_pictures_is_exact(taken, cone):
+    if cone:
+        cameras = replace(RING).cameras(f_number=cone)
+        taken = replace(taken, cameras=cameras)
+    (part,) = Target.of(of_source(taken, "pictures"), linear=True).parts
+    grid = Grid.of_resolution(BOX, 12)
+    operator = VoxelOperator(part.rays, grid, part.model, "cubic", dtype=torch.float64)
+    draw = torch.Generator().manual_seed(1)
+    x = torch.randn(grid.shape, generator=draw, dtype=torch.float64)
+    y = torch.randn(operator.range_shape, generator=draw, dtype=torch.float64)
+    assert operator.range_shape[1] == 1
+    assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-10)
+
+
+# -- reconstructions -------------------------------------------------------------------------------------------------
+
+
+def test_networks_and_voxels_find_the_field_in_pictures(balls, taken):
+    assert error(balls, NETWORK(taken)) < 0.15
+    assert error(balls, Tikhonov(voxels=24)(taken)) < 0.25
+
+
+def test_a_drift_of_the_light_is_fitted(balls):
+    drifting = photographed(balls, gain=0.05)
+    assert error(balls, NETWORK(drifting)) < 0.16
+
+
+def test_shifts_of_several_pixels_are_found_without_displacements(balls):
+    far = GaussianBalls(balls.centres, balls.widths, 8 * balls.amplitudes)
+    m = photographed(far)
+    largest = float(predict(far, m.cameras, BOX, 1.00027).displacements.norm(dim=-1).max())
+    assert largest > 3
+    assert error(far, replace(NETWORK, max_steps=400)(m)) < 0.15
+
+
+def test_pictures_go_on_from_displacements(balls, taken):
+    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
+    both = replace(taken, displacement=d + 0.05, sigma=torch.full_like(d, 0.05))
+    parts = stages(both, "auto")
+    assert [[o.technique.name for o in part.measurement().observations] for part in parts[:2]] == [
+        ["deflection"],
+        ["pictures"],
+    ]
+    assert torch.equal(parts[1].measurement().maps[Pictures.guess], (d + 0.05).float())
+    assert error(balls, NETWORK(both)) < 0.15
+    together = replace(NETWORK, source="both", max_steps=60)(both)
+    assert not together.outcome.failed
+
+
+def test_a_run_from_pictures_resumes_bit_for_bit(taken):
+    whole = replace(NETWORK, max_steps=40)
+    states = []
+
+    def keep(step) -> bool:
+        if step.step == 25:
+            states.append(step.capture())
+        return False
+
+    once = Training(whole, FrameData(whole, taken)).run(keep)
+    again = Training(whole, FrameData(whole, taken), states[0]).run()
+    a, b = (dict(r.field.network.state_dict()) for r in (once, again))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_without_a_limit_a_run_is_judged_by_pixels_held_back(taken):
+    settings = replace(NETWORK, max_steps=0, first_cycle=120)
+    result = settings(taken, lambda step: step.step > 121)
+    held = [row["held_back"] for row in result.history if "held_back" in row]
+    judges = FrameData(settings, taken, judged=True).held_back
+    assert judges is not None
+    assert len(judges) > 200
+    assert held[-1] < 0.5 * math.sqrt(judges.chi_square)  # of what is left of them without a field
+
+
+def test_views_are_compared_as_pictures(balls, taken):
+    views = reproject(balls, taken, held_out=["cam1"])
+    scores = evaluate_views(views)
+    assert {v["measured"] for v in scores} == {"flow"}
+    assert [v["held_out"] for v in scores] == [v["name"] == "cam1" for v in scores]
+    assert min(v["cc"] for v in scores) > 0.99
+    assert max(v["rms_over_sigma"] for v in scores) < 1.1
+
+
+# -- files, and what is refused --------------------------------------------------------------------------------------
+
+
+def test_files_hold_pictures_beside_displacements(tmp_path, balls, taken):
+    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
+    both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05))
+    for name, measurement in (("alone", taken), ("both", both)):
+        path = tmp_path / f"{name}.nc"
+        measurement.write(path)
+        read = Measurement.read(path)
+        assert [o.technique.name for o in read.observations] == [o.technique.name for o in measurement.observations]
+        for key, value in measurement.maps.items():
+            assert torch.equal(read.maps[key], value)
+    with xr.open_dataset(tmp_path / "both.nc", engine="h5netcdf") as data:
+        assert data.attrs["technique"] == "deflection pictures"
+        assert data["reference"].attrs["units"] == "grey value"
+
+
+def test_the_noise_of_pictures_may_be_told_by_attributes(tmp_path, taken):
+    plain = {name: value for name, value in taken.maps.items() if name != "picture_sigma"}
+    dataset = replace(taken, maps=plain).to_dataset()
+    dataset.attrs |= {"read_noise": 10.0, "electrons_per_grey_value": [2.0, 4.0, 4.0, 4.0]}
+    read = Measurement.from_dataset(dataset)
+    flow = taken.maps["flow"]
+    each = torch.tensor([2.0, 4, 4, 4])[:, None, None]
+    assert torch.allclose(read.maps["picture_sigma"], (100 + flow.clamp(min=0) / each).sqrt())
+    dataset.attrs["read_noise"] = [1.0, 2.0]
+    with pytest.raises(InputError, match="attribute read_noise: expected a number, or one for each of 4 views"):
+        Measurement.from_dataset(dataset)
+
+
+def test_what_is_missing_is_told(taken, balls):
+    with pytest.raises(InputError, match="reference: expected pictures without flow"):
+        replace(taken, maps={"flow": taken.maps["flow"]})
+    with pytest.raises(InputError, match=r"reference: expected \(view, row, column\)"):
+        replace(taken, maps={**taken.maps, "reference": taken.maps["reference"][:, :-1]})
+    with pytest.raises(InputError, match="from: expected displacements for 'displacements', got pictures alone"):
+        of_source(taken, "displacements")
+    displaced = predict(balls, taken.cameras, BOX, 1.00027)
+    with pytest.raises(InputError, match="from: expected a measurement with pictures"):
+        NeRIF(source="pictures")(displaced)
+    with pytest.raises(InputError, match="from: expected one of auto, pictures, displacements, both, got 'images'"):
+        NeRIF(source="images")
+    with pytest.raises(InputError, match="technique: pictures show a pattern, and are made by nerif render"):
+        predict(balls, taken.cameras, BOX, 1.00027, technique=Pictures)
+    grey = {**taken.maps, "flow": torch.ones_like(taken.maps["flow"])}
+    with pytest.raises(InputError, match="flow: expected a picture of a pattern, got one of a single grey"):
+        replace(taken, maps=grey)
