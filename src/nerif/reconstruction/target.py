@@ -31,33 +31,46 @@ class Part:
     measured : (n, c) as the model reads it
     inverse_scale : (n, c) one over the unit of `measured`; residuals are multiplied by it: 1/sigma, scaled so that the
         ambient field has mean square 1 over all parts of a target
+    outlier : scaled residual beyond which a number counts by its size and not by its square
     """
 
     model: ForwardModel
     rays: Rays
     measured: Float[Tensor, "n c"]
     inverse_scale: Float[Tensor, "n c"]
+    outlier: float = math.inf
 
     def __len__(self) -> int:
         return len(self.rays)
 
     def __getitem__(self, index: Tensor | slice) -> Part:
         measured, inverse = self.measured[index], self.inverse_scale[index]
-        return Part(self.model, self.rays[index], measured, inverse)
+        return replace(self, rays=self.rays[index], measured=measured, inverse_scale=inverse)
 
     def to(self, device: torch.device | str) -> Part:
         """Return the same on another device."""
-        return Part(self.model, self.rays.to(device), self.measured.to(device), self.inverse_scale.to(device))
+        measured, inverse = self.measured.to(device), self.inverse_scale.to(device)
+        return replace(self, rays=self.rays.to(device), measured=measured, inverse_scale=inverse)
 
     def residual(self, prediction: Float[Tensor, "n k"]) -> Float[Tensor, "n c"]:
-        """Return the scaled difference between a path integral and what was measured."""
-        return self.model.residual(prediction, self.measured, self.rays) * self.inverse_scale
+        """Return the scaled difference between a path integral and what was measured.
+
+        One beyond `outlier` is made smaller by a factor that counts as constant, so that the slope of its square is
+        that of Huber's loss.
+        """
+        r = self._difference(prediction)
+        if math.isinf(self.outlier):
+            return r
+        return r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
 
     @property
     def of_nothing(self) -> Float[Tensor, "n c"]:
         """The scaled residual of the ambient field."""
         integrals = self.model.integrals or self.measured.shape[1]
-        return self.residual(self.measured.new_zeros(len(self), integrals))
+        return self._difference(self.measured.new_zeros(len(self), integrals))
+
+    def _difference(self, prediction: Float[Tensor, "n k"]) -> Float[Tensor, "n c"]:
+        return self.model.residual(prediction, self.measured, self.rays) * self.inverse_scale
 
 
 @dataclass(frozen=True)
@@ -114,7 +127,11 @@ class Target:
         empty = torch.cat([part.of_nothing.flatten() for part in parts])
         # nothing measured at all: the answer is the ambient, in whatever scale
         chi_square = float(empty.square().mean()) or 1.0
-        parts = [replace(part, inverse_scale=part.inverse_scale / math.sqrt(chi_square)) for part in parts]
+        sigma = 1 / math.sqrt(chi_square)
+        parts = [
+            replace(p, inverse_scale=p.inverse_scale * sigma, outlier=p.model.outlier * sigma if known else math.inf)
+            for p in parts
+        ]
         scale = math.sqrt(sum(s**2 for s in scales) / len(scales)) or 1e-6
         return cls(tuple(parts), scale, chi_square, known)
 

@@ -144,6 +144,8 @@ class ForwardModel(ABC):
     """Technique whose values are found in these, such as displacements in pictures, by a window's reach of them."""
     guess: ClassVar[str] = ""
     """Map that holds what those values are about."""
+    outlier: ClassVar[float] = math.inf
+    """Residuals, in sigma, beyond which a pixel counts by their size and not by its square (Huber)."""
     settles: ClassVar[bool] = False
     """Whether something of what is measured beside the field has to be fitted to a prediction (`settle`)."""
     linear: ClassVar[bool] = True

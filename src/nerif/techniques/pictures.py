@@ -59,6 +59,7 @@ class Pictures(LeverArm):
     linear = False
     averaged = False
     derived, guess = "deflection", GUESS
+    outlier = 0.75  # what splines miss of a sharp pattern has long tails
     settles = True
 
     maps: Mapping[str, Tensor] = field(default_factory=dict)
