@@ -1,4 +1,4 @@
-"""The drawings of docs/conventions.md, docs/method.md and docs/pixels.md, as SVG: `python docs/drawings.py FOLDER`.
+"""The drawings of conventions.md, method.md, pixels.md and pictures.md, as SVG: `python docs/drawings.py FOLDER`.
 
 What they show is computed by nerif itself: camera axes, pixels and rays by `Camera`, voxel centres by `Grid`, the
 displacement by warping dots as its definition says. A convention that changed would change the drawing.
@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from nerif.geometry import Box, Camera, Grid, Lens, Ring
+from nerif.techniques.warped import References
 
 __all__ = ["DRAWINGS", "draw_all"]
 
@@ -429,12 +430,43 @@ def cone() -> Figure:
     return figure
 
 
+def pictures() -> Figure:
+    """A pattern without and with flow, and what is left of the difference once the reference is moved."""
+    size, draw = 72, np.random.default_rng(4)
+    row, column = np.mgrid[:size, :size].astype(float)
+    dots = draw.uniform(-4, size + 4, (520, 2))
+
+    def light(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        squares = (u[..., None] - dots[:, 0]) ** 2 + (v[..., None] - dots[:, 1]) ** 2
+        return np.clip(1 - np.exp(-squares / (2 * 1.1**2)).sum(axis=-1), 0.05, 1)
+
+    lump = np.exp(-((column - 36) ** 2 + (row - 36) ** 2) / (2 * 14**2))
+    d = 1.1 * np.stack([(column - 36) / 14 * lump, (row - 36) / 14 * lump], axis=-1)
+    reference = light(column, row) + 0.02 * draw.standard_normal(row.shape)
+    flow = light(column - d[..., 0], row - d[..., 1]) + 0.02 * draw.standard_normal(row.shape)
+    references = References(torch.tensor(reference)[None].float(), [(size, size)])
+    pixel = torch.tensor(np.stack([column, row], axis=-1)).reshape(-1, 2).float()
+    view = torch.zeros(len(pixel), dtype=torch.int16)
+    moved = references.seen(view, pixel, torch.tensor(d).reshape(-1, 2).float()).reshape(size, size).numpy()
+    figure = Figure(figsize=(9.2, 2.6))
+    FigureCanvasAgg(figure)
+    shown = (("$R$", reference), ("$I$", flow), ("$R - I$", reference - flow), ("$R(p - d) - I$", moved - flow))
+    for i, (name, image) in enumerate(shown):
+        axes = figure.add_axes((0.005 + 0.25 * i, 0.01, 0.24, 0.85))
+        limits = {"cmap": "gray", "vmin": 0, "vmax": 1.1} if i < 2 else {"cmap": "RdBu_r", "vmin": -0.6, "vmax": 0.6}
+        axes.imshow(image, interpolation="nearest", **limits)
+        axes.set_title(name, fontsize=11, color=INK, pad=4)
+        axes.set_axis_off()
+    return figure
+
+
 DRAWINGS: dict[str, Callable[[], Figure]] = {
     "axes": axes_and_pixels,
     "displacement": displacement_sign,
     "volume": volume_index,
     "lever_arm": lever_arm,
     "cone": cone,
+    "pictures": pictures,
 }
 
 

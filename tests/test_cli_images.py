@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import tomllib
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -102,6 +104,31 @@ def test_field_from_pictures_alone_is_that_which_was_rendered(experiment):
     assert main([*words, "--voxels", "16", "--basis", "linear", "--regularisation", "3e-3", "--no-report"]) == 0
     assert main(["evaluate", str(experiment / "r"), "--truth", str(experiment / "pictures/truth/volume.nc")]) == 0
     assert json.loads((experiment / "r/metrics.json").read_text())["cc"] > 0.9
+
+
+def test_a_network_goes_by_pictures_and_the_page_shows_them(experiment, tmp_path, capsys):
+    out = tmp_path / "result"
+    held = Measurement.read(experiment / "m.nc").names[1]
+    words = ["reconstruct", str(experiment / "m.nc"), "-o", str(out), "--from", "pictures", "--hold-out", held]
+    assert main([*words, "--max-steps", "40", "--voxels", "16", "--points-per-batch", "2048"]) == 0
+    assert tomllib.loads((out / "run.toml").read_text())["source"] == "pictures"
+    views = json.loads((out / "metrics.json").read_text())["views"]
+    assert {(v["name"], v["measured"]) for v in views if v["held_out"]} == {(held, "displacement"), (held, "flow")}
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png") >= 3 * 3 * VIEWS  # measured, predicted, difference of u, v and flow
+    settings = out / "run.toml"
+    settings.write_text(settings.read_text().replace('source = "pictures"', 'from = "displacements"'))
+    assert main(["reconstruct", "--config", str(settings), "-o", str(tmp_path / "again"), "--no-report"]) == 0
+    kept = tomllib.loads((tmp_path / "again/run.toml").read_text())
+    assert kept["source"] == "displacements"
+    capsys.readouterr()
+    assert main([*words[:-4], "--force", "--from", "images"]) == 2
+    assert "from: expected one of auto, pictures, displacements, both, got 'images'" in capsys.readouterr().err
+    plain = tmp_path / "plain.nc"
+    whole = Measurement.read(experiment / "m.nc")
+    replace(whole, maps={}).write(plain)
+    assert main(["reconstruct", str(plain), "-o", str(tmp_path / "none"), "--from", "pictures"]) == 2
+    assert "expected a measurement with pictures (variables reference and flow)" in capsys.readouterr().err
 
 
 def test_nothing_is_overwritten_unasked(experiment, capsys):

@@ -179,6 +179,19 @@ def test_the_adjoint_of_linear_pictures_is_exact(taken, cone):
     assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-10)
 
 
+def test_outliers_pull_by_their_size_alone(taken):
+    (part,) = Target.of(of_source(taken, "pictures")).parts
+    part = part[:50]
+    d = torch.zeros(50, 2, requires_grad=True)
+    plain = replace(part, outlier=math.inf).residual(d)
+    (square,) = torch.autograd.grad(0.5 * plain.square().sum(), d)
+    (robust,) = torch.autograd.grad(0.5 * part.residual(d).square().sum(), d)
+    size = plain.detach().abs()
+    share = (part.outlier / size).clamp(max=1)
+    assert bool((share < 1).any())
+    assert torch.allclose(robust, square * share, rtol=1e-4, atol=1e-6)
+
+
 # -- reconstructions -------------------------------------------------------------------------------------------------
 
 

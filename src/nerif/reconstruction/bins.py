@@ -8,6 +8,8 @@ whose rays miss it, are left out; a view that has no others keeps its pixels.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -16,7 +18,7 @@ from nerif.geometry import Box, Camera, Rays
 from nerif.measurement import Measurement
 from nerif.observation import Observation
 
-__all__ = ["binned_rays", "coarsest_edge"]
+__all__ = ["binned_rays", "coarsest_edge", "patches"]
 
 FEWEST = 128
 """Bins that a picture keeps along its shorter side, so that they blur no more than the pixels of a small camera."""
@@ -66,6 +68,31 @@ def binned_rays(
         values.append((_sums(weight * d, own)[keep] / total[keep])[crosses].float())
         sigma.append(total[keep][crosses].rsqrt().float())
     return Rays.concatenate(parts), torch.cat(values), torch.cat(sigma)
+
+
+def patches(
+    measurement: Measurement, observation: Observation, edge: int, open_faces: tuple[str, ...] = ()
+) -> tuple[Rays, Float[Tensor, "n c"], Float[Tensor, "n c"]]:
+    """Return the rays of bins, and value and sigma of each of their pixels, row by row.
+
+    A pixel that is not usable has the value 0 and an infinite sigma. Where sigma is not known it counts as 1.
+
+    Parameters
+    ----------
+    observation : what was measured by a technique of one channel
+    edge : of a bin, px
+    """
+    rays, _, _ = binned_rays(measurement, observation, edge, open_faces)
+    usable, within = measurement.usable_for(observation), torch.arange(edge)
+    rows, columns = usable.shape[1:]
+    column, row = (((rays.pixel + 0.5) / edge).floor().long() * edge).unbind(-1)
+    there = row[:, None, None] + within[:, None], column[:, None, None] + within
+    inside = (there[0] < rows) & (there[1] < columns)
+    place = rays.view.long()[:, None, None], there[0].clamp(max=rows - 1), there[1].clamp(max=columns - 1)
+    good = (usable[place] & inside).flatten(1)
+    values = observation.values[place].flatten(1)
+    sigma = torch.ones_like(values) if observation.sigma is None else observation.sigma[place].flatten(1)
+    return rays, torch.where(good, values, 0.0).float(), torch.where(good, sigma, math.inf).float()
 
 
 def _sums(x: Float[Tensor, "row column k"], edge: int) -> Float[Tensor, "r c k"]:

@@ -13,7 +13,7 @@ from nerif.conventions import InputError
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
 from nerif.observation import Observation
-from nerif.reconstruction.bins import binned_rays
+from nerif.reconstruction.bins import binned_rays, patches
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import AUTO, forward_models
 
@@ -94,7 +94,7 @@ class Target:
     @classmethod
     def of(
         cls, measurement: Measurement, open_faces: tuple[str, ...] = (), edge: int = 1, model: str = AUTO,
-        linear: bool = False,
+        linear: bool = False, single: bool = False,
     ) -> Target:  # fmt: skip
         """Collect the usable rays that cross none of the open faces, or those of bins of edge x edge pixels.
 
@@ -102,6 +102,7 @@ class Target:
         ----------
         model : name of the forward model, or auto
         linear : whether it has to be linear
+        single : whether every pixel has a ray of its own, also where a model has patches
 
         Raises
         ------
@@ -118,7 +119,9 @@ class Target:
                 f"{' and '.join(wanted)}, got not both"
             )
         for forward, observation in zip(models, measurement.observations, strict=True):
-            rays, values, sigma = _rays(measurement, observation, open_faces, edge)
+            rays, values, sigma = _rays(
+                measurement, observation, open_faces, edge, 1 if single else forward.patch
+            )
             scales.append(forward.field_scale(rays, values))
             read, noise = forward.reading(values, sigma if observation.sigma is not None else None, rays)
             noise = sigma if observation.sigma is None else noise  # of bins: by how many pixels they have
@@ -127,9 +130,9 @@ class Target:
         empty = torch.cat([part.of_nothing.flatten() for part in parts])
         # nothing measured at all: the answer is the ambient, in whatever scale
         chi_square = float(empty.square().mean()) or 1.0
-        sigma = 1 / math.sqrt(chi_square)
+        unit = 1 / math.sqrt(chi_square)
         parts = [
-            replace(p, inverse_scale=p.inverse_scale * sigma, outlier=p.model.outlier * sigma if known else math.inf)
+            replace(p, inverse_scale=p.inverse_scale * unit, outlier=p.model.outlier * unit if known else math.inf)
             for p in parts
         ]
         scale = math.sqrt(sum(s**2 for s in scales) / len(scales)) or 1e-6
@@ -165,9 +168,11 @@ class Target:
 
 
 def _rays(
-    measurement: Measurement, observation: Observation, open_faces: tuple[str, ...], edge: int
+    measurement: Measurement, observation: Observation, open_faces: tuple[str, ...], edge: int, patch: int
 ) -> tuple[Rays, Tensor, Tensor | None]:
-    """Rays that cross none of the open faces, what they measured, and its sigma."""
+    """Rays that cross none of the open faces, what they or their patches measured, and its sigma."""
+    if patch > 1:
+        return patches(measurement, observation, patch, open_faces)
     if edge > 1 and observation.technique.averaged:
         found: tuple[Rays, Tensor, Tensor | None] = binned_rays(measurement, observation, edge, open_faces)
     else:

@@ -151,7 +151,9 @@ class FrameData(TrainingData):
                 if held is not None:
                     judges = of_source(held, settings.source)
                     self.judging = judges.names
-                    self.held_back = Target.of(judges, settings.open_faces, model=settings.model).to(self.device)
+                    self.held_back = Target.of(
+                        judges, settings.open_faces, model=settings.model, single=True
+                    ).to(self.device)
                     self.measurement = rest
         self.stages, self.edge = stages(self.measurement, settings.source), self.coarsest
         self.refine(self.coarsest)

@@ -181,6 +181,11 @@ class ForwardModel(ABC):
         """What it knows of the light, by names."""
         return dict(vars(self))
 
+    @property
+    def patch(self) -> int:
+        """Edge (px) of the squares of pixels that one ray through their middle stands for, each with its own value."""
+        return 1
+
     @classmethod
     def seen_by(cls, camera: Camera) -> Camera:
         """Return the camera, without its background if the technique looks at none."""

@@ -36,6 +36,10 @@ GUESS = "displacement_guess"
 """Map of what the displacement is about, px: where to begin, and where to be linear."""
 
 
+PATCHES, LARGEST_PATCH = 64, 4
+"""Patches that a picture keeps along its shorter side, and their largest edge, px: a displacement for each."""
+
+
 @dataclass(frozen=True, eq=False)
 class Pictures(LeverArm):
     """Grey values of the flow picture, by the reference picture moved.
@@ -108,6 +112,11 @@ class Pictures(LeverArm):
         return LeverArm(self.n_ambient)
 
     @property
+    def patch(self) -> int:
+        shortest = min(min(size) for size in self.sizes)
+        return min(max(1, shortest // PATCHES), LARGEST_PATCH)
+
+    @property
     def linear_twin(self) -> ForwardModel:
         return LinearPictures(self.n_ambient, self.maps, self.sizes)
 
@@ -117,9 +126,12 @@ class Pictures(LeverArm):
     def residual(
         self, prediction: Float[Tensor, "n k"], measured: Float[Tensor, "n c"], rays: Rays
     ) -> Float[Tensor, "n c"]:
-        """Return the difference; 0 where what is seen lies beyond the reference."""
-        known = self.references.known(rays.view, rays.pixel - prediction.detach())
-        return torch.where(known[:, None], self.read(prediction, rays) - measured, 0.0)
+        """Return the difference at every pixel of a ray's patch; 0 where what is seen lies beyond the reference."""
+        view, pixel = _of_patches(rays, measured.shape[1])
+        d = prediction.repeat_interleave(measured.shape[1], dim=0)
+        known = self.references.known(view, pixel - d.detach())
+        left = self.references.seen(view, pixel, d) - measured.flatten()
+        return torch.where(known, left, 0.0).reshape(measured.shape)
 
     def settle(
         self,
@@ -129,7 +141,9 @@ class Pictures(LeverArm):
         rays: Rays,
     ) -> None:
         """Fit gain and offset of every view to what is predicted."""
-        self.references.fit(rays.view, rays.pixel, prediction, measured[:, 0], inverse_sigma[:, 0])
+        view, pixel = _of_patches(rays, measured.shape[1])
+        d = prediction.repeat_interleave(measured.shape[1], dim=0)
+        self.references.fit(view, pixel, d, measured.flatten(), inverse_sigma.flatten())
 
     @property
     def settled(self) -> Tensor:
@@ -223,6 +237,7 @@ class LinearPictures(Pictures):
     linear = True
     integrals = 1
     settles = False
+    patch = 1
 
     @property
     def linear_twin(self) -> ForwardModel:
@@ -265,3 +280,13 @@ class LinearPictures(Pictures):
         gain, _ = self.references.gain_and_offset(rays.view, pixel)
         known = self.references.known(rays.view, place)
         return torch.where(known[:, None], gain[:, None] * self.references.slope(rays.view, place), 0.0)
+
+
+def _of_patches(rays: Rays, pixels: int) -> tuple[Tensor, Float[Tensor, "m 2"]]:
+    """The views and pixels of the patches that rays stand for, of so many pixels each, row by row."""
+    edge = math.isqrt(pixels)
+    corner = ((rays.pixel + 0.5) / edge).floor() * edge if edge > 1 else rays.pixel
+    within = torch.arange(edge, device=corner.device).to(corner)
+    row, column = torch.meshgrid(within, within, indexing="ij")
+    pixel = corner[:, None] + torch.stack([column, row], dim=-1).reshape(-1, 2)
+    return rays.view.repeat_interleave(pixels), pixel.reshape(-1, 2)

@@ -114,7 +114,7 @@ class References:
         self._follow(pixel)
         moved, known, terms = self.at(view, pixel - d), self.known(view, pixel - d), self._terms(view, pixel)
         for i in view.unique().tolist():
-            own = (view == i) & known & flow.isfinite() & inverse_sigma.isfinite()
+            own = (view == i) & known & flow.isfinite() & inverse_sigma.isfinite() & (inverse_sigma > 0)
             if int(own.sum()) < 4 * terms.shape[1]:
                 continue
             p, w, y = terms[own].double(), inverse_sigma[own].double(), flow[own].double()
