@@ -25,7 +25,7 @@ from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reprojection import Reprojection
 from nerif.result import VOLUME, ResultDirectory
-from nerif.techniques.registry import AUTO
+from nerif.techniques.registry import AUTO, forward_model
 from nerif.volume import INDEX, Volume
 from nerif.volume_file import read_volume
 
@@ -90,12 +90,15 @@ def evaluate(
 def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     """Compare every view with its prediction: cc, ssim, psnr and rms over the usable pixels that see the box.
 
+    Of pictures it is the change by the flow that is compared: what they would show without it is taken off both.
+
     The rms is in the unit of what was measured, and also called rms_px where that is px. Where sigma is known,
     rms_over_sigma tells whether the residual is the noise (1) or more.
     """
     from concurrent.futures import ThreadPoolExecutor
 
     measurement, sees_box = reprojection.measurement, reprojection.measurement.sees_box
+    models = {kind: forward_model(kind, measurement) for kind in measurement.techniques if kind.derived}
 
     def scores(view: int, observation: Observation, compared: Bool[Tensor, "view row column"]) -> dict[str, Any]:
         camera, kind = measurement.cameras[view], observation.technique
@@ -105,6 +108,9 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         measured = observation.values[inside].nan_to_num(0.0, 0.0, 0.0)
         found: dict[str, Any] = {"name": camera.name, "held_out": camera.name in reprojection.held_out}
         found |= {"measured": kind.measured, "unit": kind.unit}
+        if kind.derived:  # what no flow would show is no merit of the field
+            still = models[kind].mapped(torch.zeros(height, width, kind.integrals), view)
+            measured, predicted = measured - still, predicted - still
         found |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
         if kind.unit != "1":
             found[f"rms_{kind.unit}"] = found["rms"]

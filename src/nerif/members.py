@@ -107,16 +107,21 @@ class Members:
 
     def _noise(self, main: Reconstruction) -> tuple[dict[str, Float[Tensor, "view row column c"]], str]:
         """Standard deviation of every pixel's noise by technique: the file's, else the rms residual of each view."""
-        seen, training = self.training.observations[0], self.training
-        if seen.sigma is not None:  # of several techniques each has one
-            known = {o.technique.name: o.sigma for o in training.observations if o.sigma is not None}
-            return {name: sigma.nan_to_num(0.0, 0.0, 0.0) for name, sigma in known.items()}, "sigma of the measurement"
-        rms = torch.tensor([v["rms"] for v in _compared(main, training)])
+        training = self.training
+        noise = {o.technique.name: o.sigma for o in training.observations if o.sigma is not None}
+        noise = {name: sigma.nan_to_num(0.0, 0.0, 0.0) for name, sigma in noise.items()}
+        unknown = [o for o in training.observations if o.sigma is None]
+        if not unknown:
+            return noise, "sigma of the measurement"
         instead = "noise of the size of each view's rms residual is added"
-        self.monitor.say(f"ensemble: the measurement has no sigma; {instead}")
-        # NaN for a view of which no ray crosses the box
-        whole = rms.nan_to_num(0.0)[:, None, None, None].expand(seen.values.shape).clone()
-        return {seen.technique.name: whole}, "rms residual"
+        names = " and ".join(o.technique.sigma for o in unknown)
+        self.monitor.say(f"ensemble: the measurement has no {names}; {instead}")
+        views = {(v["measured"], v["name"]): v["rms"] for v in _compared(main, training)}
+        for o in unknown:
+            # none for a view of which no ray crosses the box
+            rms = torch.tensor([views.get((o.technique.measured, name), 0.0) for name in training.names])
+            noise[o.technique.name] = rms.nan_to_num(0.0)[:, None, None, None].expand(o.values.shape).clone()
+        return noise, "rms residual"
 
     def _member(self, number: int, noise: Mapping[str, Float[Tensor, "view row column c"]]) -> Reconstruction:
         """One member: read if it is there already, made by the same settings from the same data; else reconstructed."""

@@ -54,7 +54,7 @@ class Observation:
     @property
     def signed(self) -> bool:
         """Whether what is measured may be negative: not where the field may not."""
-        return self.technique.bounds[0] < 0
+        return self.technique.bounds[0] < 0 and not self.technique.derived
 
     @property
     def caption(self) -> str:

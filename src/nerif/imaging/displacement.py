@@ -183,9 +183,17 @@ def measure(
 
 
 def measure_against(
-    rest: AtRest, flow: Sequence[np.ndarray], region: Bool[np.ndarray, "row column"] | None = None
+    rest: AtRest,
+    flow: Sequence[np.ndarray],
+    region: Bool[np.ndarray, "row column"] | None = None,
+    pictures: bool = True,
 ) -> DisplacementMap:
-    """Return displacement, noise and validity of a view whose reference is known already; see measure."""
+    """Return displacement, noise and validity of a view whose reference is known already; see measure.
+
+    Parameters
+    ----------
+    pictures : whether to keep them, where there is one flow picture
+    """
     settings, reach = rest.settings, rest.settings.reach
     full = rest.full.copy()
     shaken = np.zeros(1)
@@ -214,7 +222,7 @@ def measure_against(
     if region is not None:
         valid &= region
     pair = None
-    if len(flow) == 1:
+    if pictures and len(flow) == 1 and bool(valid.any()):
         usable = ~_grown(full, 2) if region is None else region & ~_grown(full, 2)
         reference = warp(rest.mean, -shaken) if settings.shake_border else rest.mean
         grey = np.asarray(flow[0], dtype=np.float32)

@@ -82,6 +82,7 @@ class RestingView:
     masks : of the flow by threshold, or None
     region : (row, column) where the background is seen, or None
     drawn : (row, column) drawn mask of the flow, or None
+    pictures : whether a displacement keeps the pictures that it was found in
     """
 
     view: View
@@ -90,6 +91,7 @@ class RestingView:
     masks: MaskSettings | None = None
     region: Bool[np.ndarray, "row column"] | None = None
     drawn: Bool[np.ndarray, "row column"] | None = None
+    pictures: bool = True
 
     @classmethod
     def of(
@@ -112,7 +114,8 @@ class RestingView:
         shape = (reference[0].shape[0], reference[0].shape[1])
         camera = camera_of(view, recording.cameras[view.name], shape)
         rest = AtRest.of(reference, recording.method, view.full_scale, averaged)
-        return cls(view, camera, rest, recording.masks, view.drawn("region", shape), view.drawn("mask", shape))
+        return cls(view, camera, rest, recording.masks, view.drawn("region", shape), view.drawn("mask", shape),
+                   recording.pictures)
 
     def measure(
         self, numbers: Sequence[int], say: Callable[[str], None] = lambda line: None
@@ -131,7 +134,7 @@ class RestingView:
             exposure = check_exposure(pictures[-1], full, frames.name(i))
             if exposure:
                 say(f"note: {exposure}")
-        found = measure_against(self.rest, pictures, self.region)
+        found = measure_against(self.rest, pictures, self.region, self.pictures)
         if not found.valid.any():
             method = self.rest.settings
             raise InputError(

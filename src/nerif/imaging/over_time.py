@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ class RestingRecording:
         processes: int | None = None,
     ) -> RestingRecording:
         """Look at the reference pictures of all views; see RestingView.of."""
-        views = recording.views
+        views, recording = recording.views, replace(recording, pictures=False)  # a store of frames has none
         if processes is None:
             processes = recording.processes(len(views), len(views))
         found: dict[int, RestingView] = {}

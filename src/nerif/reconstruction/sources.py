@@ -8,6 +8,7 @@ sharp pattern is not known: that much blur takes more from what cubic splines ge
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -84,6 +85,8 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT) -> Meas
     whole = measurement if source == "both" else pictures.alone(measurement)
     sizes = [camera.image_size for camera in whole.cameras]
     maps = pictures.technique.softened(whole.maps, sizes, blur)
+    measured = pictures.technique.measured
+    maps[measured] = maps[measured].where(whole.usable_for(_pair(whole)[0] or pictures), math.nan)
     if found is not None:
         known = [measurement.names.index(name) for name in whole.names]
         maps[pictures.technique.guess] = _filled(measurement, found)[known]

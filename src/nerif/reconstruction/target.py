@@ -17,7 +17,9 @@ from nerif.reconstruction.bins import binned_rays, patches
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import AUTO, forward_models
 
-__all__ = ["Part", "Target"]
+__all__ = ["Part", "Target", "check_target"]
+
+PIECE = 1 << 17  # rays
 
 
 @dataclass(frozen=True)
@@ -58,19 +60,40 @@ class Part:
         One beyond `outlier` is made smaller by a factor that counts as constant, so that the slope of its square is
         that of Huber's loss.
         """
-        r = self._difference(prediction)
-        if math.isinf(self.outlier):
-            return r
-        return r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
+        return self._robust(self._difference(prediction))
 
     @property
     def of_nothing(self) -> Float[Tensor, "n c"]:
         """The scaled residual of the ambient field."""
         integrals = self.model.integrals or self.measured.shape[1]
-        return self._difference(self.measured.new_zeros(len(self), integrals))
+        return self._robust(self._difference(self.measured.new_zeros(len(self), integrals)))
+
+    def split(self) -> list[Part]:
+        """Return the part in pieces that need little memory."""
+        return [self[i : i + PIECE] for i in range(0, len(self), PIECE)]
+
+    def _robust(self, r: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        if math.isinf(self.outlier):
+            return r
+        return r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
 
     def _difference(self, prediction: Float[Tensor, "n k"]) -> Float[Tensor, "n c"]:
         return self.model.residual(prediction, self.measured, self.rays) * self.inverse_scale
+
+
+def check_target(measurement: Measurement, model: str = AUTO, linear: bool = False) -> None:
+    """Refuse a model that a technique of the measurement does not have, and several techniques without their noise.
+
+    Raises
+    ------
+    InputError
+        Naming it.
+    """
+    forward_models(measurement.techniques, measurement, model, linear)
+    observations = measurement.observations
+    if len(observations) > 1 and any(o.sigma is None for o in observations):
+        names, wanted = (" and ".join(getattr(o.technique, a) for o in observations) for a in ("name", "sigma"))
+        raise InputError(f"technique: {names} together are weighed by their noise: expected {wanted}, got not both")
 
 
 @dataclass(frozen=True)
@@ -84,12 +107,14 @@ class Target:
     chi_square : mean square of the ambient field's residual over sigma (over 1, where sigma is not known), which turns
         the mean square of a scaled residual into that in units of the noise
     sigma_known : whether it is
+    noise : mean square of the noise's residual over that of the ambient field's; None where sigma is not known
     """
 
     parts: tuple[Part, ...]
     scale: float
     chi_square: float
     sigma_known: bool
+    noise: float | None = None
 
     @classmethod
     def of(
@@ -109,15 +134,10 @@ class Target:
         InputError
             If no ray is left, or there is no such model.
         """
+        check_target(measurement, model, linear)
         models = forward_models(measurement.techniques, measurement, model, linear)
         parts, scales = [], []
         known = all(o.sigma is not None for o in measurement.observations)
-        if not known and len(measurement.observations) > 1:
-            names, wanted = ([getattr(o.technique, a) for o in measurement.observations] for a in ("name", "sigma"))
-            raise InputError(
-                f"technique: {' and '.join(names)} together are weighed by their noise: expected "
-                f"{' and '.join(wanted)}, got not both"
-            )
         for forward, observation in zip(models, measurement.observations, strict=True):
             rays, values, sigma = _rays(
                 measurement, observation, open_faces, edge, 1 if single else forward.patch
@@ -127,7 +147,7 @@ class Target:
             noise = sigma if observation.sigma is None else noise  # of bins: by how many pixels they have
             inverse = torch.ones_like(read) if noise is None else 1 / noise
             parts.append(Part(forward, rays, read, inverse))
-        empty = torch.cat([part.of_nothing.flatten() for part in parts])
+        empty = torch.cat([p.of_nothing.flatten() for part in parts for p in part.split()])
         # nothing measured at all: the answer is the ambient, in whatever scale
         chi_square = float(empty.square().mean()) or 1.0
         unit = 1 / math.sqrt(chi_square)
@@ -136,15 +156,13 @@ class Target:
             for p in parts
         ]
         scale = math.sqrt(sum(s**2 for s in scales) / len(scales)) or 1e-6
-        return cls(tuple(parts), scale, chi_square, known)
+        left = torch.cat([p.of_nothing.flatten() for part in parts for p in part.split()]).square().mean()
+        of_noise = sum(_robust_square(p.model.outlier) * p.measured.numel() for p in parts) / len(empty)
+        share = of_noise / chi_square / (float(left) or 1.0)
+        return cls(tuple(parts), scale, chi_square, known, share if known else None)
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
-
-    @property
-    def noise(self) -> float | None:
-        """Mean square of the noise over that of what was measured; None where it is not known."""
-        return 1 / self.chi_square if self.sigma_known else None
 
     @property
     def numbers(self) -> int:
@@ -161,6 +179,10 @@ class Target:
             chosen.append(part[own - first])
             first += len(part)
         return replace(self, parts=tuple(chosen))
+
+    def without_outliers(self) -> Target:
+        """Return the same by which every number counts by its square."""
+        return replace(self, parts=tuple(replace(part, outlier=math.inf) for part in self.parts))
 
     def to(self, device: torch.device | str) -> Target:
         """Return the same on another device."""
@@ -184,3 +206,11 @@ def _rays(
     if bool(keep.all()):
         return rays, values, sigma
     return rays[keep], values[keep], None if sigma is None else sigma[keep]
+
+
+def _robust_square(outlier: float) -> float:
+    """The mean of min(z^2, c |z|) of a standard normal variable: what Huber's loss leaves of noise.
+
+    erf(c / sqrt 2) - 2 c phi(c) + 2 c phi(c) = erf(c / sqrt 2),     phi the normal density
+    """
+    return 1.0 if math.isinf(outlier) else math.erf(outlier / math.sqrt(2))

@@ -210,11 +210,14 @@ class Training:
         self.edge = edge
         self.data.refine(edge)
         self._recount()
+        self.objective.settle()
         self._log({"bin_edge": float(edge)})
 
     def _begin_part(self) -> None:
         """Meet what the data give from now on, what is open beside the field fitted to the field so far."""
         self._recount()
+        self.watch = Watch(self.data.noise)
+        self.watch.step = self.budget.step
         self.objective.settle()
         self._log({"part": float(self.data.stage)})
 
@@ -252,6 +255,7 @@ class Training:
         self._log({"held_back": math.sqrt(error)})
         if cycles.best:
             self.best = self._weights()
+        self.objective.settle()
         self.settled = self.edge == 1  # the pace is better known now
         return outcome
 

@@ -26,7 +26,7 @@ from nerif.reconstruction.gauge import AmbientRegion, is_open
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.sources import of_source, stages
-from nerif.reconstruction.target import Part, Target
+from nerif.reconstruction.target import Part, Target, check_target
 from nerif.techniques.base import ForwardModel
 
 __all__ = ["FrameData", "TrainingData"]
@@ -136,6 +136,7 @@ class FrameData(TrainingData):
     ) -> None:
         measurement = seen_through(measurement, settings.aperture)
         final = of_source(measurement, settings.source)
+        check_target(final, settings.model)
         super().__init__(
             resolve_device(settings.device), measurement.box, measurement.n_ambient,
             fingerprint(final, settings.open_faces), is_open(measurement), measurement.quantity,
@@ -153,7 +154,7 @@ class FrameData(TrainingData):
                     self.judging = judges.names
                     self.held_back = Target.of(
                         judges, settings.open_faces, model=settings.model, single=True
-                    ).to(self.device)
+                    ).without_outliers().to(self.device)
                     self.measurement = rest
         self.stages, self.edge = stages(self.measurement, settings.source), self.coarsest
         self.refine(self.coarsest)

@@ -136,7 +136,7 @@ def _kind(result: Result) -> str:
         kinds = result.measurement.techniques
     else:
         kinds = () if result.field is None else (technique_of(result.field.quantity),)
-    return " and ".join(kind.tomography for kind in kinds)
+    return " and ".join(dict.fromkeys(kind.tomography for kind in kinds))
 
 
 def _source(result: Result) -> str:

@@ -70,6 +70,9 @@ def reconstruct_sequence(
         raise InputError(f"reconstructor: expected NeRIF for a sequence, got {type(reconstructor).__name__}")
     if reconstructor.time_limit:
         raise InputError("time_limit: expected none in a sequence, whose frames are to be repeatable; give --max-steps")
+    if reconstructor.source in ("pictures", "both"):
+        raise InputError(f"from: expected auto or displacements for a sequence, got '{reconstructor.source}'")
+    reconstructor = replace(reconstructor, source="displacements")
     sequence = MeasurementSequence.read(measurement)
     like = seen_through(sequence.first_good(), reconstructor.aperture)
     like.without(settings.hold_out)

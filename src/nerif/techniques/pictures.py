@@ -36,6 +36,7 @@ GUESS = "displacement_guess"
 """Map of what the displacement is about, px: where to begin, and where to be linear."""
 
 
+FEWEST = 256  # pixels that show whether there is a pattern
 PATCHES, LARGEST_PATCH = 64, 4
 """Patches that a picture keeps along its shorter side, and their largest edge, px: a displacement for each."""
 
@@ -86,7 +87,7 @@ class Pictures(LeverArm):
         sigma: Float[Tensor, "row column c"] | None,
         usable: Bool[Tensor, "row column"],
     ) -> None:
-        if bool(usable.any()) and not float(values[usable].std(correction=0)) > 0:
+        if int(usable.sum()) >= FEWEST and not float(values[usable].std(correction=0)) > 0:
             raise InputError("flow: expected a picture of a pattern, got one of a single grey")
 
     @cached_property
@@ -97,9 +98,9 @@ class Pictures(LeverArm):
         if GUESS in self.maps:
             for i, (height, width) in enumerate(self.sizes):
                 row, column = self.maps["flow"][i, :height, :width].isfinite().nonzero().unbind(-1)
-                view = torch.full_like(row, i)
-                guess, flow = self.maps[GUESS][i, row, column], self.maps["flow"][i, row, column]
+                view, flow = torch.full_like(row, i), self.maps["flow"][i, row, column]
                 pixel = torch.stack([column, row], dim=-1).float()
+                guess = self.maps[GUESS][i, row, column].nan_to_num(0.0)
                 found.fit(view, pixel, guess, flow, self._inverse_sigma(i, row, column))
         return found
 
@@ -131,7 +132,7 @@ class Pictures(LeverArm):
         d = prediction.repeat_interleave(measured.shape[1], dim=0)
         known = self.references.known(view, pixel - d.detach())
         left = self.references.seen(view, pixel, d) - measured.flatten()
-        return torch.where(known, left, 0.0).reshape(measured.shape)
+        return torch.where(known | d.isnan().any(dim=-1), left, 0.0).reshape(measured.shape)
 
     def settle(
         self,
@@ -164,8 +165,8 @@ class Pictures(LeverArm):
         views, of_view = len(maps[cls.measured]), []
         for name, default in zip(names, otherwise, strict=True):
             value = np.asarray(attributes.get(name, default))
-            good = value.dtype.kind in "fiu" and value.shape in ((), (1,), (views,)) and bool(np.all(value >= 0))
-            if not good:
+            good = value.dtype.kind in "fiu" and value.shape in ((), (1,), (views,))
+            if not good or not bool(np.all(value > 0 if name == names[1] else value >= 0)):
                 raise InputError(f"attribute {name}: expected a number, or one for each of {views} views, got {value}")
             of_view.append(torch.tensor(value, dtype=torch.float32).expand(views)[:, None, None])
         return {**maps, cls.sigma: (of_view[0].square() + maps[cls.measured].clamp(min=0) / of_view[1]).sqrt()}
@@ -269,9 +270,9 @@ class LinearPictures(Pictures):
 
     def _guess(self, rays: Rays) -> Float[Tensor, "n 2"]:
         if GUESS not in self.maps:
-            return torch.zeros(len(rays), 2)
-        column, row = rays.pixel.round().long().unbind(-1)
-        return self.maps[GUESS][rays.view.long(), row, column].nan_to_num(0.0)
+            return torch.zeros(len(rays), 2, device=rays.pixel.device)
+        column, row = rays.pixel.round().long().cpu().unbind(-1)
+        return self.maps[GUESS][rays.view.long().cpu(), row, column].nan_to_num(0.0).to(rays.pixel.device)
 
     def _slope(self, rays: Rays) -> Float[Tensor, "n 2"]:
         """g grad(reference) at p - d_0; 0 where that is not known."""

@@ -29,6 +29,7 @@ ASSUMED = Deflection
 AUTO = "auto"
 MODELS: dict[str, tuple[str, ...]] = {
     Deflection.name: tuple(deflection.MODELS),
+    Pictures.name: ("lever_arm",),
     Absorption.name: tuple(absorption.MODELS),
 }
 """Names of the models of those techniques that have several, the default first."""
@@ -98,7 +99,8 @@ def forward_models(
     offered = [name for kind in kinds for name in MODELS.get(kind.name, ())]
     if model != AUTO and model not in offered:
         names = " and ".join(kind.name for kind in kinds)
-        raise InputError(f"model: expected one of {', '.join((AUTO, *offered))} for {names}, got '{model}'")
+        instead = "; give --from displacements" if any(kind.derived for kind in kinds) else ""
+        raise InputError(f"model: expected one of {', '.join((AUTO, *offered))} for {names}, got '{model}'{instead}")
     models = tuple(forward_model(kind, light, model) for kind in kinds)
     if not linear:
         return models

@@ -20,6 +20,7 @@ DEGREE = 4
 """Of the polynomials of gain and offset, in total."""
 RIDGE = 1e-4  # of what a pixel weighs, for every term beyond the constants
 ROUNDS, OUTLIER = 3, 3.0  # of the fit; residuals, in standard deviations, beyond which a pixel counts less
+MOST = 1 << 16  # pixels of a view that tell its gain and offset
 PAD = 2  # rows and columns that the spline takes beyond the edges, mirrored
 
 
@@ -86,7 +87,7 @@ class References:
         self._follow(place)
         last = self.sizes[view.long()].flip(-1) - 1
         inside = ((place >= 0) & (place <= last)).all(dim=-1)
-        column, row = place.round().long().clamp(min=0).minimum(last).unbind(-1)
+        column, row = place.nan_to_num(0.0).round().long().clamp(min=0).minimum(last).unbind(-1)
         return inside & self.good[view.long(), row, column]
 
     def gain_and_offset(
@@ -117,6 +118,9 @@ class References:
             own = (view == i) & known & flow.isfinite() & inverse_sigma.isfinite() & (inverse_sigma > 0)
             if int(own.sum()) < 4 * terms.shape[1]:
                 continue
+            if int(own.sum()) > MOST:
+                drawn = torch.rand(len(own), generator=torch.Generator().manual_seed(i))
+                own &= (drawn < MOST / int(own.sum())).to(own.device)
             p, w, y = terms[own].double(), inverse_sigma[own].double(), flow[own].double()
             scale = moved[own].double().std().clamp(min=1e-9)
             matrix = torch.cat([p * (moved[own].double() / scale)[:, None], p], dim=1)
@@ -155,7 +159,7 @@ class References:
         """The spline, or its two slopes."""
         self._follow(place)
         place = place.clamp(min=0).minimum(self.sizes[view.long()].flip(-1).to(place) - 1)
-        first = place.detach().floor()
+        first = place.detach().nan_to_num(0.0).floor()
         within = place - first
         column, row = first.long().unbind(-1)
         start = view.long() * self.area + (row + PAD - 1) * self.width + column + PAD - 1
