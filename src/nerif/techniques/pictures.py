@@ -238,6 +238,7 @@ class LinearPictures(Pictures):
     linear = True
     integrals = 1
     settles = False
+    outlier = math.inf
     patch = 1
 
     @property
