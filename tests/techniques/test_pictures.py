@@ -223,6 +223,7 @@ def test_pictures_go_on_from_displacements(balls, taken):
     ]
     assert torch.equal(parts[1].measurement().maps[Pictures.guess], (d + 0.05).float())
     assert error(balls, NETWORK(both)) < 0.15
+    assert [o.technique.name for o in of_source(both, "auto", preferred="displacements").observations] == ["deflection"]
     together = replace(NETWORK, source="both", max_steps=60)(both)
     assert not together.outcome.failed
 

@@ -63,7 +63,9 @@ class Descent:
         resume: State | None,
         start: Field | None,
     ) -> None:
-        measurement = seen_through(of_source(measurement, settings.source), settings.aperture)
+        measurement = seen_through(
+            of_source(measurement, settings.source, preferred="displacements"), settings.aperture
+        )
         self.settings, self.measurement, self.on_step, self.field_before = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
         self.faces = ambient_faces(measurement, settings.ambient_faces)

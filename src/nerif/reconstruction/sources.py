@@ -52,16 +52,18 @@ def check_source(source: str) -> None:
         raise InputError(f"from: expected one of {', '.join(SOURCES)}, got '{source}'")
 
 
-def of_source(measurement: Measurement, source: str, blur: float = SOFT) -> Measurement:
+def of_source(
+    measurement: Measurement, source: str, blur: float = SOFT, preferred: str = "pictures"
+) -> Measurement:
     """Return the measurement with what a reconstruction is to go by: pictures, displacements, or both.
 
-    "auto" takes the pictures where there are some; what is measured by other techniques is left as it is. Pictures
-    keep what displacements tell, as a guess.
+    What is measured by other techniques is left as it is. Pictures keep what displacements tell, as a guess.
 
     Parameters
     ----------
     source : one of SOURCES
     blur : of the pictures, standard deviation in px
+    preferred : what "auto" takes where there are both
 
     Raises
     ------
@@ -78,6 +80,8 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT) -> Meas
                 f"{names}; nerif displacement writes them"
             )
         return measurement
+    if source == "auto" and found is not None:
+        source = preferred
     if found is None and source in ("displacements", "both"):
         raise InputError(f"from: expected displacements for '{source}', got pictures alone; give --from pictures")
     if found is not None and source == "displacements":

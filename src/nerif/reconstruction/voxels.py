@@ -52,7 +52,7 @@ class VoxelReconstructor(Reconstructor):
     (off)."""
     source: str = "auto"
     """What to go by (also --from): displacements, pictures (each pixel, linear around the displacements), both, or
-    auto: pictures where there are some."""
+    auto: displacements where there are some."""
     step: float | None = None
     """Longest distance between the planes on which rays are sampled, in voxels: at most, and by default, 1 (cubic) or
     0.5 (linear)."""
