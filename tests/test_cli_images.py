@@ -320,7 +320,7 @@ def test_many_flow_pictures_become_a_sequence(copy, capsys):
     first = film.frame(0)
     assert first.names == single.names
     assert torch.equal(first.usable, single.usable_for(single.observations[0]))
-    assert torch.allclose(first.displacement[first.usable], single.displacement[single.usable], atol=1e-6)
+    assert torch.allclose(first.displacement[first.usable], single.displacement[first.usable], atol=1e-6)
     assert len(film.frame(1).names) == len(views) - 1
     still = film.frame(2)
     assert float(still.displacement[still.usable].abs().mean()) < 0.3 * float(
