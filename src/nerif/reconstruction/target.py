@@ -139,9 +139,8 @@ class Target:
         parts, scales = [], []
         known = all(o.sigma is not None for o in measurement.observations)
         for forward, observation in zip(models, measurement.observations, strict=True):
-            rays, values, sigma = _rays(
-                measurement, observation, open_faces, edge, 1 if single else forward.patch
-            )
+            patch = 1 if single else forward.patch
+            rays, values, sigma = _rays(measurement, observation, open_faces, edge, patch)
             scales.append(forward.field_scale(rays, values))
             read, noise = forward.reading(values, sigma if observation.sigma is not None else None, rays)
             noise = sigma if observation.sigma is None else noise  # of bins: by how many pixels they have
@@ -156,10 +155,7 @@ class Target:
             for p in parts
         ]
         scale = math.sqrt(sum(s**2 for s in scales) / len(scales)) or 1e-6
-        left = torch.cat([p.of_nothing.flatten() for part in parts for p in part.split()]).square().mean()
-        of_noise = sum(_robust_square(p.model.outlier) * p.measured.numel() for p in parts) / len(empty)
-        share = of_noise / chi_square / (float(left) or 1.0)
-        return cls(tuple(parts), scale, chi_square, known, share if known else None)
+        return cls(tuple(parts), scale, chi_square, known, _noise_share(parts, chi_square) if known else None)
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
@@ -206,6 +202,16 @@ def _rays(
     if bool(keep.all()):
         return rays, values, sigma
     return rays[keep], values[keep], None if sigma is None else sigma[keep]
+
+
+def _noise_share(parts: list[Part], chi_square: float) -> float:
+    """Mean square of the noise's residual over that of the ambient field's, outliers of either by their size."""
+    if all(math.isinf(part.outlier) for part in parts):
+        return 1 / chi_square
+    numbers = sum(part.measured.numel() for part in parts)
+    noise = sum(_robust_square(part.model.outlier) * part.measured.numel() for part in parts)
+    empty = sum(float(p.of_nothing.square().sum()) for part in parts for p in part.split())
+    return noise / chi_square / (empty or numbers)
 
 
 def _robust_square(outlier: float) -> float:
