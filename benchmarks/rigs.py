@@ -53,18 +53,18 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     add_write(parser)
     asked = parser.parse_args()
-    columns = ["rig", "method", "aperture", "L2", "goal", "worst view, sigma", "steps", "s"]
+    columns = ["rig", "method", "lens, window", "L2", "goal", "worst view, sigma", "steps", "s"]
     more = f"\n\nNeRIF trains for {asked.seconds:g} s; total variation by its defaults; medians of seeds."
     table = Table("Rigs with one fault each", columns, asked.write, more)
     for name in asked.only:
         path = asked.rigs / f"{name}.nc"
         for method in asked.methods:
-            for aperture in ("auto", "off") if name.startswith("f") else ("auto",):
+            for aperture in ("auto", "off") if name.startswith(("f", "window")) else ("auto",):
                 seeds = asked.seeds if method == "nerif" else asked.seeds[:1]
                 found = [alone(run, path, method, aperture, asked.seconds, seed) for seed in seeds]
                 middle = {key: statistics.median(one[key] for one in found) for key in found[0]}
                 goal = GOALS.get(name) if (method, aperture) == ("nerif", "auto") else None
-                known = "-" if not name.startswith("f") else {"auto": "known", "off": "off"}[aperture]
+                known = "-" if not name.startswith(("f", "window")) else {"auto": "known", "off": "off"}[aperture]
                 table.row(
                     [name, method, known, f"{middle['l2']:.3%}", "" if goal is None else f"{goal:.2%}",
                      f"{middle['worst']:.2f}", f"{middle['steps']:.0f}", f"{middle['seconds']:.0f}"]

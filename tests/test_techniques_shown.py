@@ -233,11 +233,11 @@ def test_quantities_of_a_sequence_follow_from_the_measurement(both, absorption):
 
 def test_what_is_known_of_the_views_and_not_used_is_told(absorption, tmp_path, capsys):
     measurement = Measurement.read(absorption.with_suffix(".nc"))
-    about = {"window": torch.full((3,), 6.0)}
+    about = {"pose_sigma": torch.full((3, 6), 6.0)}
     path = tmp_path / "m.nc"
     replace(measurement, about_views=about).write(path)
     assert main(["reconstruct", str(path), "-o", str(tmp_path / "r"), "--no-report", *QUICK]) == 0
-    assert "window: known of the views, but the reconstruction makes no use of it" in capsys.readouterr().out
+    assert "pose_sigma: known of the views, but the reconstruction makes no use of it" in capsys.readouterr().out
 
 
 def test_maps_that_cannot_be_negative_begin_at_zero():

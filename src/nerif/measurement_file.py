@@ -49,6 +49,7 @@ RIG = {
     "image_size": (("view", "side"), "px"),
     "aperture_diameter": (("view",), "mm"),
     "focus_distance": (("view",), "mm"),
+    "window": (("view",), "px"),
 }
 """Dimensions and unit of what is known of the rig."""
 
@@ -58,7 +59,6 @@ SPELLED = {"px/mm": "px mm-1"}
 MASKS = ("valid", "flow_mask")
 
 ABOUT_VIEWS = {
-    "window": (("view",), "px"),
     "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
 }
 """Dimensions and unit of what else may be known of the views."""
@@ -145,7 +145,9 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         data["background_normal"] = stack([nowhere if c.background is None else c.background.normal for c in cameras])
         data["background_offset"] = np.array([np.nan if c.background is None else c.background.offset for c in cameras])
     lenses = [c.lens for c in cameras if c.lens is not None]
-    if lenses:
+    if any(lens.window > 0 for lens in lenses):
+        data["window"] = np.array([lens.window for lens in lenses])
+    if any(lens.diameter > 0 for lens in lenses):
         data["aperture_diameter"] = np.array([lens.diameter for lens in lenses])
     if any(lens.focus is not None for lens in lenses):
         data["focus_distance"] = np.array([np.nan if lens.focus is None else lens.focus for lens in lenses])
@@ -339,17 +341,18 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
 
 
 def _lenses(dataset: xr.Dataset, names: list[str]) -> list[Lens | None]:
-    """The lenses of all views; none of any where no aperture is known."""
-    diameters = _array(dataset, "aperture_diameter") if "aperture_diameter" in dataset else torch.zeros(len(names))
+    """The lenses of all views, and their windows; none of any where no aperture and no window is known."""
+    nought = torch.zeros(len(names))
+    diameters, windows = (_array(dataset, n) if n in dataset else nought for n in ("aperture_diameter", "window"))
     nowhere = torch.full((len(names),), torch.nan)
     focus = _array(dataset, "focus_distance", True) if "focus_distance" in dataset else nowhere
     found: list[Lens | None] = []
-    for name, diameter, depth in zip(names, diameters.tolist(), focus.tolist(), strict=True):
+    for name, diameter, depth, edge in zip(names, diameters.tolist(), focus.tolist(), windows.tolist(), strict=True):
         try:
-            found.append(Lens(diameter, None if math.isnan(depth) else depth))
+            found.append(Lens(diameter, None if math.isnan(depth) else depth, window=edge))
         except InputError as error:
             raise InputError(f"view '{name}': {error}") from None
-    return found if bool((diameters > 0).any()) else [None] * len(names)
+    return found if any(lens is not None and lens.wide for lens in found) else [None] * len(names)
 
 
 def _plane(normal: Tensor, offset: Tensor, view: str) -> Plane | None:

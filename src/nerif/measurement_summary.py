@@ -38,7 +38,7 @@ def summary(measurement: Measurement, held_out: int = 0) -> list[tuple[str, str]
 
 def _lenses(measurement: Measurement) -> list[tuple[str, str]]:
     """How wide the lenses are, where that is known."""
-    wide = sorted({c.lens.diameter for c in measurement.cameras if c.lens is not None})
+    wide = sorted({c.lens.diameter for c in measurement.cameras if c.lens is not None} - {0.0})
     return [("Aperture", " to ".join(f"{d:.3g}" for d in wide[:: max(len(wide) - 1, 1)]) + " mm")] if wide else []
 
 

@@ -151,7 +151,7 @@ def render(
         raise InputError(f"samples: expected at least one point along the edge of a pixel, got {samples}")
     height, width = camera.image_size
     shift = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
-    camera = replace(camera, background=texture.plane, lens=camera.lens or Lens())
+    camera = replace(camera, background=texture.plane, lens=(camera.without_window.lens or Lens()))
     assert camera.lens is not None
     light, offsets = torch.zeros(height, width, dtype=torch.float64), camera.lens.offsets()
     for offset in offsets:
@@ -171,9 +171,9 @@ def render(
     return light / (len(offsets) * samples**2)
 
 
-def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], offset: Float[Tensor, 2]) -> Rays:
+def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], offset: Float[Tensor, 4]) -> Rays:
     """Rays from a point of the lens through where each pixel is in focus, on to the background."""
-    return camera.rays(pixels).through(offset.expand(len(pixels), 1, 2))
+    return camera.rays(pixels).through(offset.expand(len(pixels), 1, 4))
 
 
 def _movement(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float, steps: int) -> Float[Tensor, "n 3"]:

@@ -48,7 +48,7 @@ def view_displacement(
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box)
     bundles: Iterable[Rays] = (rays,)
     if camera.lens is not None:
-        bundles = (rays.through(offset.expand(len(rays), 1, 2)) for offset in camera.lens.offsets())
+        bundles = (rays.through(offset.expand(len(rays), 1, 4)) for offset in camera.lens.offsets())
     total, light = torch.zeros_like(rays.pixel), torch.zeros_like(rays.near)
     for bundle in bundles:
         carries = ~bundle.crosses | bundle.unobstructed

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerif.conventions import InputError
-from nerif.geometry import PROJECTIONS, Box, Lens, Plane, Ring, disc_points
+from nerif.geometry import PROJECTIONS, Box, Lens, Plane, Ring, spread_points
 
 BOX = Box.cube(40.0)
 RING = Ring(views=2, arc=(20.0, 70.0), elevation=6.0, image_size=(8, 10), pixel_pitch=0.2)
@@ -26,7 +26,7 @@ def spread(lens: Lens, projection: str = "perspective", each: int = 6):
     """The rays of all pixels, and those through points of the lens."""
     seen = camera(lens, projection)
     rays = seen.rays(seen.pixel_grid().reshape(-1, 2), view=3).clip(BOX)
-    return seen, rays, rays.through(disc_points(len(rays), each))
+    return seen, rays, rays.through(spread_points(len(rays), each))
 
 
 @pytest.mark.parametrize("projection", sorted(PROJECTIONS))
@@ -73,7 +73,7 @@ def test_a_movement_in_the_background_is_seen_alike_by_all_rays_of_a_pixel(proje
 @pytest.mark.parametrize(("count", "degree"), [(4, 3), (6, 3), (8, 3), (12, 5), (16, 7)])
 def test_points_of_the_disc_have_its_mean(count, degree):
     """Source: moments of the unit disc, x^a y^b with a, b even: 2 / (a + b + 2) times the mean of cos^a sin^b."""
-    points = disc_points(50, count, torch.Generator().manual_seed(1)).double()
+    points = spread_points(50, count, torch.Generator().manual_seed(1)).double()
     assert not torch.allclose(points[0], points[1])
     theta = torch.arange(64, dtype=torch.float64) * (2 * math.pi / 64)
     for a in range(degree + 1):
@@ -82,8 +82,32 @@ def test_points_of_the_disc_have_its_mean(count, degree):
             expected = (2 / (a + b + 2) * around).expand(50)
             found = (points[..., 0] ** a * points[..., 1] ** b).mean(dim=1)
             assert torch.allclose(found, expected, atol=1e-6), (a, b)
-    assert torch.equal(disc_points(5, 4), disc_points(5, 4))
-    assert torch.equal(disc_points(3, 1), torch.zeros(3, 1, 2))
+    assert torch.equal(spread_points(5, 4), spread_points(5, 4))
+    square = points[..., 2:]
+    assert float(square.abs().max()) <= 1
+    assert float(square.mean(dim=1).abs().max()) < 2 / count  # of 0, and a spread of 1/3
+    assert float(square.square().mean()) == pytest.approx(1 / 3, rel=0.05)
+    assert torch.equal(spread_points(3, 1), torch.zeros(3, 1, 4))
+
+
+@pytest.mark.parametrize("diameter", [0.0, 12.0])
+@pytest.mark.parametrize("projection", sorted(PROJECTIONS))
+def test_rays_over_a_window_are_those_of_its_pixels(projection, diameter):
+    seen, rays, through = spread(Lens(diameter, window=5.0), projection, 6)
+    ends, middle = seen.project(through.end_points).reshape(-1, 6, 2), rays.pixel[:, None]
+    assert float((ends - middle).abs().max()) < 2.5 * 1.01  # the step to them is linear
+    pixels = middle + 2.5 * spread_points(len(rays), 6)[..., 2:].double()
+    assert torch.allclose(ends, pixels, atol=1e-2)
+    thin = replace(seen, lens=None).rays(pixels.reshape(-1, 2)).clip(BOX)
+    if diameter == 0:
+        assert torch.allclose(through.direction, thin.direction, atol=1e-4)
+        assert torch.allclose(through.ends.distance, thin.ends.distance, rtol=1e-4)
+    blind = torch.einsum("nij,nj->ni", through.ends.sensitivity, through.direction)
+    assert float(blind.abs().max()) < 1e-12
+    wide = rays.half_width(0.5 * (rays.near + rays.far))
+    at = seen.pixel_size(rays.origin + 0.5 * (rays.near + rays.far)[:, None] * rays.direction)
+    assert float(wide.min()) >= 0.9 * 2.5 * float(at.min())
+    assert seen.without_window.lens.window == 0
 
 
 def test_what_a_background_hides_from_a_part_of_the_lens_carries_no_light():
@@ -120,7 +144,7 @@ def test_a_camera_that_looks_at_no_background_keeps_its_focus():
     ("wrong", "words"),
     [((-1.0,), "aperture_diameter"), ((math.inf,), "aperture_diameter"), ((1.0, 0.0), "focus_distance"),
      ((1.0, math.inf), "focus_distance"),
-     ((1.0, None, 0), "points")],
+     ((1.0, None, 0), "points"), ((1.0, None, 4, -2.0), "window"), ((1.0, None, 4, math.nan), "window")],
 )  # fmt: skip
 def test_lenses_that_cannot_be(wrong, words):
     with pytest.raises(InputError, match=words):
@@ -130,13 +154,13 @@ def test_lenses_that_cannot_be(wrong, words):
 def test_thin_rays_pass_no_lens():
     seen = camera(None)
     with pytest.raises(InputError, match="expected rays through a lens, got thin ones"):
-        seen.rays(seen.pixel_grid().reshape(-1, 2)).through(torch.zeros(80, 1, 2))
+        seen.rays(seen.pixel_grid().reshape(-1, 2)).through(torch.zeros(80, 1, 4))
 
 
 def test_where_a_telecentric_camera_counts_its_depth_from_changes_nothing():
     """z_cam = 0 before, in and behind the flow, the diameter of the cone there with it."""
     depth = camera(None).depth(camera(None).plane)
-    seen, disc = camera(Lens(12.0, depth), "telecentric"), torch.tensor([[[0.6, -0.3], [0.0, 0.0]]]).double()
+    seen, disc = camera(Lens(12.0, depth), "telecentric"), torch.tensor([[[0.6, -0.3, 0.0, 0.0], [0.0] * 4]]).double()
     pixel = torch.tensor([[4.0, 3.0]], dtype=torch.float64)
     first = seen.rays(pixel).clip(BOX).through(disc)
     for shift in (700.0, depth + 300.0):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import xarray as xr
 
 from nerif.cli import main
 from nerif.conventions import InputError
@@ -23,6 +24,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.result import ResultDirectory
 from nerif.simulation import simulate, view_displacement
+from nerif.techniques.pictures import Pictures
 from nerif.techniques.registry import forward_model
 from nerif.volume_file import read_volume
 
@@ -52,6 +54,44 @@ def test_the_path_integral_through_a_lens_is_what_curved_rays_see(wide):
     assert float((exact - found).std()) < 0.005 * scale
 
 
+def test_a_displacement_over_a_window_is_the_mean_over_its_pixels(wide):
+    ball, edge = make_phantom("gaussians", BOX, seed=1), 3
+    camera = replace(wide.cameras[1], lens=Lens(window=float(edge)))
+    fine = replace(camera, lens=None, intrinsics=camera.intrinsics * torch.tensor([[5.0, 1, 5], [1, 5, 5], [1, 1, 1]]))
+    fine = replace(fine, intrinsics=fine.intrinsics + torch.tensor([[0, 0, 2.0], [0, 0, 2], [0, 0, 0]]))
+    height, width = camera.image_size
+    thin = view_displacement(ball, replace(fine, image_size=(5 * height, 5 * width)), BOX, 1.00027, 40) / 5
+    means = torch.nn.functional.avg_pool2d(thin.permute(2, 0, 1), 5 * edge, stride=5).permute(1, 2, 0)
+    found = predict_view(ball, camera, PathIntegral(forward_model(wide.techniques[0], wide), 80), BOX)
+    simulated = view_displacement(ball, replace(camera, lens=replace(camera.lens, points=100)), BOX, 1.00027, 40)
+    exact, scale = means, float(means.std())
+    inner = slice(edge // 2, height - edge // 2), slice(edge // 2, width - edge // 2)
+    assert float((found[inner] - exact).std()) < 0.03 * scale
+    assert float((simulated[inner] - exact).std()) < 0.03 * scale
+    smooth = view_displacement(ball, replace(camera, lens=None), BOX, 1.00027, 40)[inner]
+    assert float((smooth - exact).std()) > 3 * float((found[inner] - exact).std())
+
+
+def test_windows_are_kept_by_files_and_used_by_displacements_alone(wide, tmp_path):
+    cameras = tuple(replace(c, lens=Lens(window=float(i))) for i, c in enumerate(RING.cameras()))
+    windowed = replace(wide, cameras=cameras)
+    windowed.write(tmp_path / "m.nc")
+    back = Measurement.read(tmp_path / "m.nc")
+    assert [camera.lens.window for camera in back.cameras] == [0.0, 1.0, 2.0, 3.0]
+    dataset = xr.load_dataset(tmp_path / "m.nc")
+    assert dataset["window"].attrs["units"] == "px"
+    assert "aperture_diameter" not in dataset
+    assert lens_rays(seen_through(back, "auto")) > 1
+    assert lens_rays(seen_through(back, "off")) == 1
+    with pytest.raises(InputError, match="aperture: expected a measurement that knows aperture_diameter"):
+        seen_through(back, "on")
+    assert Pictures.seen_by(cameras[3]).lens.window == 0
+    assert wide.techniques[0].seen_by(cameras[3]).lens.window == 3
+    dataset["window"][1] = -1.0
+    with pytest.raises(InputError, match="window: expected an edge of 0"):
+        Measurement.from_dataset(dataset)
+
+
 def test_the_focus_is_where_a_lens_sees_like_a_pinhole(wide):
     """Focused in the middle of the flow the cone is narrow there, and the background is blurred instead."""
     thin = replace(wide.cameras[0], lens=None)
@@ -62,10 +102,12 @@ def test_the_focus_is_where_a_lens_sees_like_a_pinhole(wide):
     assert float((flow - pinhole).std()) < 0.5 * float((background - pinhole).std())
 
 
+@pytest.mark.parametrize("window", [0.0, 4.0])
 @pytest.mark.parametrize("basis", ["linear", "cubic"])
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_adjoint_of_an_operator_through_lenses(basis, compiled, wide):
-    rays, values, _ = wide.rays()
+def test_the_adjoint_of_an_operator_through_lenses(basis, compiled, window, wide):
+    cameras = tuple(replace(c, lens=replace(c.lens, window=window)) for c in wide.cameras)
+    rays, values, _ = replace(wide, cameras=cameras).rays()
     grid = Grid.of_resolution(BOX, 12)
     operator = VoxelOperator(rays, grid, forward_model(wide.techniques[0], wide), basis, dtype=torch.float64)
     operator.compiled = compiled

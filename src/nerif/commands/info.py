@@ -77,7 +77,9 @@ def _measurement(path: Path, m: Measurement) -> None:
         say(f"  {kind.name:<14} {len(rays)} rays cross the box; rms {kind.measured} {rms}; sigma {noise}")
     say(f"  masked         {m.bad_pixels} pixels whose value or sigma is NaN, infinite or impossible")
     lenses = {c.lens for c in m.cameras if c.lens is not None}
-    for lens in sorted(lenses, key=lambda lens: lens.diameter):
+    for edge in sorted({lens.window for lens in lenses if lens.window}):
+        say(f"  window         {edge:g} px, over which displacements are means")
+    for lens in sorted((lens for lens in lenses if lens.diameter), key=lambda lens: lens.diameter):
         focus = "their backgrounds" if lens.focus is None else f"{lens.focus:g} mm"
         say(f"  aperture       {lens.diameter:.4g} mm, focused on {focus}")
     for name in m.about_views:

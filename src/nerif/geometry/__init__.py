@@ -2,12 +2,26 @@
 
 from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box, Grid
-from nerif.geometry.lens import Lens, LensDiscs, disc_points
+from nerif.geometry.lens import Lens, LensDiscs, spread_points
 from nerif.geometry.projection import PERSPECTIVE, PROJECTIONS, TELECENTRIC, Projection, projection_named
 from nerif.geometry.rays import BackgroundPoints, Rays
 from nerif.geometry.rig import Ring, paper_rig
 
 __all__ = [
-    "PERSPECTIVE", "PROJECTIONS", "TELECENTRIC", "BackgroundPoints", "Box", "Camera", "Grid", "Lens", "LensDiscs",
-    "Plane", "Projection", "Rays", "Ring", "disc_points", "paper_rig", "projection_named",
+    "PERSPECTIVE",
+    "PROJECTIONS",
+    "TELECENTRIC",
+    "BackgroundPoints",
+    "Box",
+    "Camera",
+    "Grid",
+    "Lens",
+    "LensDiscs",
+    "Plane",
+    "Projection",
+    "Rays",
+    "Ring",
+    "paper_rig",
+    "projection_named",
+    "spread_points",
 ]  # fmt: skip

@@ -228,6 +228,11 @@ class Camera:
             lens = replace(lens, focus=self.depth(self.plane))
         return replace(self, background=None, lens=lens)
 
+    @property
+    def without_window(self) -> Camera:
+        """The camera of which every pixel measures by itself."""
+        return self if self.lens is None else replace(self, lens=replace(self.lens, window=0.0))
+
     def _lens_discs(self, direction: Points, ends: BackgroundPoints | None) -> LensDiscs | None:
         """The lens as rays see it."""
         if self.lens is None:
@@ -241,7 +246,9 @@ class Camera:
             focus = torch.full_like(direction[..., 0], torch.inf)
         normal = axis if self.background is None else self.background.normal.to(direction)
         radius = torch.full_like(focus, self.lens.diameter / 2)
-        return LensDiscs(axis.expand_as(direction), normal.expand_as(direction), radius, focus)
+        window = torch.full_like(focus, self.lens.window / 2)
+        parallel = torch.full_like(focus, not self.projection.shows_depth, dtype=torch.bool)
+        return LensDiscs(axis.expand_as(direction), normal.expand_as(direction), radius, focus, window, parallel)
 
     def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
         """Where rays meet the background, and S there."""

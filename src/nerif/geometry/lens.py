@@ -1,7 +1,8 @@
-"""The lens of a camera: a pixel gathers the rays from all of its disc that meet in one point in focus.
+"""What a pixel gathers: the rays from all of a lens's disc that meet in one point in focus, of a window of pixels all.
 
     L = O + r (x e_1 + y e_2),  |(x, y)| <= 1        a point of the disc about the camera's centre O, of radius r
     X_f = O + s_f t                                  in focus on the pixel's own ray, O + s t
+    p' = p + w (a, b),  |a|, |b| <= 1                a pixel of the window about p, of half the edge w
 """
 
 from __future__ import annotations
@@ -10,23 +11,27 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.conventions import LARGEST_LENGTH, InputError
 from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
 
-__all__ = ["Lens", "LensDiscs", "disc_points"]
+__all__ = ["Lens", "LensDiscs", "spread_points"]
 
+CHEBYSHEV = (-0.7946544723, -0.1875924741, 0.1875924741, 0.7946544723)  # of -1 to 1, all of one weight
+MIXED = 3
+LARGEST_WINDOW = 1000  # px
 SEED = 20  # of points that have to be the same every time
 MANY = 8  # points, from which on they stand on two rings
 RINGS = (0.5,), (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # squares of their radii
+PLASTIC = 1.324717957244746  # the root of x^3 = x + 1, of the most even lattice in a square
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A thin lens of finite aperture.
+    """What a pixel gathers: the light of a thin lens of finite aperture, the mean over a window of pixels.
 
     Parameters
     ----------
@@ -35,6 +40,7 @@ class Lens:
     focus : depth of the plane in focus along the optical axis, mm, below 0 only of a telecentric lens; None for the
         background's
     points : number of points on the disc, where pictures are rendered and measurements simulated
+    window : edge of the square of pixels over which a displacement is the mean, px; 0 for that of its own pixel
 
     Raises
     ------
@@ -45,6 +51,7 @@ class Lens:
     diameter: float = 0.0
     focus: float | None = None
     points: int = 19
+    window: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.diameter <= LARGEST_LENGTH:
@@ -53,19 +60,30 @@ class Lens:
             raise InputError(f"focus_distance: expected a lens in focus elsewhere than at 0 mm, got {self.focus}")
         if self.points < 1:
             raise InputError(f"points: expected at least one point on the lens, got {self.points}")
+        if not 0 <= self.window <= LARGEST_WINDOW:
+            raise InputError(f"window: expected an edge of 0 to {LARGEST_WINDOW} px, got {self.window}")
 
-    def offsets(self) -> Float[Tensor, "n 2"]:
-        """Return points spread evenly over the disc (sunflower spiral), in shares of its radius; one for a thin ray."""
-        if self.diameter == 0:
-            return torch.zeros(1, 2, dtype=torch.float64)
+    @property
+    def wide(self) -> bool:
+        """Whether a pixel gathers more than a thin ray."""
+        return self.diameter > 0 or self.window > 0
+
+    def offsets(self) -> Float[Tensor, "n 4"]:
+        """Return points spread evenly over disc (sunflower spiral) and window, in shares of radius and half an edge.
+
+        There is one for a thin ray.
+        """
+        if not self.wide:
+            return torch.zeros(1, 4, dtype=torch.float64)
         i = torch.arange(self.points, dtype=torch.float64)
         radius, angle = torch.sqrt((i + 0.5) / self.points), i * math.pi * (3 - math.sqrt(5))
-        return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
+        disc = torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1)
+        return torch.cat([disc, _square(torch.full((1, 1, 2), 0.5), self.points)[0].double()], dim=-1)
 
 
 @dataclass(frozen=True)
 class LensDiscs(Columns):
-    """The disc of the lens that each ray passes in the middle.
+    """The disc of the lens that each ray passes in the middle, and the window of pixels about its own.
 
     Parameters
     ----------
@@ -73,6 +91,8 @@ class LensDiscs(Columns):
     normal : (n, 3) unit vector of the background's normal; the axis where there is none
     radius : (n,) mm
     focus : (n,) path length from the ray's origin to the point in focus, mm
+    window : (n,) half the edge of the window, px
+    parallel : (n,) whether rays of other pixels start elsewhere in the same direction, or at the same place in another
     box : what rays through other points of the disc are clipped to, or None
     """
 
@@ -80,7 +100,28 @@ class LensDiscs(Columns):
     normal: Float[Tensor, "n 3"]
     radius: Float[Tensor, " n"]
     focus: Float[Tensor, " n"]
+    window: Float[Tensor, " n"]
+    parallel: Bool[Tensor, " n"]
     box: Box | None = None
+
+    def shifts(
+        self, square: Float[Tensor, "n k 2"], sensitivity: Float[Tensor, "n 2 3"], direction: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n k 3"]:
+        """Return how far on the background (mm) other pixels of the window see than that in its middle.
+
+            X' = X - S^+ p + t (n . S^+ p) / (n . t),      S^+ = S^T (S S^T)^-1
+
+        Parameters
+        ----------
+        square : pixels of the window, in shares of half its edge
+        sensitivity : S, px/mm
+        direction : t of the rays
+        """
+        p = self.window[:, None, None] * square.to(direction)
+        inverse = torch.linalg.solve(sensitivity @ sensitivity.mT, sensitivity)
+        across = -torch.einsum("nki,nij->nkj", p, inverse)
+        off = (across * self.normal[:, None]).sum(-1) / (direction * self.normal).sum(-1, keepdim=True)
+        return across - off[..., None] * direction[:, None]
 
     def points(self, disc: Float[Tensor, "n k 2"]) -> Float[Tensor, "n k 3"]:
         """Return how far from its middle points of the disc are (mm), given in shares of its radius."""
@@ -90,6 +131,21 @@ class LensDiscs(Columns):
         second = torch.linalg.cross(self.axis, first)
         x, y = (self.radius[:, None] * disc.to(self.axis).unbind(-1)[i] for i in (0, 1))
         return x[..., None] * first[:, None] + y[..., None] * second[:, None]
+
+
+def spread_points(rays: int, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "n k 4"]:
+    """Return points of the unit disc and of the square about 0 of edge 2 for each ray, evenly over both.
+
+    Parameters
+    ----------
+    count : even, or 1 for the middle
+    generator : turns and moves them; None for the same points every time
+    """
+    if count == 1:
+        return torch.zeros(rays, 1, 4)
+    generator = generator or torch.Generator().manual_seed(SEED)
+    disc = disc_points(rays, count, generator)
+    return torch.cat([disc, _square(torch.rand(rays, 1, 2, generator=generator), count)], dim=-1)
 
 
 def disc_points(rays: int, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "n k 2"]:
@@ -116,3 +172,19 @@ def disc_points(rays: int, count: int, generator: torch.Generator | None = None)
     angle = 2 * math.pi * (turn + share)
     radius = torch.tensor(rings).sqrt()[:, None]
     return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], dim=-1).flatten(1, 2)
+
+
+def _square(start: Float[Tensor, "n 1 2"], count: int) -> Float[Tensor, "n k 2"]:
+    """Points of the square about 0 of edge 2, for a mean over it.
+
+    16 are 4 x 4, exact up to degree 5; others a lattice that begins at `start`, folded by the tent function.
+
+    Source: Chebyshev's quadrature; Hickernell, Obtaining O(N^-2+eps) convergence for lattice quadrature rules (2002).
+    """
+    if count == len(CHEBYSHEV) ** 2:
+        row = torch.tensor(CHEBYSHEV)
+        mixed = torch.arange(count) * MIXED % count  # neighbours on the disc are none in the window
+        return torch.cartesian_prod(row, row)[mixed].expand(len(start), -1, -1)
+    i = torch.arange(count)[:, None]
+    lattice = (start + i * torch.tensor([1 / PLASTIC, 1 / PLASTIC**2])) % 1
+    return 1 - 2 * (2 * lattice - 1).abs()

@@ -18,7 +18,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
-from nerif.geometry.lens import LensDiscs
+from nerif.geometry.lens import LensDiscs, spread_points
 
 __all__ = ["BackgroundPoints", "Rays"]
 
@@ -50,7 +50,7 @@ class Rays(Columns):
     view : (n,) number of the view
     background : what they see on a background, or None
     begin : path length before which there is no ray, mm: 0, or -inf for a camera that sees along parallel lines
-    lens : the lens that each passes in the middle, or None where a pixel sees a thin ray
+    lens : the lens that each passes in the middle, and the window it stands for; None where a pixel sees a thin ray
     """
 
     origin: Float[Tensor, "n 3"]
@@ -139,8 +139,10 @@ class Rays(Columns):
         lens = None if self.lens is None else replace(self.lens, box=box)
         return replace(self, near=near, far=torch.maximum(far, near), lens=lens)
 
-    def through(self, disc: Float[Tensor, "n k 2"]) -> Rays:
-        """Return the n k rays through points of the lens to the point in focus of each, clipped to the same box.
+    def through(self, points: Float[Tensor, "n k 4"]) -> Rays:
+        """Return the n k rays through points of the lens, each for a pixel of the window to what it has in focus.
+
+        They are clipped to the same box.
 
         A movement of the background point is seen as S has it, whatever ray it was that moved it in its plane:
 
@@ -148,7 +150,7 @@ class Rays(Columns):
 
         Parameters
         ----------
-        disc : points of the lens, in shares of its radius
+        points : of the lens, in shares of its radius, and of the window, in shares of half its edge (`spread_points`)
 
         Raises
         ------
@@ -157,24 +159,63 @@ class Rays(Columns):
         """
         if self.lens is None:
             raise InputError("aperture_diameter: expected rays through a lens, got thin ones")
-        each, shift = disc.shape[1], self.lens.points(disc)
+        each, ends, shift = points.shape[1], self.background, self.lens.points(points[..., :2])
+        start, toward, reach = self._of_window(points[..., 2:])
         # of either sign: a telecentric camera's z_cam = 0 may be behind what is in focus
-        direction = torch.nn.functional.normalize(
-            self.direction[:, None] - shift / self.lens.focus[:, None, None], dim=-1
-        )
+        direction = torch.nn.functional.normalize(toward - shift / (self.lens.focus[:, None, None] * reach), dim=-1)
         whole = replace(self, lens=None, background=None).each(lambda x: x.repeat_interleave(each, dim=0))
-        ends = self.background
         if ends is not None:
             normal = self.lens.normal[:, None]
             along = (direction * normal).sum(-1)
-            to_plane = ends.distance[:, None, None] * self.direction[:, None] - shift
+            to_plane = ends.distance[:, None, None] * reach * toward - shift
             seen = torch.einsum("nij,nkj->nki", ends.sensitivity, direction)
             sensitivity = ends.sensitivity[:, None] - seen[..., None] * (normal / along[..., None])[:, :, None]
             distance = (to_plane * normal).sum(-1) / along
             ends = BackgroundPoints(sensitivity.flatten(0, 1), distance.flatten(0, 1))
-        origin = (self.origin[:, None] + shift).flatten(0, 1)
+        origin = (self.origin[:, None] + start + shift).flatten(0, 1)
         whole = replace(whole, origin=origin, direction=direction.flatten(0, 1), background=ends)
         return whole if self.lens.box is None else whole.clip(self.lens.box)
+
+    def spread(self, each: int, generator: torch.Generator | None = None) -> Rays:
+        """Return so many rays for each, evenly through its lens and over its window (`through`).
+
+        Parameters
+        ----------
+        generator : of where they are; None for the same places every time
+        """
+        return self.through(spread_points(len(self), each, generator).to(self.near))
+
+    def _of_window(
+        self, square: Float[Tensor, "n k 2"]
+    ) -> tuple[Float[Tensor, (n #k 3
+)], Float[Tensor, (n #k 3
+)], Float[Tensor, (n #k 1
+)]]:
+        """Where thin rays of other pixels start, mm from the origin, their directions, and how far off they end.
+
+        The last is a share of the path length of the ray in the middle.
+        """
+        toward, nowhere = self.direction[:, None], torch.zeros_like(self.direction[:, None])
+        if self.lens is None or self.background is None or not bool(self.lens.window.any()):
+            return nowhere, toward, torch.ones_like(toward[..., :1])
+        ends, parallel = self.background, self.lens.parallel[:, None, None]
+        aside = self.lens.shifts(square, ends.sensitivity, self.direction)
+        along, length = (aside * toward).sum(-1, keepdim=True), ends.distance[:, None, None]
+        end = length * toward + aside
+        reach = torch.where(parallel, length + along, end.norm(dim=-1, keepdim=True))
+        start = torch.where(parallel, aside - along * toward, 0.0)
+        return start, torch.where(parallel, toward, end / reach), reach / length
+
+    def half_width(self, s: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """Return half the width (mm) of what the pixels of rays gather light from at path lengths s, mm."""
+        if self.lens is None:
+            return torch.zeros_like(s)
+        cone = self.lens.radius * (1 - s / self.lens.focus)
+        if self.background is None:
+            return cone.abs()
+        share = torch.where(self.lens.parallel, 1.0, s / self.background.distance)
+        window = self.lens.window / torch.linalg.matrix_norm(self.background.sensitivity, 2).clamp_min(1e-12) * share
+        return torch.hypot(cone, window)
 
     def mean_of(self, each: int, seen: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
         """Return the mean of what the rays of a pixel see; one that a background ends before the box carries no light.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.geometry import Rays, disc_points
+from nerif.geometry import Rays
 from nerif.techniques.base import ForwardModel, midpoints
 
 __all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]
@@ -57,7 +57,7 @@ class PathIntegral(Projector):
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]:
         if rays.lens is None:
             return self._along(field, rays, *midpoints(rays, self.samples))
-        spread = rays.through(disc_points(len(rays), LENS_RAYS))
+        spread = rays.spread(LENS_RAYS)
         s, step = midpoints(spread, math.ceil(self.samples / 2), LENS_RAYS)
         return spread.mean_of(LENS_RAYS, self._along(field, spread, s, step))
 

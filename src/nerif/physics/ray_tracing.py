@@ -21,7 +21,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.geometry import Rays, disc_points
+from nerif.geometry import Rays
 from nerif.physics.path_integral import LENS_RAYS, Projector
 
 __all__ = ["CurvedRays", "background_points", "trace"]
@@ -91,7 +91,7 @@ class CurvedRays(Projector):
 
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n 2"]:
         if rays.lens is not None:
-            spread = rays.through(disc_points(len(rays), LENS_RAYS))
+            spread = rays.spread(LENS_RAYS)
             return spread.mean_of(LENS_RAYS, self(field, spread))
         moved = background_points(field, rays, self.steps, self.n_ambient)
         return torch.einsum("nij,nj->ni", rays.ends.sensitivity.to(moved), moved).to(rays.origin.dtype)

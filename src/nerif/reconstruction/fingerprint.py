@@ -70,7 +70,8 @@ def check_fingerprint(kept: dict[str, str] | None, asked: dict[str, str]) -> Non
 def _parts(camera: Camera) -> tuple[Any, ...]:
     plane = camera.background
     optics = (camera.projection.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion)
-    lens = () if camera.lens is None else (camera.lens.diameter, camera.lens.focus)
+    lens: tuple[Any, ...] = () if camera.lens is None else (camera.lens.diameter, camera.lens.focus)
+    lens += (camera.lens.window,) if camera.lens is not None and camera.lens.window else ()
     return (*optics, camera.image_size, *(() if plane is None else (plane.normal, plane.offset)), *lens)
 
 

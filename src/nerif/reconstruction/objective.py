@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerif.fields.mlp import NeuralField
 from nerif.fields.space_time import AtTimes, with_time
-from nerif.geometry import Rays, disc_points
+from nerif.geometry import Rays
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, project
 from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
 from nerif.reconstruction.parallel import Ranks
@@ -52,7 +52,7 @@ class Draw:
         """Return the rays of pixels: their own, or so many through the lens in a row for each."""
         if part.rays.lens is None:
             return part.rays
-        return part.rays.through(disc_points(len(part), self.each, generator).to(part.rays.near.device))
+        return part.rays.spread(self.each, generator)
 
 
 @dataclass(frozen=True)

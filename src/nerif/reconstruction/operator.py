@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
-from nerif.geometry import Grid, Rays, disc_points
+from nerif.geometry import Grid, Rays
 from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.planes import Bundle
 from nerif.techniques.base import ForwardModel
@@ -85,7 +85,7 @@ class VoxelOperator:
         self.shares: Tensor | None = None  # of rays through a lens, in what a pixel sees
         if rays.lens is not None:
             each = rays_through(rays, min(grid.spacing))
-            rays = rays.through(disc_points(len(rays), each).to(rays.near.device))
+            rays = rays.spread(each)
             self.shares = rays.shares(each).reshape(-1, each, 1).to(self.device, dtype)
         if min(grid.shape) < self.layers:
             raise InputError(
@@ -194,7 +194,7 @@ def rays_through(rays: Rays, length: float) -> int:
     if not len(rays):
         return 2
     middle = 0.5 * (rays.near + rays.far)
-    spread = float((rays.lens.radius * (1 - middle / rays.lens.focus)).abs().max())
+    spread = float(rays.half_width(middle).max())
     return 2 * min(MOST_PAIRS, max(1, math.ceil(PAIRS * spread / length)))
 
 

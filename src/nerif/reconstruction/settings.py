@@ -52,8 +52,8 @@ class TrainingSettings(Reconstructor):
     """In equal intervals, one draw each ("random", the paper's), one a ray ("shifted") or midpoints ("regular"), or
     "adaptive", where the field varies."""
     aperture: str = "auto"
-    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
-    (off)."""
+    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), and displacements
+    are means over their window where that is; or all are thin rays (off)."""
     source: str = "auto"
     """What to go by (also --from): displacements, pictures (each pixel, after a start from displacements, or from
     blurred pictures), both, or auto: pictures where there are some."""

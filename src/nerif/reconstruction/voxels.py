@@ -48,8 +48,8 @@ class VoxelReconstructor(Reconstructor):
     model: str = AUTO
     """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
     aperture: str = "auto"
-    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
-    (off)."""
+    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), and displacements
+    are means over their window where that is; or all are thin rays (off)."""
     source: str = "auto"
     """What to go by (also --from): displacements, pictures (each pixel, linear around the displacements), both, or
     auto: displacements where there are some."""

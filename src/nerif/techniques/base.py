@@ -140,6 +140,8 @@ class ForwardModel(ABC):
     """Whether cameras may be of different brightness, which a fit can tell."""
     averaged: ClassVar[bool] = True
     """Whether the mean over neighbouring pixels is what their mean ray measures."""
+    windowed: ClassVar[bool] = False
+    """Whether a pixel may have measured the mean over a window of pixels."""
     derived: ClassVar[str] = ""
     """Technique whose values are found in these, such as displacements in pictures, by a window's reach of them."""
     guess: ClassVar[str] = ""
@@ -188,8 +190,9 @@ class ForwardModel(ABC):
 
     @classmethod
     def seen_by(cls, camera: Camera) -> Camera:
-        """Return the camera, without its background if the technique looks at none."""
-        return camera if cls.background or camera.background is None else camera.without_background
+        """Return the camera, without the background or the window that the technique does not look at."""
+        camera = camera if cls.background or camera.background is None else camera.without_background
+        return camera if cls.windowed else camera.without_window
 
     def bend(
         self,

@@ -46,6 +46,7 @@ class Deflection(ForwardModel):
     gauge = True
     background = True
     traced = True
+    windowed = True
 
     n_ambient: float = 1.0
 

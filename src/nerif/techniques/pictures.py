@@ -61,6 +61,7 @@ class Pictures(LeverArm):
     misscaled = "another exposure"
     limits = (1e-9, 1e9)
     traced = False
+    windowed = False
     linear = False
     averaged = False
     derived, guess = "deflection", GUESS
