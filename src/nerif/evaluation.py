@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.alignment import aligned
 from nerif.conventions import InputError, with_unit
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
@@ -23,16 +24,18 @@ from nerif.notebook import number
 from nerif.observation import Observation
 from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.refinement import with_corrections
 from nerif.reprojection import Reprojection
-from nerif.result import VOLUME, ResultDirectory
+from nerif.result import METRICS, VOLUME, ResultDirectory
 from nerif.techniques.registry import AUTO, forward_model
 from nerif.volume import INDEX, Volume
 from nerif.volume_file import read_volume
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
+ALIGNMENTS = ("none", "rigid")
 AT_A_TIME = 8e6  # pixels of the views that are scored side by side: a megapixel takes some 0.1 GiB
 
-__all__ = ["FLOW", "evaluate", "evaluate_views", "evaluate_volume", "rms_text", "score_lines"]
+__all__ = ["FLOW", "evaluate", "evaluate_aligned", "evaluate_views", "evaluate_volume", "rms_text", "score_lines"]
 
 
 def evaluate(
@@ -41,6 +44,7 @@ def evaluate(
     measurement: str | os.PathLike[str] | None = None,
     hold_out: Sequence[str] | None = None,
     on_view: Callable[[int, int], None] = lambda done, total: None,
+    align: str = "none",
 ) -> dict[str, Any]:
     """Compare a result directory with a truth or with measured views; return the metrics, and add them to it.
 
@@ -53,15 +57,21 @@ def evaluate(
     measurement : measurement file to re-project into
     hold_out : views of it which the reconstruction has not seen; None for those that run.toml held out
     on_view : told how many views are re-projected, out of how many
+    align : "rigid" for the errors after the best rigid motion of the field as well, under `aligned`; or "none"
 
     Raises
     ------
     InputError
-        If there is nothing to compare, truth or measurement are of another quantity, the truth is over an unknown
+        If there is nothing to compare or to align, truth or measurement are of another quantity, the truth is over an
+        unknown
         ambient or sticks out of the box, or there is no such view.
     """
     if truth is None and measurement is None:
         raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")
+    if align not in ALIGNMENTS:
+        raise InputError(f"align: expected one of {', '.join(ALIGNMENTS)}, got '{align}'")
+    if align != "none" and truth is None:
+        raise InputError("align: expected together with --truth VOLUME, to which the field is moved, got none")
     directory = ResultDirectory(result)
     field, box, n_ambient = directory.field()
     quantity = directory.quantity()
@@ -72,6 +82,8 @@ def evaluate(
     if truth is not None:
         compared = _truth(Path(truth), box, n_ambient, quantity)
         metrics |= evaluate_volume(field, compared, n_ambient) | _coverage(directory, compared)
+        if align == "rigid":
+            metrics["aligned"] = evaluate_aligned(field, compared, n_ambient)
         metrics["quantity"] = quantity
         metrics["truth"] = str(Path(truth).resolve())
     if data is not None:
@@ -79,6 +91,8 @@ def evaluate(
         held_out = _held_out(hold_out, asked, data)
         aperture = "off" if asked.get("aperture", "off") == "off" else "auto"
         data = with_gains(seen_through(data, aperture), gains_of(asked))
+        if directory.has(METRICS):
+            data = with_corrections(data, directory.metrics().get("rig", []))
         views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
         metrics["measurement"] = str(Path(str(measurement)).resolve())
@@ -169,6 +183,14 @@ def evaluate_volume(
     heights = truth.grid.axis("z").numpy()
     beyond = n_ambient if truth.quantity == INDEX else 1.0  # the paper's L2 counts the ambient in
     return {**volume_metrics(gt, rec, beyond), "slices": slice_metrics(gt, rec, heights)}
+
+
+def evaluate_aligned(field: Field, truth: Volume, n_ambient: float) -> dict[str, Any]:
+    """Compare a field with a truth after the best rigid motion: its scores, and the motion, turn_rad and shift_mm."""
+    moved = aligned(field, truth)
+    scores = evaluate_volume(moved, truth, n_ambient)
+    del scores["slices"]
+    return {**scores, "turn_rad": moved.turn.tolist(), "shift_mm": moved.shift.tolist()}
 
 
 def _truth(path: Path, box: Box, n_ambient: float, quantity: str) -> Volume:

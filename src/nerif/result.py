@@ -36,13 +36,15 @@ from nerif.volume import INDEX, Volume, field_of
 from nerif.volume_file import read_volume, read_volumes
 
 __all__ = [
-    "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions", "write_json",
+    "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions",
+    "write_json",
 ]  # fmt: skip
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
 ENSEMBLE, FIGURES = "ensemble", "figures"
-FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT)
+CALIBRATION = "calibration.toml"
+FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
 

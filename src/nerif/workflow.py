@@ -12,6 +12,7 @@ from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
 from nerif.gains import fit_gains, with_gains
+from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
@@ -25,12 +26,13 @@ from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.refinement import moved_lines, with_corrections
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
-from nerif.result import REPORT, ResultDirectory, versions
+from nerif.result import CALIBRATION, REPORT, ResultDirectory, versions
 from nerif.volume import quantities_of
 from nerif.volume_sequence import VolumeSequence
 
@@ -125,9 +127,9 @@ def reconstruct_into(
         seen = " or ".join(o.technique.measured for o in measurement.observations)
         what = f"pixels left out whose {seen} or sigma is NaN, infinite or impossible"
         monitor.say(f"{where}: {measurement.bad_pixels} {what}")
-    if measurement.about_views:
+    if measurement.about_views and not getattr(reconstructor, "refine", ()):
         names = ", ".join(measurement.about_views)
-        monitor.say(f"{names}: known of the views, but the reconstruction makes no use of it yet")
+        monitor.say(f"{names}: known of the views, but used only with --refine cameras")
     state = out.state() if resume else None
     start = _start(run, measurement) if run.ensemble or not resume else None
     if not resume:
@@ -216,6 +218,12 @@ def _write(
     out.write_metrics(metrics)
     about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
     out.write_settings(settings, about | ({"gains": gains} if gains else {}))
+    if result.rig:
+        measurement = with_corrections(measurement, result.rig)
+        metrics["rig"] = result.rig
+        write_cameras(out / CALIBRATION, [CalibratedCamera.from_camera(c) for c in measurement.cameras])
+        for line in moved_lines(result.rig):
+            monitor.say(line)
     with monitor.counting("re-projecting") as bar:
         reprojection = reproject(result.field, measurement, run.hold_out, result.device, bar, result.model)
     views = evaluate_views(reprojection)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,6 +28,8 @@ class Evaluate(Settings):
     """Volume file (.nc, .vti) of the true field, compared on its own grid; of a sequence NAME.truth.zarr."""
     measurement: Path | None = None
     """Measurement to re-project into."""
+    align: str = "none"
+    """Give errors after the best rigid motion of the field as well (rigid): what no camera can tell."""
     hold_out: tuple[str, ...] | None = None
     """Views of that measurement which the reconstruction has not seen; default: those that run.toml held out."""
 
@@ -36,7 +39,9 @@ def run(settings: Evaluate) -> dict[str, Any]:
     if settings.result.suffix == ".zarr":
         return run_over_time(settings)
     with counting_bar("re-projecting") as bar:
-        metrics = evaluate(settings.result, settings.truth, settings.measurement, settings.hold_out, bar)
+        metrics = evaluate(
+            settings.result, settings.truth, settings.measurement, settings.hold_out, bar, settings.align
+        )
     if settings.truth is not None:
         if "coverage" in metrics:
             share = metrics["coverage"]
@@ -47,6 +52,11 @@ def run(settings: Evaluate) -> dict[str, Any]:
             say(f"L2 variation  {metrics['l2_variation']:8.3%}   |n_gt - n_rec| / |n_gt - n_ambient|")
         else:
             say(f"L2            {metrics['l2']:8.3%}   |f_gt - f_rec| / |f_gt| of the {name_of(metrics['quantity'])} f")
+        if "aligned" in metrics:
+            moved = math.hypot(*metrics["aligned"]["shift_mm"])
+            turn = math.degrees(math.hypot(*metrics["aligned"]["turn_rad"]))
+            motion = f"after a rigid motion of {moved:.3f} mm and {turn:.3f} degrees"
+            say(f"L2 aligned    {metrics['aligned']['l2']:8.3%}   {motion}")
         say(f"CC            {metrics['cc']:8.5f}")
         say(f"SSIM          {metrics['ssim']:8.5f}")
         say(f"PSNR          {metrics['psnr']:8.2f} dB")

@@ -56,15 +56,15 @@ class PathIntegral(Projector):
 
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]:
         if rays.lens is None:
-            return self._along(field, rays, *midpoints(rays, self.samples))
+            return self.along(field, rays, *midpoints(rays, self.samples))
         spread = rays.spread(LENS_RAYS)
         s, step = midpoints(spread, math.ceil(self.samples / 2), LENS_RAYS)
-        return spread.mean_of(LENS_RAYS, self._along(field, spread, s, step))
+        return spread.mean_of(LENS_RAYS, self.along(field, spread, s, step))
 
-    def _along(
+    def along(
         self, field: Field, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]
     ) -> Float[Tensor, "n c"]:
-        """The integral along thin rays."""
+        """Return the integral along thin rays by samples at path lengths s, each of which stands for a length, mm."""
         model = self.model
         points, tilt = places(model, rays, s, step, field.value_and_gradient)
         weights = model.weights(rays, s, step)

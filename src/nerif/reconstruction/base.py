@@ -112,6 +112,7 @@ class Reconstruction:
     peak_memory_bytes : on the device (CUDA) or of the process (CPU)
     device : where it ran
     state : to resume from, or None
+    rig : what was refined of each view (refinement.py)
     """
 
     field: Field
@@ -125,6 +126,7 @@ class Reconstruction:
     device: str = "cpu"
     state: State | None = dataclasses.field(default=None, repr=False)
     quantity: str = "index_excess"
+    rig: list[dict[str, Any]] = dataclasses.field(default_factory=list)
 
     @property
     def model(self) -> str:

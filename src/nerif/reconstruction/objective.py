@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -16,6 +17,7 @@ from nerif.physics.path_integral import LENS_RAYS, PathIntegral, project
 from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
+from nerif.reconstruction.refinement import MOMENTUM
 from nerif.reconstruction.sampling import SamplingDensity, sample_count, sample_rays
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.target import Part
@@ -26,6 +28,8 @@ __all__ = ["Objective", "Piece"]
 GAUGE_POINTS = 256  # a step
 JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a thin ray that is held back, of a pixel with a lens four times as many
 SETTLING = 24  # samples of a ray that brightness is fitted by
+REFINED_SAMPLES, REFINED_RAYS, REFINED_AT_ONCE = 16, 4, 512
+REFINED_FROM, REFINED_EVERY, REFINED_UNTIL, SLOWED_FROM = 0.1, 0.04, 0.94, 0.75  # shares of a run
 FEWEST = 4  # samples of a ray through a lens
 MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (docs/architecture.md)
 
@@ -165,6 +169,36 @@ class Objective:
             seen = seen.to(part.measured.device)
             part.model.settle(seen, part.measured, part.inverse_scale, rays)
 
+    @torch.no_grad()
+    def refine(self, progress: float) -> None:
+        """Move the rig by a step of its refinement (refinement.py), the field as it is, where one is due."""
+        data, rig = self.data, self.data.refinement
+        if rig is None:
+            return
+        due = math.ceil((min(progress, REFINED_UNTIL) - REFINED_FROM) / REFINED_EVERY)
+        if rig.done > max(due, 0) + 1:  # of the cycle before
+            rig.done = 0
+        if rig.done >= due:
+            return
+        low, self.network.low = self.network.low, False
+
+        def predict(part: Part, rays: Rays) -> Tensor:
+            drawn = torch.Generator().manual_seed(rig.done)  # the same samples wherever the cameras are
+            seen = []
+            for some in torch.arange(len(rays)).split(REFINED_AT_ONCE):
+                few = rays[some]
+                each = 1 if few.lens is None else REFINED_RAYS
+                few = few if each == 1 else few.spread(each, drawn)
+                count = REFINED_SAMPLES if each == 1 else REFINED_SAMPLES // 2
+                s, step = sample_rays(few, count, drawn, "adaptive", self.density, each)
+                integral = PathIntegral(part.model.integral).along(self.field, few, s, step)
+                seen.append(integral if each == 1 else few.mean_of(each, integral))
+            return torch.cat(seen)
+
+        momentum = MOMENTUM if progress < SLOWED_FROM else 0.0
+        rig.step(data.refined_by(rig.done), predict, data.sigma_known, momentum)
+        self.network.low = low
+
     def at_ambient(self, count: int, generator: torch.Generator) -> Tensor | None:
         """Return what the network gives where it should give 0, in full precision; None where no place is known."""
         found = self.data.ambient_points(count, generator)
@@ -184,7 +218,7 @@ class Objective:
             thin = part.rays.lens is None
             at_once = JUDGED_AT_ONCE if thin else JUDGED_AT_ONCE // 4
             for first in range(0, len(part), at_once):
-                some = part[first : first + at_once]
+                some = self.data.refined(part[first : first + at_once], held_back=True)
                 draw = Draw(1, JUDGED_SAMPLES) if thin else Draw(LENS_RAYS, 4 * JUDGED_SAMPLES // LENS_RAYS)
                 rays = draw.rays_of(some, drawn)
                 s, interval = sample_rays(rays, draw.samples, drawn, "adaptive", self.density, draw.each)

@@ -11,6 +11,7 @@ from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS
+from nerif.reconstruction.refinement import check_refined
 from nerif.reconstruction.sources import check_source
 from nerif.techniques.registry import AUTO, check_model
 
@@ -64,6 +65,15 @@ class TrainingSettings(Reconstructor):
     """Sample points of a step; a step takes points_per_batch / N pixels of N points each."""
     optimiser: str = "muon"
     """Muon for weight matrices and Adam for the rest, or adam for all (the paper's)."""
+    refine: tuple[str, ...] = ()
+    """Refined together with the field, held by their standard deviations: cameras (where they stand and look), shift
+    (of whole pictures, as of a shaken camera), focal, background (its distance)."""
+    pose_sigma_mm: float = 0.2
+    """Standard deviation of where a camera stands, where the measurement has no pose_sigma."""
+    pose_sigma_deg: float = 0.02
+    """Standard deviation of how a camera is turned, where the measurement has no pose_sigma."""
+    shift_sigma_px: float = 0.05
+    """Standard deviation of the shift of a picture; of turn and zoom of it, at its edge, a fifth."""
     learning_rate: float = 1.5e-2
     """Adam's at its highest, for a network of 4 x 128; other shapes have shares of it (reconstruction/optimiser.py)."""
     rates_by_shape: bool = True
@@ -145,6 +155,7 @@ class TrainingSettings(Reconstructor):
         check_model(self.model)
         check_aperture(self.aperture)
         check_source(self.source)
+        check_refined(self.refine, self.pose_sigma_mm, self.pose_sigma_deg, self.shift_sigma_px)
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")

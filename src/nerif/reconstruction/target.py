@@ -34,6 +34,7 @@ class Part:
     inverse_scale : (n, c) one over the unit of `measured`; residuals are multiplied by it: 1/sigma, scaled so that the
         ambient field has mean square 1 over all parts of a target
     outlier : scaled residual beyond which a number counts by its size and not by its square
+    offset : (n, k) added to what is predicted, or None
     """
 
     model: ForwardModel
@@ -41,13 +42,15 @@ class Part:
     measured: Float[Tensor, "n c"]
     inverse_scale: Float[Tensor, "n c"]
     outlier: float = math.inf
+    offset: Float[Tensor, "n k"] | None = None
 
     def __len__(self) -> int:
         return len(self.rays)
 
     def __getitem__(self, index: Tensor | slice) -> Part:
         measured, inverse = self.measured[index], self.inverse_scale[index]
-        return replace(self, rays=self.rays[index], measured=measured, inverse_scale=inverse)
+        offset = None if self.offset is None else self.offset[index]
+        return replace(self, rays=self.rays[index], measured=measured, inverse_scale=inverse, offset=offset)
 
     def to(self, device: torch.device | str) -> Part:
         """Return the same on another device."""
@@ -78,7 +81,8 @@ class Part:
         return r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
 
     def _difference(self, prediction: Float[Tensor, "n k"]) -> Float[Tensor, "n c"]:
-        return self.model.residual(prediction, self.measured, self.rays) * self.inverse_scale
+        moved = prediction if self.offset is None else prediction + self.offset
+        return self.model.residual(moved, self.measured, self.rays) * self.inverse_scale
 
 
 def check_target(measurement: Measurement, model: str = AUTO, linear: bool = False) -> None:

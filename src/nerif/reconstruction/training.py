@@ -112,6 +112,7 @@ class Training:
                 clock, rays_then = time.perf_counter(), budget.rays_done
             if self.data.advance(budget.progress):
                 self._begin_part()
+            self.objective.refine(budget.progress)
             pieces, whole = self._batch()
             self.network.low = budget.progress < settings.full_precision_from
             terms, mine = self.objective.terms(pieces), sum(piece.part.measured.numel() for piece in pieces)
@@ -383,4 +384,5 @@ class Training:
             device=str(self.device),
             state=state,
             quantity=self.data.quantity,
+            rig=[] if self.data.refinement is None else self.data.refinement.table(),
         )

@@ -6,8 +6,10 @@ and of each point as well: tau in [-1, 1].
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from contextlib import suppress
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -23,6 +25,7 @@ from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.gauge import AmbientRegion, is_open
+from nerif.reconstruction.refinement import Refinement
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.sources import of_source, stages
@@ -67,6 +70,18 @@ class TrainingData(ABC):
 
     stage: int = 0
     """Part of the run that the data are given for."""
+
+    refinement: Refinement | None = None
+    """Of the rig, or None where it is as calibrated."""
+    sigma_known: bool = False
+
+    def refined_by(self, seed: int) -> list[Part]:
+        """Draw pixels that the rig is refined by, with their calibrated rays, residuals in units of sigma."""
+        raise NotImplementedError("these data refine no rig")
+
+    def refined(self, part: Part, held_back: bool = False) -> Part:
+        """Return a part, of the rays held back or of the others, as the refined rig has it."""
+        return part
 
     def advance(self, progress: float) -> bool:
         """Give what is to be met at that share of a run, or of its first cycle; return whether a new part began."""
@@ -117,7 +132,7 @@ class TrainingData(ABC):
         """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
 
 
-SETTLED_BY = 1024  # pixels a view
+SETTLED_BY, REFINED_BY = 1024, 150  # pixels a view
 
 
 class FrameData(TrainingData):
@@ -146,6 +161,10 @@ class FrameData(TrainingData):
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.lens_rays = lens_rays(measurement, settings.lens_rays)
+        if settings.refine:
+            self.refinement = Refinement.asked(
+                final, settings.refine, settings.pose_sigma_mm, settings.pose_sigma_deg, settings.shift_sigma_px
+            )
         if judged:
             rest, held = hold_back(measurement, self.coarsest)
             with suppress(InputError):  # all that would be held back crosses an open face
@@ -165,6 +184,7 @@ class FrameData(TrainingData):
         self.target = Target.of(seen, settings.open_faces, edge, settings.model).to(self.device)
         self.names = seen.names
         self.noise = self.target.noise or 0.0
+        self.sigma_known = self.target.sigma_known
 
     def advance(self, progress: float) -> bool:
         reached = max(i for i, stage in enumerate(self.stages) if stage.begin <= progress)
@@ -181,10 +201,12 @@ class FrameData(TrainingData):
         drawn = torch.Generator().manual_seed(self.stage)
         parts = [part for part in self.target.parts if part.model.settles]
         some = [torch.randperm(len(part), generator=drawn)[: SETTLED_BY * len(self.names)] for part in parts]
-        return [part[index.to(self.device)] for part, index in zip(parts, some, strict=True)]
+        return [self.refined(part[index.to(self.device)]) for part, index in zip(parts, some, strict=True)]
 
     def kept(self) -> dict[str, Tensor]:
-        return {str(i): model.settled.clone() for i, model in enumerate(_settling(self.target))}
+        kept = {str(i): model.settled.clone() for i, model in enumerate(_settling(self.target))}
+        rig = {} if self.refinement is None else self.refinement.kept()
+        return kept | {f"rig.{name}": value for name, value in rig.items()}
 
     def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
         if stage != self.stage:
@@ -192,6 +214,8 @@ class FrameData(TrainingData):
             self.refine(self.edge)
         for i, model in enumerate(_settling(self.target)):
             model.adopt(kept[str(i)])
+        if self.refinement is not None:
+            self.refinement.restore({name: kept[f"rig.{name}"] for name in self.refinement.kept()})
 
     def judge_alike(self) -> None:
         """Let the pictures that are held back be as bright as those that are not."""
@@ -203,7 +227,23 @@ class FrameData(TrainingData):
         return len(self.target)
 
     def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
-        return [(part, None) for part in self.target[index.to(self.device)].parts if len(part)]
+        return [(self.refined(part), None) for part in self.target[index.to(self.device)].parts if len(part)]
+
+    def refined(self, part: Part, held_back: bool = False) -> Part:
+        if self.refinement is None:
+            return part
+        names = self.judging if held_back else self.names
+        return self.refinement.of(part, [self.refinement.names.index(name) for name in names])
+
+    def refined_by(self, seed: int) -> list[Part]:
+        if self.refinement is None or self.names != self.refinement.names:
+            return []  # a part of the run that has not all views
+        parts, drawn, unit = [], torch.Generator().manual_seed(seed), math.sqrt(self.target.chi_square)
+        for part in self.target.parts:
+            index = torch.randperm(len(part), generator=drawn)[: REFINED_BY * len(self.names)]
+            some = part[index.to(self.device)]
+            parts.append(replace(some, inverse_scale=some.inverse_scale * unit, outlier=some.outlier * unit))
+        return parts
 
     def ambient_points(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], None] | None:
         return None if self.ambient is None else (self.ambient.sample(count, generator).to(self.device), None)

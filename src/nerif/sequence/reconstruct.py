@@ -72,6 +72,11 @@ def reconstruct_sequence(
         raise InputError("time_limit: expected none in a sequence, whose frames are to be repeatable; give --max-steps")
     if reconstructor.source in ("pictures", "both"):
         raise InputError(f"from: expected auto or displacements for a sequence, got '{reconstructor.source}'")
+    if reconstructor.refine:
+        raise InputError(
+            "refine: expected nothing to refine in a sequence; refine one frame with nerif reconstruct, and give its "
+            "calibration.toml to the measurement"
+        )
     reconstructor = replace(reconstructor, source="displacements")
     sequence = MeasurementSequence.read(measurement)
     like = seen_through(sequence.first_good(), reconstructor.aperture)

@@ -1,0 +1,340 @@
+"""A rig refined together with the field: where cameras stand and look, and what shifts their pictures.
+
+    d = A(theta_v) f + c_v + C_v x        theta_v: corrections of camera v (geometry/correction.py), x in the picture
+    min  sum |d - measured|^2 / sigma^2 + sum theta^2 / sigma_theta^2
+
+Every number is held by its standard deviation. A step is one of Gauss and Newton against the field as it is, camera by
+camera; between two steps the field follows. It follows so well that a step sees but a part of what is wrong, so that
+steps gather momentum. What no camera can tell, the rigid motion of all of them with the field, is taken out: the mean
+of the corrections, weighted by their priors, stays 0.
+
+While the field is not found yet, what it leaves is alike around and no noise. So data count little at first, and where
+they tell less than the prior does, the prior holds (docs/refinement.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import InputError
+from nerif.geometry import Box, Camera, Rays
+from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.measurement import Measurement
+from nerif.reconstruction.target import Part
+
+__all__ = ["NAMES", "PICTURE", "REFINED", "UNITS", "Refinement", "check_refined", "moved_lines", "with_corrections"]
+
+PICTURE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
+"""Displacement of a whole picture, px: constant, and growing from the middle to the edge along columns and rows."""
+NAMES = (*GEOMETRY, *PICTURE)
+UNITS = (*("rad",) * 3, *("mm",) * 3, "1", "mm", *("px",) * 6)
+REFINED = {"cameras": range(6), "focal": range(6, 7), "background": range(7, 8), "shift": range(8, 14)}
+"""What can be refined, and which of NAMES it is."""
+
+ZOOM_SIGMA, BACKGROUND_SIGMA = 1e-3, 0.5  # of a focal length, as a share; mm
+LINEAR = 0.2  # of the shift: what turn and zoom of a shaken camera move its edge by
+STEP_PX = 0.3  # by which rays move at the middle of the box, to see what changes
+ALIKE = 20.0  # neighbours that what is not understood is alike in
+MOMENTUM = 0.6
+MOVED = 3.0  # sigma, by which a view counts as moved
+
+Predict = Callable[[Part, Rays], Float[Tensor, "n k"]]
+"""Gives the path integral of the field that is there, along rays of a part."""
+
+
+def refined_words(refine: Sequence[str]) -> tuple[str, ...]:
+    """Return the words of a setting, which may stand one by one or with commas between."""
+    return tuple(dict.fromkeys(word for given in refine for word in given.replace(",", " ").split()))
+
+
+def check_refined(refine: Sequence[str], mm: float, deg: float, px: float) -> None:
+    """Refuse what cannot be refined, and standard deviations that are none.
+
+    Raises
+    ------
+    InputError
+        Naming it.
+    """
+    for word in refined_words(refine):
+        if word not in REFINED:
+            raise InputError(f"refine: expected some of {', '.join(REFINED)}, got '{word}'")
+    for name, value in (("pose_sigma_mm", mm), ("pose_sigma_deg", deg), ("shift_sigma_px", px)):
+        if not 0 < value < 1e6:
+            raise InputError(f"{name}: expected a standard deviation above 0, got {value}")
+
+
+class Refinement:
+    """The refined numbers of a rig.
+
+    Parameters
+    ----------
+    cameras : as they were calibrated
+    box : of the field, mm
+    sigma : (view, 14) standard deviation of each of NAMES; 0 for one that is not refined
+    """
+
+    def __init__(self, cameras: Sequence[Camera], box: Box, sigma: Float[Tensor, "view 14"]) -> None:
+        self.cameras, self.box, self.sigma = tuple(cameras), box, sigma.double()
+        self.values, self.velocity = torch.zeros_like(self.sigma), torch.zeros_like(self.sigma)
+        self.done = 0
+        """Steps in this cycle of a run."""
+        self.columns = [i for i in range(len(NAMES)) if bool((self.sigma[:, i] > 0).any())]
+        self._half = torch.tensor([max(c.image_size) / 2 for c in self.cameras])
+        self._middle = torch.tensor([[(n - 1) / 2 for n in c.image_size[::-1]] for c in self.cameras])
+        self._corrections = self._of(self.values)
+
+    @classmethod
+    def asked(cls, measurement: Measurement, refine: Sequence[str], mm: float, deg: float, px: float) -> Refinement:
+        """Return the refinement of some of REFINED.
+
+        Parameters
+        ----------
+        mm, deg, px : standard deviations of where cameras stand, how they are turned and by how much pictures are
+            shifted, where the measurement does not know its pose_sigma
+
+        Raises
+        ------
+        InputError
+            If nothing measured can tell of a shift.
+        """
+        words, views = refined_words(refine), len(measurement.cameras)
+        whole = torch.tensor(
+            [*[torch.pi / 180 * deg] * 3, *[mm] * 3, ZOOM_SIGMA, BACKGROUND_SIGMA, px, px, *[LINEAR * px] * 4],
+            dtype=torch.float64,
+        ).repeat(views, 1)
+        if "pose_sigma" in measurement.about_views:
+            whole[:, :6] = measurement.about_views["pose_sigma"]
+        if "shift" in words and any(not kind.windowed for kind in measurement.techniques):
+            names = " and ".join(o.technique.measured for o in measurement.observations)
+            raise InputError(
+                f"refine: expected displacements alone for 'shift', got {names}; of pictures give --from displacements"
+            )
+        if "background" in words and any(camera.background is None for camera in measurement.cameras):
+            raise InputError("refine: expected cameras that look at a background for 'background', got some without")
+        open_ = torch.zeros(len(NAMES), dtype=torch.bool)
+        for word in words:
+            open_[list(REFINED[word])] = True
+        return cls(measurement.cameras, measurement.box, torch.where(open_, whole, 0.0))
+
+    # -- what follows from the numbers ---------------------------------------------------------------------------
+
+    @property
+    def corrected(self) -> tuple[Camera, ...]:
+        """The cameras as refined."""
+        return self._corrections.corrected
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the views."""
+        return tuple(camera.name for camera in self.cameras)
+
+    def of(self, part: Part, numbers: Sequence[int] | None = None) -> Part:
+        """Return a part with its rays as the refined cameras have them, and the displacement of its pictures.
+
+        Parameters
+        ----------
+        numbers : of the cameras that are the views of the part; None where they are all
+        """
+        rays = part.rays
+        if numbers is not None and list(numbers) != list(range(len(self.cameras))):
+            rays = replace(rays, view=torch.tensor(numbers, device=rays.view.device).to(rays.view)[rays.view.long()])
+        geometric = any(i < len(GEOMETRY) for i in self.columns)
+        moved = self._corrections.moved(rays, self.box) if geometric else rays
+        return replace(part, rays=replace(moved, view=part.rays.view), offset=self._offset(self.values, rays))
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return for each view the refined numbers by their names, and how far it moved, in its sigmas."""
+        rows = []
+        for camera, value, sigma in zip(self.cameras, self.values, self.sigma, strict=True):
+            numbers = {NAMES[i]: float(value[i]) for i in self.columns}
+            held = {NAMES[i]: float(sigma[i]) for i in self.columns}
+            most = max((abs(float(value[i] / sigma[i])) for i in self.columns if sigma[i] > 0), default=0.0)
+            rows.append({"name": camera.name, "moved": most, "values": numbers, "sigma": held})
+        return rows
+
+    # -- steps ---------------------------------------------------------------------------------------------------
+
+    def step(self, parts: Sequence[Part], predict: Predict, known: bool = True, momentum: float = MOMENTUM) -> None:
+        """Move by one step of Gauss and Newton, and a share of the step before, to what some pixels ask for.
+
+        Parameters
+        ----------
+        parts : pixels, with their calibrated rays, residuals in units of sigma
+        predict : of the field
+        known : whether sigma is; else residuals are in any unit
+        """
+        self.done += 1
+        if not parts:
+            return
+        normal, right = self.normal_equations(parts, predict, known)
+        sigma = self.sigma[:, self.columns]  # 0 of a number that a view does not refine: it stays
+        told, ways = torch.linalg.eigh(sigma[:, :, None] * normal * sigma[:, None])
+        pull = torch.einsum("vij,vi->vj", ways, sigma * right)
+        at = torch.einsum("vij,vi->vj", ways, self.values[:, self.columns] / sigma.clamp(min=1e-30))
+        told = told.clamp(min=0)
+        move = ((1 + told) * pull - at) / (1 + told * (1 + told))  # what is told clearly is free of the prior
+        change = torch.zeros_like(self.values)
+        change[:, self.columns] = sigma * torch.einsum("vij,vj->vi", ways, move)
+        self.velocity = momentum * self.velocity + change
+        self.values = self._centred(self.values + self.velocity)
+        self._corrections = self._of(self.values)
+
+    def normal_equations(
+        self, parts: Sequence[Part], predict: Predict, known: bool = True
+    ) -> tuple[Float[Tensor, "view k k"], Float[Tensor, "view k"]]:
+        """Return J^T W J and -J^T W r of each view, of the numbers that are refined."""
+        views, k, steps = len(self.cameras), len(self.columns), self._steps()
+        normal = torch.zeros(views, k, k, dtype=torch.float64)
+        right = torch.zeros(views, k, dtype=torch.float64)
+        for part in parts:
+            now, seen = self.residual(part, self.values, predict)
+            slopes = []
+            for i in self.columns:
+                other = self.values.clone()
+                other[:, i] += steps[:, i]
+                there, _ = self.residual(part, other, predict, seen if i >= len(GEOMETRY) else None)
+                slopes.append((there - now) / steps[:, i].to(now)[part.rays.view.long()][:, None])
+            jacobian = torch.stack(slopes, dim=-1).double().cpu()
+            now, view = now.double().cpu(), part.rays.view.long().cpu()
+            weight = (part.outlier / now.abs().clamp(min=1e-30)).clamp(max=1.0)
+            for v in range(views):
+                own = view == v
+                if not bool(own.any()):
+                    continue
+                j, r, w = jacobian[own].flatten(0, 1), now[own].flatten(), weight[own].flatten()
+                level = float((w * r.square()).mean())
+                level, excess = (max(level, 1.0), max(level - 1, 0.0)) if known else (max(level, 1e-30), 1.0)
+                each = 1 / (level * (1 + ALIKE * min(excess, 1.0)))
+                normal[v] += each * (j.T * w) @ j
+                right[v] -= each * (j.T * w) @ r
+        return normal, right
+
+    def residual(
+        self, part: Part, values: Float[Tensor, "view 14"], predict: Predict, seen: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the residual of a part with other numbers, outliers as large as they are, and the path integral.
+
+        Parameters
+        ----------
+        part : pixels, with their calibrated rays
+        seen : the path integral, where it is known
+        """
+        if seen is None:
+            seen = predict(part, self._of(values).moved(part.rays, self.box))
+        offset = self._offset(values, part.rays)
+        shifted = seen if offset is None else seen + offset
+        return part.model.residual(shifted, part.measured, part.rays) * part.inverse_scale, seen
+
+    # -- what a checkpoint keeps ---------------------------------------------------------------------------------
+
+    def kept(self) -> dict[str, Tensor]:
+        """Return what a checkpoint keeps."""
+        done = torch.tensor(self.done)
+        return {"values": self.values.clone(), "velocity": self.velocity.clone(), "done": done}
+
+    def restore(self, kept: dict[str, Tensor]) -> None:
+        """Go on from what a checkpoint kept."""
+        self.values, self.velocity, self.done = kept["values"].clone(), kept["velocity"].clone(), int(kept["done"])
+        self._corrections = self._of(self.values)
+
+    def _of(self, values: Float[Tensor, "view 14"]) -> Corrections:
+        return Corrections(self.cameras, values[:, : len(GEOMETRY)])
+
+    def _centred(self, values: Float[Tensor, "view 14"]) -> Float[Tensor, "view 14"]:
+        """The numbers without the rigid motion of all cameras."""
+        if not bool((self.sigma[:, :6] > 0).all()):
+            return values
+        motions = torch.stack([_motion(camera) for camera in self.cameras])
+        weighted = motions / self.sigma[:, :6, None]
+        value = (values[:, :6] / self.sigma[:, :6]).flatten()[:, None]
+        rigid = torch.linalg.lstsq(weighted.flatten(0, 1), value).solution[:, 0]
+        values = values.clone()
+        values[:, :6] -= torch.einsum("vij,j->vi", motions, rigid)
+        return values
+
+    def _steps(self) -> Float[Tensor, "view 14"]:
+        """By how much each number is changed to see what it does: what moves rays by STEP_PX, at about."""
+        steps = torch.full_like(self.sigma, 1e-2)
+        centre = torch.tensor(self.box.centre, dtype=torch.float64)
+        for v, camera in enumerate(self.cameras):
+            pixel, depth = float(camera.pixel_size(centre)), abs(float(camera.local(centre)[2]))
+            across, moved = float(self._half[v]) * pixel, STEP_PX * pixel
+            toward = moved * depth / across if camera.projection.shows_depth else moved
+            turn = moved / max(depth, across)
+            zoom, away = moved / across, moved * depth / across
+            steps[v, : len(GEOMETRY)] = torch.tensor([turn, turn, zoom, moved, moved, toward, zoom, away])
+        return steps
+
+    def _offset(self, values: Float[Tensor, "view 14"], rays: Rays) -> Tensor | None:
+        """The displacement of the pictures at the pixels of rays, px; None where it is not refined."""
+        if not any(i >= len(GEOMETRY) for i in self.columns):
+            return None
+        view = rays.view.long()
+        middle, half = self._middle.to(rays.pixel)[view], self._half.to(rays.pixel)[view]
+        return displaced(values[:, len(GEOMETRY) :].to(rays.pixel)[view], (rays.pixel - middle) / half[:, None]).to(
+            rays.near
+        )
+
+
+def displaced(numbers: Float[Tensor, "n 6"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
+    """Return the displacement of a whole picture, px, from its middle (PICTURE): at places, 1 at the edge."""
+    return numbers[:, :2] + torch.einsum("nij,nj->ni", numbers[:, 2:].unflatten(1, (2, 2)), place)
+
+
+def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) -> Measurement:
+    """Return a measurement with the cameras that a refinement found, and without the shifts of its pictures.
+
+    Views that the table does not name stay as they are.
+
+    Parameters
+    ----------
+    table : of a Refinement, as metrics.json keeps it
+    """
+    known = {row["name"]: row["values"] for row in table}
+    values = torch.tensor(
+        [[known.get(name, {}).get(number, 0.0) for number in NAMES] for name in measurement.names], dtype=torch.float64
+    )
+    cameras = Corrections(measurement.cameras, values[:, : len(GEOMETRY)]).corrected
+    d = measurement.displacement
+    if d is not None and bool(values[:, len(GEOMETRY) :].any()):
+        d = d.clone()
+        for i, camera in enumerate(cameras):
+            height, width = camera.image_size
+            pixel = camera.pixel_grid().reshape(-1, 2).double()
+            middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+            own = values[i, len(GEOMETRY) :].expand(len(pixel), -1)
+            shift = displaced(own, (pixel - middle) / (max(height, width) / 2)).reshape(height, width, 2)
+            d[i, :height, :width] -= shift.to(d)
+    return replace(measurement, cameras=cameras, displacement=d)
+
+
+def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
+    """Return what to say of a refinement: how far views moved, and each that moved further than its sigmas allow."""
+    far = [row for row in table if row["moved"] > MOVED]
+    most = max(table, key=lambda row: row["moved"])
+    lines = [f"refined {len(table)} views; furthest is {most['name']}, by {most['moved']:.1f} of its sigmas"]
+    for row in far:
+        number, value = max(row["values"].items(), key=lambda n: abs(n[1]) / max(row["sigma"][n[0]], 1e-30))
+        unit = UNITS[NAMES.index(number)]
+        lines.append(
+            f"view {row['name']} is not where its calibration says: {number} {value:.3g} {unit}, {row['moved']:.1f} "
+            "sigma; calibrate it again, or state a larger pose_sigma"
+        )
+    return lines
+
+
+def _motion(camera: Camera) -> Float[Tensor, "6 6"]:
+    """How the numbers of a camera change with a rigid motion of the world, turn (rad) and shift (mm)."""
+    rotation, centre = camera.rotation.double(), camera.centre.double()
+    x, y, z = centre.tolist()
+    cross = torch.tensor([[0, z, -y], [-z, 0, x], [y, -x, 0]], dtype=torch.float64)  # w -> w x C
+    motion = torch.zeros(6, 6, dtype=torch.float64)
+    motion[:3, :3] = -rotation
+    motion[3:, :3], motion[3:, 3:] = rotation @ cross, rotation
+    return motion

@@ -1,0 +1,71 @@
+"""Corrections of cameras: rays that move with their camera are those of the corrected camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Plane, Rays
+from nerif.geometry.correction import GEOMETRY, Corrections, turned
+
+BOX = Box((-25.0,) * 3, (25.0,) * 3)
+
+
+def camera(projection: str, lens: Lens | None, turn: float) -> Camera:
+    """Askew, distorted, before a slanted background."""
+    scale = 900.0 if projection == "perspective" else 2.0
+    k = torch.tensor([[scale, 0.003 * scale, 60], [0, 0.98 * scale, 50], [0, 0, 1]], dtype=torch.float64)
+    rotation = turned(torch.tensor([0.1, turn, 0.2], dtype=torch.float64))
+    translation = torch.tensor([3.0, 4.0, 500.0], dtype=torch.float64)
+    normal = torch.nn.functional.normalize(rotation[2] + torch.tensor([0.05, 0.02, 0.1]).double(), dim=0)
+    behind = float(normal @ (-rotation.T @ translation + 900 * rotation[2]))
+    bent = [0.1, 0.05, 0.01, -0.02, 0.03] if projection == "perspective" else [1e-5, 0, 0, 0, 0]
+    distortion = torch.tensor(bent, dtype=torch.float64)
+    made = Camera(k, rotation, translation, (100, 120), Plane(normal, behind), distortion, f"{turn}", lens=lens)
+    return replace(made, projection=PROJECTIONS[projection])
+
+
+@pytest.mark.parametrize("lens", [None, Lens(6.0), Lens(6.0, focus=800.0), Lens(3.0, window=4.0)])
+@pytest.mark.parametrize("projection", sorted(PROJECTIONS))
+@pytest.mark.parametrize("background", [True, False])
+def test_rays_move_as_those_of_the_corrected_cameras(projection, lens, background):
+    if not background and (lens is None or lens.focus is None):
+        lens = None
+    cameras = [camera(projection, lens, turn) for turn in (0.0, 0.5)]
+    if not background:
+        cameras = [replace(c, background=None) for c in cameras]
+    sizes = torch.tensor([0.01] * 3 + [2.0] * 3 + [0.02, 5.0], dtype=torch.float64)
+    corrections = Corrections(cameras, torch.randn(2, 8, generator=torch.Generator().manual_seed(0)).double() * sizes)
+    pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(1)).double() * 100
+
+    def seen(by) -> Rays:
+        return Rays.concatenate([c.rays(pixels, True, i).clip(BOX) for i, c in enumerate(by)])
+
+    expected, found = seen(corrections.corrected), corrections.moved(seen(cameras), BOX)
+    assert float((expected.direction - seen(cameras).direction).abs().max()) > 1e-3
+    pairs = [(getattr(expected, n), getattr(found, n)) for n in ("origin", "direction", "near", "far")]
+    if background:
+        pairs += [(getattr(expected.ends, n), getattr(found.ends, n)) for n in ("sensitivity", "distance")]
+    if lens is not None:
+        pairs += [(getattr(expected.lens, n), getattr(found.lens, n)) for n in ("axis", "normal", "radius", "focus")]
+    for wanted, got in pairs:
+        assert torch.allclose(wanted, got, rtol=1e-9, atol=1e-8)
+    assert torch.equal(found.view, expected.view)
+
+
+def test_no_correction_changes_nothing():
+    cameras = [camera("perspective", None, 0.0)]
+    none = Corrections(cameras, torch.zeros(1, len(GEOMETRY)))
+    assert torch.allclose(none.corrected[0].rotation, cameras[0].rotation, atol=1e-14)
+    assert torch.allclose(none.corrected[0].translation, cameras[0].translation, atol=1e-10)
+
+
+def test_a_shift_is_along_the_axes_of_the_camera_and_a_turn_about_them():
+    first = camera("perspective", None, 0.5)
+    moved = Corrections([first], torch.tensor([[0, 0, 0.1, 0, 0, 2.0, 0, 0]])).corrected[0]
+    assert torch.allclose(moved.centre, first.centre + 2 * first.rotation[2], atol=1e-9)
+    assert torch.allclose(moved.rotation[2], first.rotation[2], atol=1e-12)
+    away = Corrections([first], torch.tensor([[0, 0, 0, 0, 0, 0, 0, 3.0]])).corrected[0]
+    assert away.depth(away.plane) > first.depth(first.plane)
