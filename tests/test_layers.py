@@ -22,7 +22,7 @@ LAYERS = (
     ("imaging",),
     ("fields",),
     ("physics",),
-    ("metrics", "resolution", "simulation", "rendering"),
+    ("alignment", "metrics", "resolution", "simulation", "rendering"),
     ("experiment", "particles"),
     ("reconstruction",),
     ("result", "monitor"),

@@ -237,7 +237,7 @@ def test_what_is_known_of_the_views_and_not_used_is_told(absorption, tmp_path, c
     path = tmp_path / "m.nc"
     replace(measurement, about_views=about).write(path)
     assert main(["reconstruct", str(path), "-o", str(tmp_path / "r"), "--no-report", *QUICK]) == 0
-    assert "pose_sigma: known of the views, but the reconstruction makes no use of it" in capsys.readouterr().out
+    assert "pose_sigma: known of the views, but used only with --refine cameras" in capsys.readouterr().out
 
 
 def test_maps_that_cannot_be_negative_begin_at_zero():

@@ -21,15 +21,8 @@ from nerif.fields.base import Field
 from nerif.geometry import Box
 from nerif.measurement import Measurement
 from nerif.reconstruction.base import Reconstruction, State
-from nerif.reconstruction.files import (
-    CHECKPOINT,
-    FIELD,
-    read_field,
-    read_quantity,
-    read_state,
-    write_field,
-    write_state,
-)
+from nerif.reconstruction import files as kept
+from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
 from nerif.reprojection import Reprojection
 from nerif.toml import read_toml, write_toml
 from nerif.volume import INDEX, Volume, field_of
@@ -42,8 +35,7 @@ __all__ = [
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
-ENSEMBLE, FIGURES = "ensemble", "figures"
-CALIBRATION = "calibration.toml"
+ENSEMBLE, FIGURES, CALIBRATION = "ensemble", "figures", "calibration.toml"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
@@ -167,9 +159,9 @@ class ResultDirectory:
 
     def write_field(self, result: Reconstruction) -> None:
         """Write the field and, where there is one, the checkpoint to go on from."""
-        write_field(self.path, result)
+        kept.write_field(self.path, result)
         if result.state is not None:
-            write_state(self.path, result.state)
+            kept.write_state(self.path, result.state)
 
     def write_history(self, history: Sequence[Mapping[str, float]]) -> None:
         """Write history.csv, a line a record, blank where a record lacks a column."""
