@@ -20,8 +20,8 @@ from nerif.exports import export
 from nerif.fields.base import Field
 from nerif.geometry import Box
 from nerif.measurement import Measurement
-from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction import files as kept
+from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
 from nerif.reprojection import Reprojection
 from nerif.toml import read_toml, write_toml
