@@ -63,8 +63,7 @@ def evaluate(
     ------
     InputError
         If there is nothing to compare or to align, truth or measurement are of another quantity, the truth is over an
-        unknown
-        ambient or sticks out of the box, or there is no such view.
+        unknown ambient or sticks out of the box, or there is no such view.
     """
     if truth is None and measurement is None:
         raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")

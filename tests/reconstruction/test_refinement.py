@@ -196,6 +196,13 @@ def test_what_cannot_be_refined_is_refused(options, words):
         NeRIF(**options)
 
 
+@pytest.mark.parametrize("sigma", [0.0, -1.0])
+def test_a_pose_sigma_that_refines_nothing_is_refused(measured, sigma):
+    known = replace(measured, about_views={"pose_sigma": torch.full((5, 6), sigma)})
+    with pytest.raises(InputError, match="pose_sigma: expected standard deviations of 0 or more"):
+        Refinement.asked(known, ["cameras"], 0.2, 0.02, 0.05)
+
+
 def test_a_shift_is_of_displacements_alone(measured):
     flat = simulate(make_phantom("gaussians", BOX, 0), RING.cameras(), BOX, 1.0, techniques=[Absorption])
     with pytest.raises(InputError, match="refine: expected displacements alone for 'shift', got absorbance"):

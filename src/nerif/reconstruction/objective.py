@@ -180,7 +180,6 @@ class Objective:
             rig.done = 0
         if rig.done >= due:
             return
-        low, self.network.low = self.network.low, False
 
         def predict(part: Part, rays: Rays) -> Tensor:
             drawn = torch.Generator().manual_seed(rig.done)  # the same samples wherever the cameras are
@@ -197,7 +196,6 @@ class Objective:
 
         momentum = MOMENTUM if progress < SLOWED_FROM else 0.0
         rig.step(data.refined_by(rig.done), predict, data.sigma_known, momentum)
-        self.network.low = low
 
     def at_ambient(self, count: int, generator: torch.Generator) -> Tensor | None:
         """Return what the network gives where it should give 0, in full precision; None where no place is known."""

@@ -110,6 +110,8 @@ class Refinement:
         ).repeat(views, 1)
         if "pose_sigma" in measurement.about_views:
             whole[:, :6] = measurement.about_views["pose_sigma"]
+        if not bool((whole >= 0).all()) or ("cameras" in words and not bool(whole[:, :6].any())):
+            raise InputError("pose_sigma: expected standard deviations of 0 or more, some above 0 to refine cameras")
         if "shift" in words and any(not kind.windowed for kind in measurement.techniques):
             names = " and ".join(o.technique.measured for o in measurement.observations)
             raise InputError(
@@ -296,6 +298,8 @@ def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) 
     ----------
     table : of a Refinement, as metrics.json keeps it
     """
+    if not table:
+        return measurement
     known = {row["name"]: row["values"] for row in table}
     values = torch.tensor(
         [[known.get(name, {}).get(number, 0.0) for number in NAMES] for name in measurement.names], dtype=torch.float64
