@@ -30,7 +30,9 @@ from nerif.reconstruction.presets import preset
 from nerif.simulation import add_noise
 from nerif.volume import Volume
 
-COLUMNS = ("pixels", "edge of the bins [px]", "steps", "passes", "seconds", "memory [GiB]", "L2", "L2 of variation")
+COLUMNS = (
+    "pixels", "edge of the bins [px]", "steps", "passes", "seconds", "memory [GiB]", "L2", "L2 of variation", "outcome",
+)  # fmt: skip
 VOXELS = 160  # along an edge of the box, on which the flame is given
 
 
@@ -73,6 +75,7 @@ def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> list[s
         f"{result.peak_memory_bytes / 2**30:.2f}",
         f"{found['l2']:.3%}",
         f"{found['l2_variation']:.2%}",
+        result.outcome.reason,
     ]
 
 
@@ -83,7 +86,7 @@ def main() -> None:
     parser.add_argument("--fewest", type=int, nargs="+", default=[0], help="bins along a picture at least; 0 as it is")
     parser.add_argument("--noise", type=float, default=0.05)
     parser.add_argument("--preset", default="fast")
-    parser.add_argument("--time-limit", type=float, default=60.0, help="seconds of training")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="seconds; 0: until it ends by itself")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--folder", type=Path, help="of the simulated measurements, to keep them")
     add_write(parser)

@@ -36,7 +36,7 @@ def run(path: Path, method: str, aperture: str, seconds: float, seed: int, refin
     from nerif.reconstruction.aperture import seen_through
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.refinement import with_corrections
+    from nerif.reconstruction.refined_rig import with_corrections
     from nerif.reconstruction.total_variation import TotalVariation
     from nerif.volume_file import read_volume
 

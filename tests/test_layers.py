@@ -26,7 +26,7 @@ LAYERS = (
     ("experiment", "particles"),
     ("reconstruction",),
     ("result", "monitor"),
-    ("prediction", "evaluation", "consistency", "mistakes", "quick_views", "symptoms", "gains"),
+    ("prediction", "evaluation", "consistency", "rig_check", "mistakes", "quick_views", "symptoms", "gains"),
     ("members",),
     ("report", "sequence"),
     ("workflow",),

@@ -13,7 +13,7 @@ import xarray as xr
 from nerif.conventions import InputError
 from nerif.geometry import Lens, Ring
 from nerif.measurement import Measurement
-from nerif.measurement_file import ABOUT_VIEWS, variables
+from nerif.measurement_file import variables
 from nerif.simulation import simulate
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.registry import TECHNIQUES
@@ -58,8 +58,8 @@ def test_file_opens_with_plain_xarray_and_states_its_units(full, tmp_path):
         assert dataset.attrs["ambient_faces"] == "x- z+"
         known = variables()
         others = {name for k in TECHNIQUES.values() if k is not Deflection for name in (k.measured, k.sigma, *k.beside)}
-        lenses = {"aperture_diameter", "focus_distance", "window"}
-        assert set(dataset.data_vars) == set(known) - set(ABOUT_VIEWS) - lenses - others
+        later = {"aperture_diameter", "focus_distance", "window", "pose_sigma"}
+        assert set(dataset.data_vars) == set(known) - later - others
         for name in dataset.data_vars:
             dimensions, unit = known[name]
             assert dataset[name].dims == dimensions
@@ -223,18 +223,20 @@ RIGS = Path(__file__).parents[2] / "shared" / "data" / "rigs"
 
 
 @pytest.mark.skipif(not RIGS.is_dir(), reason="the measurements of others are not beside the project (shared/data)")
-@pytest.mark.parametrize(("name", "known"), [("all", {"pose_sigma"}), ("window6", set())])
+@pytest.mark.parametrize(("name", "known"), [("all", True), ("window6", False)])
 def test_files_of_others_are_read(name, known):
     m = Measurement.read(RIGS / f"{name}.nc")
-    assert set(m.about_views) == known
+    assert all((camera.pose_sigma is not None) == known for camera in m.cameras)
     assert len(m.cameras) == 9
     assert {c.lens for c in m.cameras} == {Lens(6.25) if name == "all" else Lens(window=6.0)}
 
 
 def test_units_of_a_list_may_have_commas(full, tmp_path):
     turned = torch.full((len(full.cameras), 6), 1e-3, dtype=torch.float64)
-    replace(full, about_views={"pose_sigma": turned}).write(tmp_path / "m.nc")
+    cameras = tuple(replace(camera, pose_sigma=sigma) for camera, sigma in zip(full.cameras, turned, strict=True))
+    replace(full, cameras=cameras).write(tmp_path / "m.nc")
     dataset = xr.load_dataset(tmp_path / "m.nc")
     dataset["pose_sigma"].attrs["units"] = "rad, rad, rad, mm, mm, mm"
     dataset.to_netcdf(tmp_path / "commas.nc", engine="h5netcdf")
-    assert torch.equal(Measurement.read(tmp_path / "commas.nc").about_views["pose_sigma"], turned)
+    back = Measurement.read(tmp_path / "commas.nc").cameras
+    assert torch.equal(torch.stack([camera.pose_sigma for camera in back]), turned)

@@ -231,15 +231,6 @@ def test_quantities_of_a_sequence_follow_from_the_measurement(both, absorption):
         SequenceSettings(quantities=("density",), gas=GasSettings()).for_measurement(alone)
 
 
-def test_what_is_known_of_the_views_and_not_used_is_told(absorption, tmp_path, capsys):
-    measurement = Measurement.read(absorption.with_suffix(".nc"))
-    about = {"pose_sigma": torch.full((3, 6), 6.0)}
-    path = tmp_path / "m.nc"
-    replace(measurement, about_views=about).write(path)
-    assert main(["reconstruct", str(path), "-o", str(tmp_path / "r"), "--no-report", *QUICK]) == 0
-    assert "pose_sigma: known of the views, but used only with --refine cameras" in capsys.readouterr().out
-
-
 def test_maps_that_cannot_be_negative_begin_at_zero():
     values = np.array([-0.1, 0.5, np.nan, 2.0])
     assert drawing.map_range(values, signed=False) == (0.0, 2.0)

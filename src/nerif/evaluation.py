@@ -24,7 +24,7 @@ from nerif.notebook import number
 from nerif.observation import Observation
 from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
-from nerif.reconstruction.refinement import with_corrections
+from nerif.reconstruction.refined_rig import with_corrections
 from nerif.reprojection import Reprojection
 from nerif.result import METRICS, VOLUME, ResultDirectory
 from nerif.techniques.registry import AUTO, forward_model

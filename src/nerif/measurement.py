@@ -52,7 +52,6 @@ class Measurement:
     ambient_faces : faces of the box on which the index is ambient (the gauge)
     maps : (view, row, column) of other techniques, by their names in the file: absorbance, absorbance_sigma, radiance,
         radiance_sigma, fringes, fringes_sigma; NaN where not measured; (view, row, column, c) of one with c channels
-    about_views : (view, ...) what else is known of the views, by its name in the file, such as pose_sigma
 
     Raises
     ------
@@ -71,7 +70,6 @@ class Measurement:
     wavelength_nm: float | None = None
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
     maps: Mapping[str, Float[Tensor, "view row column *c"]] = field(default_factory=dict)
-    about_views: Mapping[str, Float[Tensor, "view ..."]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._check_shapes()
@@ -93,7 +91,6 @@ class Measurement:
         shape = self.shape
         if len(set(self.names)) < len(self.names):
             raise InputError(f"view: expected different names, got {', '.join(self.names)}")
-        measurement_file.check_about_views(self.about_views, len(self.cameras))
         if len({camera.lens is None for camera in self.cameras}) > 1:
             raise InputError("aperture_diameter: expected of every view or of none (0 is a thin ray), got it of some")
         for camera in self.cameras:
@@ -307,7 +304,6 @@ class Measurement:
             displacement=pick(self.displacement),
             sigma=pick(self.sigma),
             maps={name: value[index] for name, value in self.maps.items()},
-            about_views={name: value[index] for name, value in self.about_views.items()},
             valid=pick(self.valid),
             flow_mask=pick(self.flow_mask),
         )

@@ -7,7 +7,6 @@ technique's. The rest is known of the rig.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,8 +26,7 @@ if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
 __all__ = [
-    "ABOUT_VIEWS", "CONVENTIONS", "PLAIN", "check_about_views", "encoding", "from_dataset", "known_conventions",
-    "map_names", "to_dataset", "variables",
+    "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "known_conventions", "map_names", "to_dataset", "variables",
 ]  # fmt: skip
 
 PLAIN, CONVENTIONS = "BOST-1.0", "BOST-1.1"
@@ -50,6 +48,7 @@ RIG = {
     "aperture_diameter": (("view",), "mm"),
     "focus_distance": (("view",), "mm"),
     "window": (("view",), "px"),
+    "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
 }
 """Dimensions and unit of what is known of the rig."""
 
@@ -57,11 +56,6 @@ SPELLED = {"px/mm": "px mm-1"}
 """How units are written that may be read in either spelling."""
 
 MASKS = ("valid", "flow_mask")
-
-ABOUT_VIEWS = {
-    "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
-}
-"""Dimensions and unit of what else may be known of the views."""
 
 NEEDED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
@@ -77,7 +71,7 @@ def variables() -> dict[str, tuple[tuple[str, ...], str]]:
         own = (len(kind.channels), kind.unit)
         for name, (channels, unit) in {kind.measured: own, kind.sigma: own, **kind.beside}.items():
             measured[name] = (PIXELS if channels == 1 else (*PIXELS, _component(channels)), unit)
-    return {**measured, **RIG, **ABOUT_VIEWS}
+    return {**measured, **RIG}
 
 
 def _component(channels: int) -> str:
@@ -93,22 +87,6 @@ def map_names() -> tuple[str, ...]:
 def known_conventions(found: object) -> bool:
     """Return whether an attribute Conventions is that of a measurement."""
     return isinstance(found, str) and found in (PLAIN, CONVENTIONS)
-
-
-def check_about_views(given: Mapping[str, Tensor], views: int) -> None:
-    """Refuse what is not known of views, and what is not of as many views as there are.
-
-    Raises
-    ------
-    InputError
-        Naming it.
-    """
-    for name, value in given.items():
-        if name not in ABOUT_VIEWS:
-            raise InputError(f"about_views: expected names out of {', '.join(ABOUT_VIEWS)}, got '{name}'")
-        whole = tuple(SIZES.get(dimension, views) for dimension in ABOUT_VIEWS[name][0])
-        if tuple(value.shape) != whole:
-            raise InputError(f"about_views: expected {name} of shape {whole}, got {tuple(value.shape)}")
 
 
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
@@ -151,11 +129,13 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         data["aperture_diameter"] = np.array([lens.diameter for lens in lenses])
     if any(lens.focus is not None for lens in lenses):
         data["focus_distance"] = np.array([np.nan if lens.focus is None else lens.focus for lens in lenses])
+    if any(c.pose_sigma is not None for c in cameras):
+        unknown = torch.full((6,), torch.nan, dtype=torch.float64)
+        data["pose_sigma"] = stack([unknown if c.pose_sigma is None else c.pose_sigma for c in cameras])
     masks = {"valid": measurement.valid, "flow_mask": measurement.flow_mask}
     for name, value in {**measurement.measured_maps, **masks}.items():
         if value is not None:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
-    data |= {name: value.numpy() for name, value in measurement.about_views.items()}
     dataset = xr.Dataset({k: (known[k][0], v, {"units": known[k][1]}) for k, v in data.items()})
     scales = {c.projection.unit for c in cameras}
     if len(scales) == 1:
@@ -165,7 +145,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         dataset = dataset.assign_coords(component=list(COMPONENTS))
     names = [kind.name for kind in measurement.techniques]
     pinholes = all(c.projection == PERSPECTIVE for c in cameras)
-    plain = names == [Deflection.name] and not measurement.about_views and pinholes and not lenses
+    plain = names == [Deflection.name] and pinholes and not lenses and "pose_sigma" not in data
     dataset.attrs = {
         "Conventions": PLAIN if plain else CONVENTIONS,
         **({} if plain else {"technique": " ".join(names)}),
@@ -208,7 +188,6 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
         "displacement": None,
         **{name: _map(dataset, name) for name in own if name in dataset},
         "maps": maps,
-        "about_views": {name: _array(dataset, name) for name in ABOUT_VIEWS if name in dataset},
         "n_ambient": _number(dataset, "n_ambient", "the index around the flow, e.g. 1.00027", None if index else 1.0),
         "wavelength_nm": _number(dataset, "wavelength_nm", "nm") if "wavelength_nm" in dataset.attrs else None,
         "ambient_faces": parse_faces(faces, "attribute ambient_faces"),
@@ -321,6 +300,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64)
     normals, offsets = (_array(dataset, n, True) if n in dataset else nowhere for n in BACKGROUND)
     lenses = _lenses(dataset, names)
+    sure = _array(dataset, "pose_sigma", True) if "pose_sigma" in dataset else torch.full((views, 6), torch.nan)
     cameras = []
     for i, name in enumerate(names):
         height, width = sizes[i].tolist()
@@ -335,6 +315,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 name=name,
                 projection=projections[i],
                 lens=lenses[i],
+                pose_sigma=None if bool(sure[i].isnan().all()) else sure[i],
             )
         )
     return tuple(cameras)

@@ -26,7 +26,9 @@ from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.parallel import Ranks
-from nerif.reconstruction.refinement import moved_lines, with_corrections
+from nerif.reconstruction.refined_rig import moved_lines, with_corrections
+from nerif.reconstruction.refit import refit
+from nerif.reconstruction.rig_posterior import with_posterior
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.voxels import VoxelReconstructor
@@ -127,9 +129,6 @@ def reconstruct_into(
         seen = " or ".join(o.technique.measured for o in measurement.observations)
         what = f"pixels left out whose {seen} or sigma is NaN, infinite or impossible"
         monitor.say(f"{where}: {measurement.bad_pixels} {what}")
-    if measurement.about_views and not getattr(reconstructor, "refine", ()):
-        names = ", ".join(measurement.about_views)
-        monitor.say(f"{names}: known of the views, but used only with --refine cameras")
     state = out.state() if resume else None
     start = _start(run, measurement) if run.ensemble or not resume else None
     if not resume:
@@ -218,12 +217,21 @@ def _write(
     out.write_metrics(metrics)
     about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
     out.write_settings(settings, about | ({"gains": gains} if gains else {}))
+    calibrated, held = measurement, []
     if result.rig:
-        measurement = with_corrections(measurement, result.rig)
-        metrics["rig"] = result.rig
+        with monitor.counting("how well the rig is known") as bar:
+            training = measurement.without(run.hold_out)
+            rig = with_posterior(result.rig, training, result.field, result.settings, bar)
+        measurement = with_corrections(measurement, rig)
+        metrics["rig"] = rig
         write_cameras(out / CALIBRATION, [CalibratedCamera.from_camera(c) for c in measurement.cameras])
-        for line in moved_lines(result.rig):
+        for line in moved_lines(rig):
             monitor.say(line)
+        if run.hold_out:
+            unseen = calibrated.select(run.hold_out)
+            held = refit(result.field, unseen, result.settings, result.device)
+            mended = reproject(result.field, with_corrections(unseen, held), run.hold_out, result.device)
+            metrics |= {"rig_held_out": held, "views_refitted": evaluate_views(mended) if held else []}
     with monitor.counting("re-projecting") as bar:
         reprojection = reproject(result.field, measurement, run.hold_out, result.device, bar, result.model)
     views = evaluate_views(reprojection)
@@ -231,6 +239,8 @@ def _write(
     out.write_reprojection(reprojection)
     for line in score_lines(views):
         monitor.say(line)
+    for line in score_lines(metrics.get("views_refitted", [])):
+        monitor.say(f"{line}, its camera refined against the field")
     for accuracy in reprojection.accuracies:
         monitor.say(accuracy.sentence)
     monitor.say(

@@ -15,6 +15,7 @@ from nerif.experiment import target_poses, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.bundle import Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration import CalibrationSettings, calibrate
+from nerif.imaging.cameras_file import read_cameras
 from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
 
 TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)
@@ -80,6 +81,26 @@ def test_errors_are_about_what_is_stated():
     assert np.all(np.array(turns) < 3 * result.sigma_rotation)
     assert np.mean(turns) > 0.1 * result.sigma_rotation.mean()
     assert np.all(np.array(moves) < 3 * result.sigma_translation)
+
+
+def test_turns_and_shifts_of_cameras_are_about_their_pose_sigma():
+    """The mount is left out; what noise does to a camera about its own axes is what refinement goes by."""
+    result = dataclasses.replace(calibrate(pictures(0.05, poses=16), SETTINGS), mount=(0.0, 0.0))
+    off = []
+    for camera, found in zip(CAMERAS, result.cameras, strict=True):
+        turn = Rotation.from_matrix((camera.rotation @ found.rotation.T).numpy()).as_rotvec()
+        centre = -found.rotation.T @ found.translation
+        shift = found.rotation @ (camera.centre - centre)
+        off.append(np.concatenate([turn, shift.numpy()]) / found.pose_sigma.numpy())
+    assert np.abs(off).max() < 4
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.6
+
+
+def test_a_mount_adds_to_the_noise_and_is_kept_in_the_file(tmp_path):
+    exact = calibrate(pictures(), SETTINGS)
+    exact.write(tmp_path / "c.toml")
+    sigma = read_cameras(tmp_path / "c.toml")[0].camera((400, 500)).pose_sigma
+    assert sigma.tolist() == pytest.approx([np.radians(0.005)] * 3 + [0.05] * 3, rel=0.05)
 
 
 def test_without_background_pictures_there_is_no_plane_but_a_note():
@@ -229,7 +250,7 @@ def test_normal_equations_are_the_slope_of_the_cost(small):
 
 def test_adjustment_ends_in_a_minimum(small):
     bundle, observations = small
-    done, sigma = adjust(bundle, observations, noise=0.01)
+    done, covariance = adjust(bundle, observations, noise=0.01)
     layout = _Layout(done, observations, 0.01)
     x = layout.pack(done)
     least = layout.cost(x)
@@ -237,7 +258,7 @@ def test_adjustment_ends_in_a_minimum(small):
     rng = np.random.default_rng(0)
     spread = np.where(np.abs(x) > 0, np.abs(x), 1.0)
     assert all(layout.cost(x + 1e-4 * spread * rng.standard_normal(len(x))) > least for _ in range(20))
-    assert np.all(sigma[:, 9:] > 0)
+    assert np.all(np.diagonal(covariance, axis1=1, axis2=2)[:, 9:] > 0)
 
 
 def test_poses_are_put_one_after_the_other_and_undone():

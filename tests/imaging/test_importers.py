@@ -131,6 +131,20 @@ def test_a_calibration_keeps_the_lenses_and_is_given_some(tmp_path):
         ImportSettings(aperture_diameter=-1.0)
 
 
+def test_how_well_a_pose_is_known_is_said_or_taken_from_the_file_in_its_unit(tmp_path):
+    path = tmp_path / "c.toml"
+    write_cameras(path, [CalibratedCamera.from_camera(dataclasses.replace(ONE, pose_sigma=torch.arange(6).double()))])
+    (own,) = import_cameras(path, ImportSettings(scale_mm=10.0))
+    assert own.pose_sigma.tolist() == [0, 1, 2, 30, 40, 50]
+    (said,) = import_cameras(path, ImportSettings(pose_sigma_mm=0.3, pose_sigma_deg=0.01))
+    assert said.pose_sigma.tolist() == pytest.approx([np.radians(0.01)] * 3 + [0.3] * 3)
+    with pytest.raises(InputError, match="pose_sigma_mm, pose_sigma_deg: expected both or neither"):
+        ImportSettings(pose_sigma_mm=0.3)
+    with pytest.raises(InputError, match="pose_sigma_deg: expected a standard deviation of 0 or more, got -1"):
+        ImportSettings(pose_sigma_mm=0.3, pose_sigma_deg=-1.0)
+
+
+
 def test_what_is_not_known_is_asked_for(tmp_path):
     path = tmp_path / "c.toml"
     bare = CalibratedCamera("one", ONE.intrinsics, ONE.rotation, ONE.translation, ONE.distortion)

@@ -199,8 +199,11 @@ def test_line_integrals_of_a_ball_are_exact(kind, measured):
 @pytest.mark.parametrize("kind", OTHERS, ids=lambda k: k.name)
 def test_a_file_keeps_every_technique(kind, measured, tmp_path):
     m = measured[kind.name]
-    cameras = tuple(replace(c, lens=Lens(3.0, 700.0 + i)) for i, c in enumerate(m.cameras))
-    m = replace(m, cameras=cameras, about_views={"pose_sigma": torch.full((5, 6), 3.0).double()})
+    cameras = tuple(
+        replace(c, lens=Lens(3.0, 700.0 + i), pose_sigma=torch.full((6,), 3.0).double() if i else None)
+        for i, c in enumerate(m.cameras)
+    )
+    m = replace(m, cameras=cameras)
     m.write(tmp_path / "m.nc")
     back = Measurement.read(tmp_path / "m.nc")
     assert back.techniques == (kind,)
@@ -209,8 +212,8 @@ def test_a_file_keeps_every_technique(kind, measured, tmp_path):
     for name, value in m.maps.items():
         assert torch.equal(back.maps[name].nan_to_num(), value.nan_to_num())
     assert [camera.lens for camera in back.cameras] == [camera.lens for camera in cameras]
-    assert back.about_views["pose_sigma"].tolist() == [[3.0] * 6] * 5
-    assert back.select(back.names[:2]).about_views["pose_sigma"].shape == (2, 6)
+    assert back.cameras[0].pose_sigma is None
+    assert [camera.pose_sigma.tolist() for camera in back.cameras[1:]] == [[3.0] * 6] * 4
 
 
 @pytest.mark.parametrize("name", list(SIMULATED))
@@ -526,14 +529,10 @@ def test_measurements_that_cannot_be(measured):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_maps_and_notes_on_views_of_other_shapes_are_refused(measured):
+def test_maps_of_other_shapes_are_refused(measured):
     m = measured["absorption"]
     with pytest.raises(InputError, match=r"absorbance: expected \(view, row, column\) = .* got \(5, 18, 23, 1\)"):
         replace(m, maps={"absorbance": m.maps["absorbance"][..., None]})
-    with pytest.raises(InputError, match="about_views: expected names out of pose_sigma"):
-        replace(m, about_views={"aperture": torch.ones(5)})
-    with pytest.raises(InputError, match=r"about_views: expected pose_sigma of shape \(5, 6\), got \(5,\)"):
-        replace(m, about_views={"pose_sigma": torch.ones(5)})
 
 
 def test_a_technique_by_which_nothing_was_measured_is_none(balls):

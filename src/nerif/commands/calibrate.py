@@ -15,7 +15,7 @@ from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration import CalibrationSettings, calibrate_views, target_pictures
-from nerif.imaging.calibration_result import Calibration
+from nerif.imaging.calibration_result import MOUNT, Calibration
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
 from nerif.imaging.targets import CalibrationTarget
@@ -73,7 +73,8 @@ def run(settings: Calibrate) -> None:
         say(f"{settings.out}: {len(cameras)} cameras taken over from {settings.source}")
     else:
         check_file(settings.out, settings.force, rig, errors)
-        calibration = replace(_calibrate(settings), lens=settings.taken_over.lens)
+        given = settings.taken_over
+        calibration = replace(_calibrate(settings), lens=given.lens, mount=given.pose_sigma or MOUNT)
         cameras = calibration.cameras
         calibration.write(settings.out)
         _tell(calibration)

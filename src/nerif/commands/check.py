@@ -7,11 +7,12 @@ from pathlib import Path
 
 import tyro
 
-from nerif.commands.output import counting_bar, say
+from nerif.commands.output import MONITOR, counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.consistency import Consistency, check_consistency
 from nerif.conventions import InputError
 from nerif.measurement import Measurement
+from nerif.rig_check import RigCheck, check_rig
 
 __all__ = ["Check", "main", "run"]
 
@@ -30,12 +31,46 @@ class Check(Settings):
     """Measurement file."""
     voxels: int = 24
     """Of the quick reconstructions, along the longest edge of the box."""
+    refine: tuple[str, ...] = ()
+    """Look at the rig instead: refine cameras, shift, focal or background with a quick field, and say which view's
+    calibration is off by how much."""
+    pose_sigma_mm: float | None = None
+    """With --refine: how far cameras may be off, mm (standard deviation); else what the measurement says, or 0.2."""
+    pose_sigma_deg: float | None = None
+    """With --refine: by how much cameras may be turned, degrees; else what the measurement says, or 0.02."""
+    time_limit: float = 30.0
+    """With --refine: seconds in which the field is found."""
     strict: bool = False
     """Exit with code 1 if something is found."""
 
 
-def run(settings: Check) -> Consistency:
-    """Compare the views, and say what was found."""
+def run(settings: Check) -> Consistency | RigCheck:
+    """Compare the views, or refine their cameras, and say what was found."""
+    return _rig(settings) if settings.refine else _views(settings)
+
+
+def _rig(settings: Check) -> RigCheck:
+    if not settings.time_limit > 0:
+        raise InputError(f"time_limit: expected seconds above 0, got {settings.time_limit}")
+    sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg)
+    found = check_rig(Measurement.read(settings.measurement), settings.refine, settings.time_limit, *sigma, MONITOR)
+    heads = ("moved [sigma]", "aside [px]", "+- [px]", "told", "residual [sigma]")
+    say(f"{'view':<14}" + "".join(f"{head:>16}" for head in heads))
+    for row in found.table:
+        left = f"{row['rms_before']:.2f} -> {row['rms_after']:.2f}" if "rms_after" in row else "unknown"
+        aside = (f"{row['aside_px']:.3f}", f"{row['aside_sigma_px']:.3f}")
+        figures = (f"{row['moved']:.1f}", *aside, f"{row['told']:.0%}", left)
+        say(f"{row['name']:<14}" + "".join(f"{figure:>16}" for figure in figures))
+    for remark in found.remarks:
+        say(f"note: {remark}")
+    for finding in found.findings:
+        say(f"FOUND: {finding}")
+    if not found.findings:
+        say("no view is further off than its sigmas allow")
+    return found
+
+
+def _views(settings: Check) -> Consistency:
     if settings.voxels < 8:
         raise InputError(f"voxels: expected at least 8, got {settings.voxels}")
     measurement = Measurement.read(settings.measurement)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
 from torch import Tensor
 
@@ -82,8 +83,10 @@ def _measurement(path: Path, m: Measurement) -> None:
     for lens in sorted((lens for lens in lenses if lens.diameter), key=lambda lens: lens.diameter):
         focus = "their backgrounds" if lens.focus is None else f"{lens.focus:g} mm"
         say(f"  aperture       {lens.diameter:.4g} mm, focused on {focus}")
-    for name in m.about_views:
-        say(f"  {name:<14} known of the views")
+    sure = [c.pose_sigma for c in m.cameras if c.pose_sigma is not None]
+    if sure:
+        turn, shift = (float(torch.stack(sure)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
+        say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (--refine cameras goes by it)")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
     columns = "".join(f"{f'rms {o.label}':>24}" for o in m.observations)
     say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable{columns}")

@@ -51,6 +51,8 @@ class Camera:
     name : what the view is called
     projection : perspective or telecentric
     lens : Lens whose whole disc a pixel sees through; None for a thin ray a pixel
+    pose_sigma : (6,) standard deviations of its turn about its own axes (rad) and of the shift of its centre along them
+        (mm); None where they are not known
 
     Raises
     ------
@@ -67,6 +69,7 @@ class Camera:
     name: str = "camera"
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
+    pose_sigma: Float[Tensor, 6] | None = None
 
     def __post_init__(self) -> None:
         plane = self.background
@@ -110,7 +113,11 @@ class Camera:
                 f"image_size of view '{self.name}': expected (height, width) between 1 and {LARGEST_IMAGE} px, "
                 f"got {self.image_size}"
             )
-
+        if self.pose_sigma is not None and not bool(((self.pose_sigma >= 0) & (self.pose_sigma < torch.inf)).all()):
+            raise InputError(
+                f"pose_sigma of view '{self.name}': expected standard deviations of 0 or more, got "
+                f"{self.pose_sigma.tolist()}"
+            )
         if self.lens is not None and self.lens.diameter > 0:
             self._check_focus(self.lens)
 

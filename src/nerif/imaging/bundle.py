@@ -25,7 +25,7 @@ from nerif.geometry import PERSPECTIVE, Projection
 from nerif.geometry.distortion import POWERS, distort
 from nerif.imaging.targets import Detection
 
-__all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust"]
+__all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust", "crossing"]
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 HUBER = 5  # times the noise of a point: where the loss turns linear
@@ -68,6 +68,17 @@ class Pose:
         import cv2
 
         return np.concatenate([cv2.Rodrigues(self.rotation)[0].ravel(), self.translation])
+
+    @property
+    def turn_by_vector(self) -> Float[np.ndarray, "3 3"]:
+        """How far about its own axes the pose turns with its rotation vector v, R(v + dv) = exp([T dv]x) R(v).
+
+        T = sin a / a + (1 - sin a / a) v v^T / a^2 + (1 - cos a) / a^2 [v]x,     a = |v|
+        """
+        v = self.vector[:3]
+        a = max(float(np.linalg.norm(v)), 1e-9)
+        share = np.sin(a) / a
+        return share * np.eye(3) + (1 - share) * np.outer(v, v) / a**2 + (1 - np.cos(a)) / a**2 * crossing(v)
 
     @classmethod
     def of_vector(cls, vector: np.ndarray) -> Pose:
@@ -162,8 +173,8 @@ class Bundle:
 
 def adjust(
     bundle: Bundle, observations: Sequence[Observation], noise: float, iterations: int = 100
-) -> tuple[Bundle, Float[np.ndarray, "camera 15"]]:
-    """Return the adjusted bundle, and the standard deviation of every camera's parameters.
+) -> tuple[Bundle, Float[np.ndarray, "camera 15 15"]]:
+    """Return the adjusted bundle, and the covariance of every camera's parameters.
 
     Parameters
     ----------
@@ -172,8 +183,8 @@ def adjust(
     noise : of a point, px: what the priors are weighed against, and where Huber's loss turns linear (times HUBER)
     iterations : at most
 
-    The standard deviations (9 intrinsics, rotation vector in rad, translation in mm) come from the curvature of the sum
-    and the residual left; they know noise, not a target that is not flat.
+    The covariances (9 intrinsics, turn about the camera's own axes in rad, translation in mm) come from the curvature
+    of the sum and the residual left; they know noise, not a target that is not flat.
     """
     from scipy.linalg import cho_factor, cho_solve
 
@@ -199,7 +210,18 @@ def adjust(
     inverse = np.linalg.pinv(curvature / scale[:, None] / scale, rcond=UNSEEN, hermitian=True)
     covariance = inverse / scale[:, None] / scale
     variance = left / max(count - len(x), 1)
-    return layout.unpack(x), layout.per_camera(np.sqrt(np.maximum(np.diag(covariance), 0) * variance))
+    done, blocks = layout.unpack(x), layout.per_camera(covariance * variance)
+    for camera, block in zip(done.cameras, blocks, strict=True):
+        turn = np.eye(INTRINSIC + POSE)
+        turn[INTRINSIC : INTRINSIC + 3, INTRINSIC : INTRINSIC + 3] = camera.turn_by_vector
+        block[:] = turn @ block @ turn.T
+    return done, blocks
+
+
+def crossing(vector: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
+    """Return [v]x, by which v x a = [v]x a."""
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def _scale(curvature: np.ndarray) -> np.ndarray:
@@ -290,11 +312,11 @@ class _Layout:
         likely = np.concatenate([PRINCIPAL * widths.repeat(2, axis=1), DISTORTION / unit ** np.array(POWERS)], axis=1)
         return np.asarray(self.noise / likely)
 
-    def per_camera(self, x: np.ndarray) -> np.ndarray:
-        """Entries that belong to cameras, with 0 for intrinsics that are not adjusted."""
-        result = np.zeros((len(self.bundle.cameras), INTRINSIC + POSE))
+    def per_camera(self, matrix: np.ndarray) -> np.ndarray:
+        """The blocks of a matrix that belong to cameras, with 0 for intrinsics that are not adjusted."""
+        at = np.concatenate([self.free, INTRINSIC + np.arange(POSE)])
+        result = np.zeros((len(self.bundle.cameras), INTRINSIC + POSE, INTRINSIC + POSE))
         for i in range(len(result)):
-            own = x[i * self.block : (i + 1) * self.block]
-            result[i, self.free] = own[: len(self.free)]
-            result[i, INTRINSIC:] = own[len(self.free) :]
+            own = slice(i * self.block, (i + 1) * self.block)
+            result[i][np.ix_(at, at)] = matrix[own, own]
         return result

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from nerif.conventions import FACES, InputError
 from nerif.geometry import Projection, projection_named
-from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust
+from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
 from nerif.imaging.calibration_result import Calibration
 from nerif.imaging.first_guess import first_guess
 from nerif.imaging.targets import CalibrationTarget, ViewPictures
@@ -154,9 +154,9 @@ def calibrate(
     kept = [o for o, k in zip(observations, keep, strict=True) if k]
     _check_poses(views, kept)
     noise = float(np.median([bundle.rms(o) for o in kept])) / np.sqrt(2)
-    bundle, sigma = adjust(bundle, kept, max(noise, LEAST_NOISE))
-    bundle = _to_world(_on_the_right_side(bundle, settings, names), settings)
-    result = Calibration.of(names, bundle, sigma, observations, keep, background_distance)
+    bundle, covariance = adjust(bundle, kept, max(noise, LEAST_NOISE))
+    bundle, covariance = _to_world(_on_the_right_side(bundle, settings, names), covariance, settings)
+    result = Calibration.of(names, bundle, covariance, observations, keep, background_distance)
     result.check(settings.max_error)
     return result
 
@@ -196,10 +196,18 @@ def _on_the_right_side(bundle: Bundle, settings: CalibrationSettings, names: Seq
     return bundle if here > there else other
 
 
-def _to_world(bundle: Bundle, settings: CalibrationSettings) -> Bundle:
+def _to_world(
+    bundle: Bundle, covariance: Float[np.ndarray, "camera 15 15"], settings: CalibrationSettings
+) -> tuple[Bundle, Float[np.ndarray, "camera 15 15"]]:
     """From the frame of the fixed target to the world that was asked for; a depth that does not show is 0 there."""
-    move = Pose(settings.rotation, np.array(settings.origin))
-    cameras = [c @ move.inverse for c in bundle.cameras]
-    if not bundle.projection.shows_depth:
-        cameras = [replace(c, translation=c.translation * (1, 1, 0)) for c in cameras]
-    return replace(bundle, cameras=tuple(cameras), poses=tuple(move @ p for p in bundle.poses))
+    move, shows = Pose(settings.rotation, np.array(settings.origin)), np.diag([1, 1, bundle.projection.shows_depth])
+    cameras, moved = [], []
+    for camera, block in zip(bundle.cameras, covariance, strict=True):
+        there = camera @ move.inverse
+        follows = np.eye(len(block))  # t' = t + R m, which turns with the camera
+        follows[-3:, -6:-3] = -shows @ crossing(there.translation - camera.translation)
+        follows[-3:, -3:] = shows
+        cameras.append(replace(there, translation=shows @ there.translation))
+        moved.append(follows @ block @ follows.T)
+    poses = tuple(move @ p for p in bundle.poses)
+    return replace(bundle, cameras=tuple(cameras), poses=poses), np.stack(moved)

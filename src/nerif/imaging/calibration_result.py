@@ -13,11 +13,13 @@ from jaxtyping import Float
 
 from nerif.conventions import InputError
 from nerif.geometry import PERSPECTIVE, Lens, Plane, Projection
-from nerif.imaging.bundle import Bundle, Observation, Pose
+from nerif.imaging.bundle import Bundle, Observation, Pose, crossing
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 
-__all__ = ["Calibration", "FittedPlane", "ImageError"]
+__all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError"]
 
+MOUNT = 0.05, 0.005
+"""How far a camera may have been moved (mm) and turned (degrees) since it was calibrated, where nobody says."""
 COVERED = 0.4  # of the picture: with less, distortion is not known at its edges
 FOCAL_KNOWN = 0.01  # of the focal length: a larger standard deviation is told
 PLANE_FLAT = 0.005  # of the distance: a background that is less flat is none
@@ -76,6 +78,8 @@ class Calibration:
     residuals : (camera) arrays (n, 4) of u, v and the residual in u, v, px: to be drawn
     projection : of all cameras
     lens : of all cameras, or None for thin rays
+    pose_sigma : (camera, 6) of a Camera, from noise alone, or None
+    mount : how far cameras may have been moved or turned since, mm and degrees, beside the noise
     """
 
     names: tuple[str, ...]
@@ -90,10 +94,12 @@ class Calibration:
     residuals: tuple[np.ndarray, ...]
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
+    pose_sigma: Float[np.ndarray, "camera 6"] | None = None
+    mount: tuple[float, float] = MOUNT
 
     @classmethod
     def of(
-        cls, names: Sequence[str], bundle: Bundle, sigma: Float[np.ndarray, "camera 15"],
+        cls, names: Sequence[str], bundle: Bundle, covariance: Float[np.ndarray, "camera 15 15"],
         observations: Sequence[Observation], used: Sequence[bool], background_distance: float | None = None,
     ) -> Calibration:  # fmt: skip
         """Sum up an adjusted bundle.
@@ -102,7 +108,7 @@ class Calibration:
         ----------
         names : of the cameras
         bundle : adjusted, in the world frame
-        sigma : standard deviations of every camera's parameters (bundle.adjust)
+        covariance : of every camera's parameters (bundle.adjust)
         observations : all points found
         used : which observations the adjustment took
         background_distance : where no target was laid, of a plane across the optical axis, behind the origin, mm
@@ -117,6 +123,7 @@ class Calibration:
             residuals.append(np.concatenate([np.hstack([o.detection.pixels, bundle.residual(o)]) for o in own]))
             laid = [bundle.poses[o.pose].moved(o.detection.points) for o in own if o.on_background]
             backgrounds.append(_background(bundle.cameras[i], laid, background_distance))
+        sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
         return cls(
             names=tuple(names),
             sizes=bundle.sizes,
@@ -129,6 +136,7 @@ class Calibration:
             sigma_focal=sigma[:, 0] / bundle.intrinsics[:, 0],
             residuals=tuple(residuals),
             projection=bundle.projection,
+            pose_sigma=np.stack([_pose_sigma(*one) for one in zip(bundle.cameras, covariance[:, 9:, 9:], strict=True)]),
         )
 
     def rms(self, camera: str | None = None) -> float:
@@ -143,7 +151,7 @@ class Calibration:
 
     def _camera(self, i: int) -> CalibratedCamera:
         fx, fy, cx, cy = (float(v) for v in self.intrinsics[i, :4])
-        plane = self.backgrounds[i]
+        plane, mount = self.backgrounds[i], np.repeat([np.radians(self.mount[1]), self.mount[0]], 3)
         return CalibratedCamera(
             name=self.names[i],
             intrinsics=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
@@ -154,6 +162,7 @@ class Calibration:
             background=None if plane is None else Plane(torch.tensor(plane.normal, dtype=torch.float64), plane.offset),
             projection=self.projection,
             lens=self.lens,
+            pose_sigma=None if self.pose_sigma is None else torch.from_numpy(np.hypot(self.pose_sigma[i], mount)),
         )
 
     @property
@@ -228,6 +237,13 @@ class Calibration:
             "notes": list(self.notes),
         }
         write_cameras(path, self.cameras, about)
+
+
+def _pose_sigma(camera: Pose, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, 6]:
+    """Standard deviations of the turn w and of the shift c of the centre along the camera's axes, c = w x t - dt."""
+    to = np.eye(6)
+    to[3:, :3], to[3:, 3:] = -crossing(camera.translation), -np.eye(3)
+    return np.sqrt(np.maximum(np.diag(to @ covariance @ to.T), 0))
 
 
 def _background(camera: Pose, laid: Sequence[np.ndarray], distance: float | None) -> FittedPlane | None:

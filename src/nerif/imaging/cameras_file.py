@@ -11,6 +11,7 @@ rotation = [[...], [...], [...]]        # world to camera
 translation = [tx, ty, tz]              # mm
 aperture_diameter = 6.25                # mm, of the entrance pupil; may be left out: thin rays
 focus_distance = 1200.0                 # mm along the optical axis; may be left out: focused on the background
+pose_sigma = [rx, ry, rz, cx, cy, cz]   # standard deviations of turn (rad) and centre (mm); may be left out
 [camera.background]                     # normal . x = offset; may be left out
 normal = [nx, ny, nz]
 offset = -500.0                         # mm
@@ -39,7 +40,7 @@ __all__ = [
 
 FORMAT = "nerif-calibration-1"
 KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotation", "translation", "background",
-        "aperture_diameter", "focus_distance")  # fmt: skip
+        "aperture_diameter", "focus_distance", "pose_sigma")  # fmt: skip
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
 """Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
 
@@ -59,6 +60,7 @@ class CalibratedCamera:
     background : Plane, world frame, mm, or None
     projection : perspective or telecentric
     lens : Lens, or None for thin rays
+    pose_sigma : (6,) that of a Camera, or None
     """
 
     name: str
@@ -70,6 +72,7 @@ class CalibratedCamera:
     background: Plane | None = None
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
+    pose_sigma: Float[Tensor, 6] | None = None
 
     def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
         """Return the whole camera; without a background if none is known.
@@ -84,7 +87,7 @@ class CalibratedCamera:
             raise InputError(f"view '{self.name}' has no image size in its calibration; give --image-size HEIGHT WIDTH")
         return Camera(
             self.intrinsics, self.rotation, self.translation, image_size, background, self.distortion, self.name,
-            self.projection, self.lens,
+            self.projection, self.lens, self.pose_sigma,
         )  # fmt: skip
 
     @classmethod
@@ -93,6 +96,7 @@ class CalibratedCamera:
         return cls(
             camera.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion,
             camera.image_size, camera.background, camera.projection, camera.lens,
+            camera.pose_sigma,
         )  # fmt: skip
 
 
@@ -219,6 +223,8 @@ def write_cameras(
             table["aperture_diameter"] = camera.lens.diameter
             if camera.lens.focus is not None:
                 table["focus_distance"] = camera.lens.focus
+        if camera.pose_sigma is not None:
+            table["pose_sigma"] = camera.pose_sigma.tolist()
         if camera.background is not None:
             table["background"] = {"normal": camera.background.normal.tolist(), "offset": camera.background.offset}
         tables.append(table)
@@ -266,6 +272,7 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
         background=None if given is None else plane(given["normal"], given["offset"], f"{where}: background"),
         projection=projection_named(table.get("projection", PERSPECTIVE.name), f"{where}: projection"),
         lens=_lens(table, where),
+        pose_sigma=numbers(table["pose_sigma"], (6,), f"{where}: pose_sigma") if "pose_sigma" in table else None,
     )
     return checked(camera, path)
 

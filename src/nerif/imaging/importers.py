@@ -6,6 +6,7 @@ of the first pixel, world to camera, mm.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,13 +47,31 @@ class ImportSettings:
     lenses of the cone where it passes z_cam = 0, which calibration has at the origin. From target pictures too."""
     focus_distance: float | None = None
     """Where the lenses are focused, mm along the optical axis; default: on the background."""
+    pose_sigma_mm: float | None = None
+    """How far a camera may stand from where its calibration has it, mm (standard deviation; reconstruct --refine goes
+    by it); of target pictures beside their noise, 0.05 by default."""
+    pose_sigma_deg: float | None = None
+    """How far a camera may be turned from how its calibration has it, degrees; of target pictures 0.005 by default."""
 
     def __post_init__(self) -> None:
         if self.focus_distance is not None and self.aperture_diameter is None:
             raise InputError("focus_distance: expected together with aperture_diameter, got it alone")
         _ = self.lens
+        for name in ("pose_sigma_mm", "pose_sigma_deg"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < math.inf:
+                raise InputError(f"{name}: expected a standard deviation of 0 or more, got {value}")
+        if (self.pose_sigma_mm is None) != (self.pose_sigma_deg is None):
+            raise InputError("pose_sigma_mm, pose_sigma_deg: expected both or neither")
         if not self.scale_mm > 0:
             raise InputError(f"scale_mm: expected a positive number, got {self.scale_mm}")
+
+    @property
+    def pose_sigma(self) -> tuple[float, float] | None:
+        """The standard deviations of where cameras stand and how they are turned, mm and degrees; None if not said."""
+        if self.pose_sigma_mm is None or self.pose_sigma_deg is None:
+            return None
+        return self.pose_sigma_mm, self.pose_sigma_deg
 
     @property
     def lens(self) -> Lens | None:
@@ -124,6 +143,12 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
     if not camera.projection.shows_depth:  # (x, y) are lengths of the file's unit
         intrinsics[:2, :2] /= scale
         distortion = distortion / scale ** torch.tensor(POWERS)
+    sigma = camera.pose_sigma
+    if sigma is not None:
+        sigma = torch.cat([sigma[:3], scale * sigma[3:]])
+    if settings.pose_sigma is not None:
+        shift, turn = settings.pose_sigma
+        sigma = torch.tensor([math.radians(turn)] * 3 + [shift] * 3, dtype=torch.float64)
     return replace(
         camera,
         intrinsics=intrinsics,
@@ -132,4 +157,5 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
         image_size=camera.image_size or settings.image_size,
         background=plane,
         lens=settings.lens or _scaled(camera.lens, scale),
+        pose_sigma=sigma,
     )

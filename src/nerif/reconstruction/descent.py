@@ -3,6 +3,8 @@
 What is left of the measurement is always judged by single pixels, for the noise of neighbours may be alike: a bin of
 them then has more than its share of it.
 
+A rig is refined between solutions (refinement.py): on each level the field follows ROUNDS times.
+
 A method without a penalty is kept from the noise by stopping alone, so on coarse grids, whose residual never comes down
 to the noise, it goes on as soon as it gains little.
 """
@@ -21,6 +23,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
+from nerif.geometry import Rays
 from nerif.measurement import Measurement
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
@@ -31,9 +34,10 @@ from nerif.reconstruction.gauge import ambient_faces, check_gauge, visual_hull
 from nerif.reconstruction.levels import Level, coarser, levels
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
+from nerif.reconstruction.refinement import MOMENTUM, Refinement, drawn
 from nerif.reconstruction.some_pixels import some_pixels
 from nerif.reconstruction.sources import of_source
-from nerif.reconstruction.target import Target
+from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.weight import FIRST, choose_weight
 
 if TYPE_CHECKING:
@@ -45,7 +49,11 @@ JUDGES = 1 << 16  # pixels, about, by whom the rest is judged: their mean square
 ROUGHLY = 10  # times the tolerance, for trials and for what is there to start from
 EARLY = 100  # times the tolerance, for what is there to start from, where nothing but an early end keeps the noise out
 TRIALS = 8  # weights that are tried on a grid, about
-KEPT = ("level", "done", "total", "weight", "guess", "chosen")  # of a run, in a checkpoint
+WHILE_REFINED = 0.1  # of FIRST: the weight while a rig is refined and none is chosen yet
+ROUNDS = 20  # times that a rig is refined on a level, the field following
+CALM = 5  # of them at the end without momentum
+FOLLOWING = 8  # iterations in which the field follows
+KEPT = ("level", "round", "done", "total", "weight", "guess", "chosen")  # of a run, in a checkpoint
 
 
 class _Stop(Exception):
@@ -89,7 +97,11 @@ class Descent:
         self.history: list[dict[str, float]] = []
         # a field to start from makes the coarse grids needless
         first = [level.grid for level in self.levels].index(finest)
-        self.level, self.done, self.total = 0 if start is None else first, 0, 0
+        self.level, self.round, self.done, self.total = 0 if start is None else first, 0, 0, 0
+        self.rig = None
+        if settings.refine:
+            sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg, settings.shift_sigma_px)
+            self.rig = Refinement.asked(measurement, settings.refine, *sigma)
         # a weight is sought on the last grid but one and mended on the last; where there is no other, sought at the end
         self.choosing = (first - 1, first if first and start is None else len(self.levels) - 1)
         self.weight = settings.weight
@@ -109,6 +121,9 @@ class Descent:
             while True:
                 problem, judge = self._problems(self.here)
                 x = self._begin(problem)
+                if self.rig is not None and self.round < ROUNDS:
+                    self._refine(self.rig, problem, judge, x)
+                    continue
                 if self.weight is None and self.level in self.choosing:
                     x = self._choose(problem, judge, x)
                 weight = self.guess if self.weight is None else self.weight
@@ -118,7 +133,7 @@ class Descent:
                 _, converged = self._solve(problem, judge, x, FIRST if weight is None else weight, tolerance)
                 if at_last:
                     return self._result(self._outcome(converged))
-                self.level, self.done = self.level + 1, 0
+                self.level, self.round, self.done = self.level + 1, 0, 0
         except _Stop as stop:
             return self._result(Outcome(*stop.args))
 
@@ -141,6 +156,23 @@ class Descent:
         if noise is None or self.level == self.choosing[-1]:
             self.weight = choice.weight
         return choice.x
+
+    def _refine(self, rig: Refinement, problem: Problem, judge: Problem | None, x: Tensor) -> None:
+        """Let the field follow the rig for a while, then move the rig by a step."""
+        weight = next((w for w in (self.weight, self.guess) if w is not None), FIRST * WHILE_REFINED)
+        tolerance = ROUGHLY * self.settings.tolerance
+        if not self.done:
+            self.done = max(0, self.settings.iterations - FOLLOWING * (1 + 2 * (self.round == 0)))
+        found, _ = self._solve(problem, judge, x, weight, tolerance)
+
+        def predict(part: Part, rays: Rays) -> Tensor:
+            operator = next(o for o, p in zip(problem.operators, self.last.parts, strict=True) if p.model is part.model)
+            return operator.for_rays(rays, part.model)(found.x * self.scale)
+
+        momentum = MOMENTUM if self.round < ROUNDS - CALM else 0.0
+        parts = drawn(self.last, len(self.measurement.names), self.round)
+        rig.step(parts, predict, self.last.sigma_known, momentum)
+        self.round, self.done = self.round + 1, 0
 
     def _begin(self, problem: Problem) -> Tensor:
         """Where to start on a grid: a checkpoint, a given field, the solution on the grid before, or nothing."""
@@ -181,6 +213,8 @@ class Descent:
     def _problem(self, level: Level, target: Target) -> Problem:
         settings, boundary, grid = self.settings, Boundary(self.faces), level.grid
         dtype = getattr(torch, settings.precision)
+        if self.rig is not None:
+            target = replace(target, parts=tuple(self.rig.of(part) for part in target.parts))
         operators = [
             VoxelOperator(part.rays, grid, part.model, settings.basis, boundary, settings.step, self.device, dtype)
             for part in target.parts
@@ -265,7 +299,8 @@ class Descent:
         scalars: dict[str, Any] = {name: getattr(self, name) for name in KEPT}
         scalars |= {"method": type(self.settings).__name__, "seconds": self.seconds, "history": list(self.history)}
         scalars["fingerprint"] = self.fingerprint
-        return State({"x": self.x.detach().clone()}, scalars)
+        rig = {} if self.rig is None else {f"rig.{name}": value for name, value in self.rig.kept().items()}
+        return State({"x": self.x.detach().clone(), **rig}, scalars)
 
     def _restore(self, state: State) -> None:
         scalars, shapes = dict(state.scalars), [level.grid.shape for level in self.levels]
@@ -278,6 +313,8 @@ class Descent:
         ):
             raise InputError("resume: the checkpoint is of another method or grid; give the same settings")
         self.x = state.tensors["x"].clone()
+        if self.rig is not None:
+            self.rig.restore({name: state.tensors[f"rig.{name}"] for name in self.rig.kept()})
         self.spent, self.started = scalars.pop("seconds"), time.perf_counter()
         self.history = list(scalars.pop("history"))
         for name, value in scalars.items():
@@ -311,6 +348,7 @@ class Descent:
             device=str(self.device),
             state=self._capture(),
             quantity=self.measurement.quantity,
+            rig=[] if self.rig is None else self.rig.table(),
         )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement
 
-__all__ = ["Level", "bins_at_last", "coarser", "levels", "pixels_in_a_voxel"]
+__all__ = ["Level", "bins_at_last", "bins_of", "coarser", "levels", "pixels_in_a_voxel"]
 
 COARSEST = 12  # voxels along the longest edge of the first grid, at least
 WHILE_COARSE = 1.25  # voxels: edge of bins from which a method goes on to finer ones
@@ -57,6 +57,11 @@ def _grids(box: Box, voxels: int, degree: int, coarse_to_fine: bool) -> list[Gri
 def bins_at_last(measurement: Measurement, grid: Grid) -> int:
     """Return the edge of the bins of pixels that the last iterations on a grid take, px."""
     return _bins(measurement, grid, AT_LAST)
+
+
+def bins_of(measurement: Measurement, grid: Grid) -> int:
+    """Return the edge of the bins of pixels that go with a grid that stays coarse, px."""
+    return _bins(measurement, grid, WHILE_COARSE)
 
 
 def _bins(measurement: Measurement, grid: Grid, share: float) -> int:

@@ -118,7 +118,7 @@ class Problem:
         root = math.sqrt(target.numbers)
         self._inverse = [(part.inverse_scale / root).to(operator.device, operator.dtype) for part in target.parts]
         self.data = self._joined(
-            [inverse * part.measured.to(inverse) for inverse, part in zip(self._inverse, target.parts, strict=True)]
+            [inverse * part.of_field.to(inverse) for inverse, part in zip(self._inverse, target.parts, strict=True)]
         )
         self.bounds = None if bounds is None else (bounds[0] / self.scale, bounds[1] / self.scale)
 

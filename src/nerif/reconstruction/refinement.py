@@ -14,7 +14,8 @@ they tell less than the prior does, the prior holds (docs/refinement.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,9 +27,9 @@ from nerif.conventions import InputError
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.measurement import Measurement
-from nerif.reconstruction.target import Part
+from nerif.reconstruction.target import Part, Target
 
-__all__ = ["NAMES", "PICTURE", "REFINED", "UNITS", "Refinement", "check_refined", "moved_lines", "with_corrections"]
+__all__ = ["NAMES", "PICTURE", "REFINED", "UNITS", "Refinement", "check_refined", "displaced", "drawn", "refined_words"]
 
 PICTURE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
 """Displacement of a whole picture, px: constant, and growing from the middle to the edge along columns and rows."""
@@ -37,12 +38,14 @@ UNITS = (*("rad",) * 3, *("mm",) * 3, "1", "mm", *("px",) * 6)
 REFINED = {"cameras": range(6), "focal": range(6, 7), "background": range(7, 8), "shift": range(8, 14)}
 """What can be refined, and which of NAMES it is."""
 
+POSE_SIGMA = 0.2, 0.02  # mm, degrees
 ZOOM_SIGMA, BACKGROUND_SIGMA = 1e-3, 0.5  # of a focal length, as a share; mm
 LINEAR = 0.2  # of the shift: what turn and zoom of a shaken camera move its edge by
 STEP_PX = 0.3  # by which rays move at the middle of the box, to see what changes
 ALIKE = 20.0  # neighbours that what is not understood is alike in
 MOMENTUM = 0.6
-MOVED = 3.0  # sigma, by which a view counts as moved
+DRAWN = 150  # pixels a view, for a step
+UNTOLD = 0.05  # share that a movement has in the mean of all which no data tell
 
 Predict = Callable[[Part, Rays], Float[Tensor, "n k"]]
 """Gives the path integral of the field that is there, along rays of a part."""
@@ -53,7 +56,7 @@ def refined_words(refine: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(word for given in refine for word in given.replace(",", " ").split()))
 
 
-def check_refined(refine: Sequence[str], mm: float, deg: float, px: float) -> None:
+def check_refined(refine: Sequence[str], mm: float | None, deg: float | None, px: float) -> None:
     """Refuse what cannot be refined, and standard deviations that are none.
 
     Raises
@@ -65,7 +68,7 @@ def check_refined(refine: Sequence[str], mm: float, deg: float, px: float) -> No
         if word not in REFINED:
             raise InputError(f"refine: expected some of {', '.join(REFINED)}, got '{word}'")
     for name, value in (("pose_sigma_mm", mm), ("pose_sigma_deg", deg), ("shift_sigma_px", px)):
-        if not 0 < value < 1e6:
+        if value is not None and not 0 < value < 1e6:
             raise InputError(f"{name}: expected a standard deviation above 0, got {value}")
 
 
@@ -77,10 +80,13 @@ class Refinement:
     cameras : as they were calibrated
     box : of the field, mm
     sigma : (view, 14) standard deviation of each of NAMES; 0 for one that is not refined
+    gauged : whether the field moves with the cameras, so that their rigid motion has to be taken out
     """
 
-    def __init__(self, cameras: Sequence[Camera], box: Box, sigma: Float[Tensor, "view 14"]) -> None:
-        self.cameras, self.box, self.sigma = tuple(cameras), box, sigma.double()
+    def __init__(
+        self, cameras: Sequence[Camera], box: Box, sigma: Float[Tensor, "view 14"], gauged: bool = True
+    ) -> None:
+        self.cameras, self.box, self.sigma, self.gauged = tuple(cameras), box, sigma.double(), gauged
         self.values, self.velocity = torch.zeros_like(self.sigma), torch.zeros_like(self.sigma)
         self.done = 0
         """Steps in this cycle of a run."""
@@ -90,28 +96,29 @@ class Refinement:
         self._corrections = self._of(self.values)
 
     @classmethod
-    def asked(cls, measurement: Measurement, refine: Sequence[str], mm: float, deg: float, px: float) -> Refinement:
+    def asked(
+        cls, measurement: Measurement, refine: Sequence[str], mm: float | None = None, deg: float | None = None,
+        px: float = 0.05, gauged: bool = True,
+    ) -> Refinement:  # fmt: skip
         """Return the refinement of some of REFINED.
 
         Parameters
         ----------
-        mm, deg, px : standard deviations of where cameras stand, how they are turned and by how much pictures are
-            shifted, where the measurement does not know its pose_sigma
+        mm, deg : standard deviations of where cameras stand and how they are turned; None for those that the cameras
+            know of themselves, or POSE_SIGMA where they do not
+        px : by how much pictures are shifted
+        gauged : as for the class
 
         Raises
         ------
         InputError
             If nothing measured can tell of a shift.
         """
-        words, views = refined_words(refine), len(measurement.cameras)
-        whole = torch.tensor(
-            [*[torch.pi / 180 * deg] * 3, *[mm] * 3, ZOOM_SIGMA, BACKGROUND_SIGMA, px, px, *[LINEAR * px] * 4],
-            dtype=torch.float64,
-        ).repeat(views, 1)
-        if "pose_sigma" in measurement.about_views:
-            whole[:, :6] = measurement.about_views["pose_sigma"]
-        if not bool((whole >= 0).all()) or ("cameras" in words and not bool(whole[:, :6].any())):
-            raise InputError("pose_sigma: expected standard deviations of 0 or more, some above 0 to refine cameras")
+        words = refined_words(refine)
+        rest = torch.tensor([ZOOM_SIGMA, BACKGROUND_SIGMA, px, px, *[LINEAR * px] * 4], dtype=torch.float64)
+        whole = torch.stack([torch.cat([_pose_sigma(camera, mm, deg), rest]) for camera in measurement.cameras])
+        if "cameras" in words and not bool(whole[:, :6].any()):
+            raise InputError("pose_sigma: expected some standard deviations above 0 to refine cameras, got none")
         if "shift" in words and any(not kind.windowed for kind in measurement.techniques):
             names = " and ".join(o.technique.measured for o in measurement.observations)
             raise InputError(
@@ -122,7 +129,26 @@ class Refinement:
         open_ = torch.zeros(len(NAMES), dtype=torch.bool)
         for word in words:
             open_[list(REFINED[word])] = True
-        return cls(measurement.cameras, measurement.box, torch.where(open_, whole, 0.0))
+        return cls(measurement.cameras, measurement.box, torch.where(open_, whole, 0.0), gauged)
+
+    @classmethod
+    def of_table(
+        cls, measurement: Measurement, settings: Mapping[str, Any], table: Sequence[dict[str, Any]], gauged: bool = True
+    ) -> Refinement:
+        """Return the refinement that settings ask for, at the numbers of a table.
+
+        Parameters
+        ----------
+        settings : refine, pose_sigma_mm, pose_sigma_deg and shift_sigma_px, by their names
+        table : of the views of the measurement
+        """
+        sigma = (settings["pose_sigma_mm"], settings["pose_sigma_deg"], settings["shift_sigma_px"])
+        found = cls.asked(measurement, settings["refine"], *sigma, gauged=gauged)
+        for v, row in enumerate(table):
+            for name, value in row["values"].items():
+                found.values[v, NAMES.index(name)] = value
+        found._corrections = found._of(found.values)
+        return found
 
     # -- what follows from the numbers ---------------------------------------------------------------------------
 
@@ -151,14 +177,35 @@ class Refinement:
         return replace(part, rays=replace(moved, view=part.rays.view), offset=self._offset(self.values, rays))
 
     def table(self) -> list[dict[str, Any]]:
-        """Return for each view the refined numbers by their names, and how far it moved, in its sigmas."""
+        """Return for each view the refined numbers by their names, and how far it moved: by how many pixels what it
+        shows of the middle of the box did, and in sigmas, those of that or of the number that moved furthest.
+        """
         rows = []
-        for camera, value, sigma in zip(self.cameras, self.values, self.sigma, strict=True):
-            numbers = {NAMES[i]: float(value[i]) for i in self.columns}
-            held = {NAMES[i]: float(sigma[i]) for i in self.columns}
+        for v, (camera, after) in enumerate(zip(self.cameras, self.corrected, strict=True)):
+            value, sigma = self.values[v], self.sigma[v]
+            aside = self._middle_at(after) - self._middle_at(camera) + value[len(GEOMETRY) :][:2]
+            held = self.aside(v) * sigma[self.columns]
+            looks = float((aside @ torch.linalg.pinv(held @ held.T, hermitian=True) @ aside).clamp(min=0).sqrt())
             most = max((abs(float(value[i] / sigma[i])) for i in self.columns if sigma[i] > 0), default=0.0)
-            rows.append({"name": camera.name, "moved": most, "values": numbers, "sigma": held})
+            row = {"name": camera.name, "moved": max(most, looks), "aside_px": float(aside.norm())}
+            numbers = {NAMES[i]: float(value[i]) for i in self.columns}
+            rows.append({**row, "values": numbers, "sigma": {NAMES[i]: float(sigma[i]) for i in self.columns}})
         return rows
+
+    def aside(self, view: int) -> Float[Tensor, "2 k"]:
+        """Return by how many pixels what a view shows of the middle of the box moves with each number refined of it."""
+        steps, slopes = self._steps()[view], []
+        here = self._middle_at(self.cameras[view])
+        for i in self.columns:
+            change = torch.zeros(len(NAMES), dtype=torch.float64)
+            change[i] = steps[i]
+            moved = Corrections(self.cameras[view : view + 1], change[None, : len(GEOMETRY)]).corrected[0]
+            slopes.append((self._middle_at(moved) - here + change[len(GEOMETRY) :][:2]) / steps[i])
+        return torch.stack(slopes, dim=1)
+
+    def _middle_at(self, camera: Camera) -> Float[Tensor, 2]:
+        """Where a camera shows the middle of the box, px."""
+        return camera.project(torch.tensor([self.box.centre], dtype=camera.rotation.dtype))[0].double()
 
     # -- steps ---------------------------------------------------------------------------------------------------
 
@@ -184,26 +231,20 @@ class Refinement:
         change = torch.zeros_like(self.values)
         change[:, self.columns] = sigma * torch.einsum("vij,vj->vi", ways, move)
         self.velocity = momentum * self.velocity + change
-        self.values = self._centred(self.values + self.velocity)
+        counts = (told / (1 + told)).clamp(min=UNTOLD).sqrt()[:, :, None] * ways.mT
+        self.values = self._centred(self.values + self.velocity, counts)
         self._corrections = self._of(self.values)
 
     def normal_equations(
         self, parts: Sequence[Part], predict: Predict, known: bool = True
     ) -> tuple[Float[Tensor, "view k k"], Float[Tensor, "view k"]]:
         """Return J^T W J and -J^T W r of each view, of the numbers that are refined."""
-        views, k, steps = len(self.cameras), len(self.columns), self._steps()
+        views, k = len(self.cameras), len(self.columns)
         normal = torch.zeros(views, k, k, dtype=torch.float64)
         right = torch.zeros(views, k, dtype=torch.float64)
         for part in parts:
-            now, seen = self.residual(part, self.values, predict)
-            slopes = []
-            for i in self.columns:
-                other = self.values.clone()
-                other[:, i] += steps[:, i]
-                there, _ = self.residual(part, other, predict, seen if i >= len(GEOMETRY) else None)
-                slopes.append((there - now) / steps[:, i].to(now)[part.rays.view.long()][:, None])
-            jacobian = torch.stack(slopes, dim=-1).double().cpu()
-            now, view = now.double().cpu(), part.rays.view.long().cpu()
+            now, jacobian = self.slopes(part, predict)
+            view = part.rays.view.long().cpu()
             weight = (part.outlier / now.abs().clamp(min=1e-30)).clamp(max=1.0)
             for v in range(views):
                 own = view == v
@@ -216,6 +257,18 @@ class Refinement:
                 normal[v] += each * (j.T * w) @ j
                 right[v] -= each * (j.T * w) @ r
         return normal, right
+
+    def slopes(self, part: Part, predict: Predict) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c k"]]:
+        """Return the residual of a part, and what the numbers that are refined change of it, each by its unit."""
+        steps = self._steps()
+        now, seen = self.residual(part, self.values, predict)
+        slopes = []
+        for i in self.columns:
+            other = self.values.clone()
+            other[:, i] += steps[:, i]
+            there, _ = self.residual(part, other, predict, seen if i >= len(GEOMETRY) else None)
+            slopes.append((there - now) / steps[:, i].to(now)[part.rays.view.long()][:, None])
+        return now.double().cpu(), torch.stack(slopes, dim=-1).double().cpu()
 
     def residual(
         self, part: Part, values: Float[Tensor, "view 14"], predict: Predict, seen: Tensor | None = None
@@ -248,16 +301,27 @@ class Refinement:
     def _of(self, values: Float[Tensor, "view 14"]) -> Corrections:
         return Corrections(self.cameras, values[:, : len(GEOMETRY)])
 
-    def _centred(self, values: Float[Tensor, "view 14"]) -> Float[Tensor, "view 14"]:
-        """The numbers without the rigid motion of all cameras."""
-        if not bool((self.sigma[:, :6] > 0).all()):
+    def _centred(
+        self, values: Float[Tensor, "view 14"], counts: Float[Tensor, "view k k"] | None = None
+    ) -> Float[Tensor, "view 14"]:
+        """The numbers without the rigid motion of all cameras: their mean, each movement as clearly as it is told.
+
+        Parameters
+        ----------
+        counts : movements in units of sigma to what counts of them; None for all alike
+        """
+        if not self.gauged or not bool((self.sigma[:, :6] > 0).all()):
             return values
         motions = torch.stack([_motion(camera) for camera in self.cameras])
-        weighted = motions / self.sigma[:, :6, None]
-        value = (values[:, :6] / self.sigma[:, :6]).flatten()[:, None]
-        rigid = torch.linalg.lstsq(weighted.flatten(0, 1), value).solution[:, 0]
+        sigma = self.sigma[:, self.columns].clamp(min=1e-30)
+        rigid = torch.zeros(len(self.cameras), len(self.columns), 6, dtype=torch.float64)
+        rigid[:, :6] = motions / sigma[:, :6, None]
+        if counts is None:
+            counts = torch.eye(len(self.columns), dtype=torch.float64).expand(len(self.cameras), -1, -1)
+        moved = counts @ (values[:, self.columns] / sigma)[..., None]
+        best = torch.linalg.lstsq((counts @ rigid).flatten(0, 1), moved.flatten(0, 1)).solution[:, 0]
         values = values.clone()
-        values[:, :6] -= torch.einsum("vij,j->vi", motions, rigid)
+        values[:, :6] -= torch.einsum("vij,j->vi", motions, best)
         return values
 
     def _steps(self) -> Float[Tensor, "view 14"]:
@@ -284,53 +348,38 @@ class Refinement:
         )
 
 
+def drawn(target: Target, views: int, seed: int, each: int = DRAWN) -> list[Part]:
+    """Draw some pixels of a target, residuals in units of sigma, for a step.
+
+    Parameters
+    ----------
+    views : that the target has
+    each : pixels of a view, about
+    """
+    parts, generator, unit = [], torch.Generator().manual_seed(seed), math.sqrt(target.chi_square)
+    for part in target.parts:
+        index = torch.randperm(len(part), generator=generator)[: each * views]
+        some = part[index.to(part.measured.device)]
+        parts.append(replace(some, inverse_scale=some.inverse_scale * unit, outlier=some.outlier * unit))
+    return parts
+
+
 def displaced(numbers: Float[Tensor, "n 6"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
     """Return the displacement of a whole picture, px, from its middle (PICTURE): at places, 1 at the edge."""
     return numbers[:, :2] + torch.einsum("nij,nj->ni", numbers[:, 2:].unflatten(1, (2, 2)), place)
 
 
-def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) -> Measurement:
-    """Return a measurement with the cameras that a refinement found, and without the shifts of its pictures.
-
-    Views that the table does not name stay as they are.
-
-    Parameters
-    ----------
-    table : of a Refinement, as metrics.json keeps it
-    """
-    if not table:
-        return measurement
-    known = {row["name"]: row["values"] for row in table}
-    values = torch.tensor(
-        [[known.get(name, {}).get(number, 0.0) for number in NAMES] for name in measurement.names], dtype=torch.float64
-    )
-    cameras = Corrections(measurement.cameras, values[:, : len(GEOMETRY)]).corrected
-    d = measurement.displacement
-    if d is not None and bool(values[:, len(GEOMETRY) :].any()):
-        d = d.clone()
-        for i, camera in enumerate(cameras):
-            height, width = camera.image_size
-            pixel = camera.pixel_grid().reshape(-1, 2).double()
-            middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
-            own = values[i, len(GEOMETRY) :].expand(len(pixel), -1)
-            shift = displaced(own, (pixel - middle) / (max(height, width) / 2)).reshape(height, width, 2)
-            d[i, :height, :width] -= shift.to(d)
-    return replace(measurement, cameras=cameras, displacement=d)
-
-
-def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
-    """Return what to say of a refinement: how far views moved, and each that moved further than its sigmas allow."""
-    far = [row for row in table if row["moved"] > MOVED]
-    most = max(table, key=lambda row: row["moved"])
-    lines = [f"refined {len(table)} views; furthest is {most['name']}, by {most['moved']:.1f} of its sigmas"]
-    for row in far:
-        number, value = max(row["values"].items(), key=lambda n: abs(n[1]) / max(row["sigma"][n[0]], 1e-30))
-        unit = UNITS[NAMES.index(number)]
-        lines.append(
-            f"view {row['name']} is not where its calibration says: {number} {value:.3g} {unit}, {row['moved']:.1f} "
-            "sigma; calibrate it again, or state a larger pose_sigma"
-        )
-    return lines
+def _pose_sigma(camera: Camera, mm: float | None, deg: float | None) -> Float[Tensor, 6]:
+    """What is given, else what the camera knows, else POSE_SIGMA."""
+    shift, turn = POSE_SIGMA
+    sigma = torch.tensor([math.radians(turn)] * 3 + [shift] * 3, dtype=torch.float64)
+    if camera.pose_sigma is not None:
+        sigma = camera.pose_sigma.double().clone()
+    if deg is not None:
+        sigma[:3] = math.radians(deg)
+    if mm is not None:
+        sigma[3:] = mm
+    return sigma
 
 
 def _motion(camera: Camera) -> Float[Tensor, "6 6"]:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from nerif.conventions import InputError, parse_faces
+from nerif.conventions import InputError
 from nerif.fields.mlp import NetworkShape
-from nerif.reconstruction.aperture import check_aperture
-from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS
-from nerif.reconstruction.refinement import check_refined
+from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.techniques.registry import AUTO, check_model
 
@@ -28,7 +25,7 @@ CHOICES = {
 
 
 @dataclass(frozen=True)
-class TrainingSettings(Reconstructor):
+class TrainingSettings(SharedSettings):
     """Settings of every method that trains a network."""
 
     network: NetworkShape = field(default_factory=NetworkShape)
@@ -41,10 +38,6 @@ class TrainingSettings(Reconstructor):
     """Forward model: of displacements lever_arm (auto), paraxial, or curved (along the ray as the present field bends
     it); of absorption absorbance (auto), or, where little light is left and its logarithm skewed, intensity (noise of
     the detector, which is even) or poisson (counted quanta)."""
-    lower: float | None = None
-    """Lowest value that the field can have (of the index excess of hot gas: -2.7e-4); else that of the technique."""
-    upper: float | None = None
-    """Highest value that the field can have (of the index excess of hot gas in air: 0)."""
     samples: tuple[int, int] = (12, 24)
     """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
     sample_jitter: int = 4
@@ -52,9 +45,6 @@ class TrainingSettings(Reconstructor):
     sampling: str = "adaptive"
     """In equal intervals, one draw each ("random", the paper's), one a ray ("shifted") or midpoints ("regular"), or
     "adaptive", where the field varies."""
-    aperture: str = "auto"
-    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), and displacements
-    are means over their window where that is; or all are thin rays (off)."""
     source: str = "auto"
     """What to go by (also --from): displacements, pictures (each pixel, after a start from displacements, or from
     blurred pictures), both, or auto: pictures where there are some."""
@@ -65,15 +55,6 @@ class TrainingSettings(Reconstructor):
     """Sample points of a step; a step takes points_per_batch / N pixels of N points each."""
     optimiser: str = "muon"
     """Muon for weight matrices and Adam for the rest, or adam for all (the paper's)."""
-    refine: tuple[str, ...] = ()
-    """Refined together with the field, held by their standard deviations: cameras (where they stand and look), shift
-    (of whole pictures, as of a shaken camera), focal, background (its distance)."""
-    pose_sigma_mm: float = 0.2
-    """Standard deviation of where a camera stands, where the measurement has no pose_sigma."""
-    pose_sigma_deg: float = 0.02
-    """Standard deviation of how a camera is turned, where the measurement has no pose_sigma."""
-    shift_sigma_px: float = 0.05
-    """Standard deviation of the shift of a picture; of turn and zoom of it, at its edge, a fifth."""
     learning_rate: float = 1.5e-2
     """Adam's at its highest, for a network of 4 x 128; other shapes have shares of it (reconstruction/optimiser.py)."""
     rates_by_shape: bool = True
@@ -93,8 +74,6 @@ class TrainingSettings(Reconstructor):
     rays that it is not given are met no better."""
     max_steps: int = 0
     """Stop after so many steps; 0 for no limit."""
-    time_limit: float = 0.0
-    """Stop after so many seconds; 0 for no limit."""
     longest: float = 600.0
     """Seconds after which a run without a limit ends, whether more would bring anything or not (no frame of a film)."""
     first_cycle: int = 400
@@ -105,14 +84,8 @@ class TrainingSettings(Reconstructor):
     """Steps in which the network is fitted to the field it starts from (--start-from)."""
     rate_after_fit: float = 0.3
     """Share of the learning rate that a run goes on with from such a start."""
-    ambient_faces: tuple[str, ...] = ()
-    """Faces on which the index is ambient; empty: those of the measurement."""
-    open_faces: tuple[str, ...] = ()
-    """Faces through which flow leaves the box; rays that cross them are dropped."""
     seed: int = 0
     """Of weights and samples; makes a CPU run repeatable that no clock ends."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda, cuda:1, ..."""
     precision: str = "auto"
     """One of auto, float32, tf32, bf16 (mixed; the last part of the run in float32)."""
     full_precision_from: float = 0.85
@@ -121,6 +94,7 @@ class TrainingSettings(Reconstructor):
     """Compile the network: on, off, or auto, on CUDA by PyTorch and its layers on a CPU in float32 by Numba."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, allowed in CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
@@ -136,7 +110,7 @@ class TrainingSettings(Reconstructor):
         ):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("epochs", "max_steps", "time_limit", "stop_ratio", "sample_jitter"):
+        for name in ("epochs", "max_steps", "stop_ratio", "sample_jitter"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         if not (len(self.samples) == 2 and min(self.samples) > self.sample_jitter):
@@ -153,12 +127,7 @@ class TrainingSettings(Reconstructor):
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
             raise InputError("weights: the head and consistency terms need gradient_head = true")
         check_model(self.model)
-        check_aperture(self.aperture)
         check_source(self.source)
-        check_refined(self.refine, self.pose_sigma_mm, self.pose_sigma_deg, self.shift_sigma_px)
-        check_bounds(self.lower, self.upper)
-        parse_faces(self.ambient_faces)
-        parse_faces(self.open_faces, "open_faces")
 
     @property
     def limited(self) -> bool:

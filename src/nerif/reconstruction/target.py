@@ -71,6 +71,11 @@ class Part:
         integrals = self.model.integrals or self.measured.shape[1]
         return self._robust(self._difference(self.measured.new_zeros(len(self), integrals)))
 
+    @property
+    def of_field(self) -> Float[Tensor, "n c"]:
+        """What was measured without what is added to a prediction, for models whose integral is what is measured."""
+        return self.measured if self.offset is None else self.measured - self.offset.to(self.measured)
+
     def split(self) -> list[Part]:
         """Return the part in pieces that need little memory."""
         return [self[i : i + PIECE] for i in range(0, len(self), PIECE)]

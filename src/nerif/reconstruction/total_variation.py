@@ -16,7 +16,7 @@ from nerif.conventions import InputError
 from nerif.reconstruction.problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels import WeightedVoxelReconstructor
 
-__all__ = ["TotalVariation"]
+__all__ = ["TotalVariation", "at_faces", "gradient_square"]
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,15 @@ class TotalVariation(WeightedVoxelReconstructor):
         x = problem.clip(x)
         while True:
             # sqrt(g^2 + e^2) <= (g^2 + e^2) / (2 m) + m / 2 with equality at m = sqrt(g^2 + e^2) of this round
-            magnitude = (_gradient_square(problem.differences(x)) + self.softness**2).sqrt()
-            penalty = Penalty(problem, "gradient", _at_faces(0.5 / magnitude))
+            magnitude = (gradient_square(problem.differences(x)) + self.softness**2).sqrt()
+            penalty = Penalty(problem, "gradient", at_faces(0.5 / magnitude))
             for _, iterate in zip(range(self.round), minimise(problem, penalty, weight, x), strict=False):
                 x = iterate.x
-                magnitude = (_gradient_square(problem.differences(x)) + self.softness**2).sqrt()
+                magnitude = (gradient_square(problem.differences(x)) + self.softness**2).sqrt()
                 yield Iterate(x, iterate.residual, float(magnitude.mean()))
 
 
-def _gradient_square(along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y x"]:
+def gradient_square(along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y x"]:
     """|grad|^2 at voxel centres: the mean of the squares at the two faces, summed over the axes."""
     total = None
     for axis, difference in enumerate(along):
@@ -71,7 +71,7 @@ def _gradient_square(along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y
     return total
 
 
-def _at_faces(weight: Float[Tensor, "z y x"]) -> tuple[Tensor, Tensor, Tensor]:
+def at_faces(weight: Float[Tensor, "z y x"]) -> tuple[Tensor, Tensor, Tensor]:
     """Weights of the squares at the faces that make sum_voxels weight |grad|^2 = sum_faces weight difference^2."""
     faces = []
     for axis in range(3):

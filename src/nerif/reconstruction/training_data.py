@@ -6,10 +6,8 @@ and of each point as well: tau in [-1, 1].
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from contextlib import suppress
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -25,7 +23,7 @@ from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.gauge import AmbientRegion, is_open
-from nerif.reconstruction.refinement import Refinement
+from nerif.reconstruction.refinement import Refinement, drawn
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.sources import of_source, stages
@@ -132,7 +130,7 @@ class TrainingData(ABC):
         """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
 
 
-SETTLED_BY, REFINED_BY = 1024, 150  # pixels a view
+SETTLED_BY = 1024  # pixels a view
 
 
 class FrameData(TrainingData):
@@ -198,9 +196,9 @@ class FrameData(TrainingData):
 
     @property
     def unsettled(self) -> list[Part]:
-        drawn = torch.Generator().manual_seed(self.stage)
+        generator = torch.Generator().manual_seed(self.stage)
         parts = [part for part in self.target.parts if part.model.settles]
-        some = [torch.randperm(len(part), generator=drawn)[: SETTLED_BY * len(self.names)] for part in parts]
+        some = [torch.randperm(len(part), generator=generator)[: SETTLED_BY * len(self.names)] for part in parts]
         return [self.refined(part[index.to(self.device)]) for part, index in zip(parts, some, strict=True)]
 
     def kept(self) -> dict[str, Tensor]:
@@ -238,12 +236,7 @@ class FrameData(TrainingData):
     def refined_by(self, seed: int) -> list[Part]:
         if self.refinement is None or self.names != self.refinement.names:
             return []  # a part of the run that has not all views
-        parts, drawn, unit = [], torch.Generator().manual_seed(seed), math.sqrt(self.target.chi_square)
-        for part in self.target.parts:
-            index = torch.randperm(len(part), generator=drawn)[: REFINED_BY * len(self.names)]
-            some = part[index.to(self.device)]
-            parts.append(replace(some, inverse_scale=some.inverse_scale * unit, outlier=some.outlier * unit))
-        return parts
+        return drawn(self.target, len(self.names), seed)
 
     def ambient_points(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], None] | None:
         return None if self.ambient is None else (self.ambient.sample(count, generator).to(self.device), None)

@@ -14,19 +14,18 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError, parse_faces
+from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction import kernels_torch
-from nerif.reconstruction.aperture import check_aperture
-from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State
-from nerif.reconstruction.bounds import check_bounds
+from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.descent import Descent
 from nerif.reconstruction.levels import bins_at_last
 from nerif.reconstruction.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.problem import Iterate, Problem
+from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.techniques.registry import AUTO, check_model
 
@@ -38,7 +37,7 @@ COMPILER_BYTES = 1 << 28  # of Numba, whatever the grid (benchmarks/results/voxe
 
 
 @dataclass(frozen=True)
-class VoxelReconstructor(Reconstructor):
+class VoxelReconstructor(SharedSettings):
     """Settings of every classical method."""
 
     voxels: int = 64
@@ -47,9 +46,6 @@ class VoxelReconstructor(Reconstructor):
     """Between voxel centres: cubic B-splines, or trilinear (less accurate, little faster)."""
     model: str = AUTO
     """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
-    aperture: str = "auto"
-    """Pixels see through the whole of their lens where its aperture is known (auto, or on to insist), and displacements
-    are means over their window where that is; or all are thin rays (off)."""
     source: str = "auto"
     """What to go by (also --from): displacements, pictures (each pixel, linear around the displacements), both, or
     auto: displacements where there are some."""
@@ -60,26 +56,15 @@ class VoxelReconstructor(Reconstructor):
     """Start on a coarse grid and halve the voxels from solution to solution."""
     tolerance: float = 1e-4
     """Converged when the objective falls by less than this share an iteration, on the mean of a few."""
-    time_limit: float = 0.0
-    """Stop after so many seconds; 0 for no limit."""
-    lower: float | None = None
-    """Lowest value that the field can have (of the index excess of hot gas: -2.7e-4); else that of the technique."""
-    upper: float | None = None
-    """Highest value that the field can have (of the index excess of hot gas in air: 0)."""
     hull: bool = True
     """Pin voxels outside the visual hull to the ambient index, where the measurement has flow masks."""
-    ambient_faces: tuple[str, ...] = ()
-    """Faces on which the index is ambient; empty: those of the measurement."""
-    open_faces: tuple[str, ...] = ()
-    """Faces through which flow leaves the box; rays that cross them are dropped."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda, cuda:1, ..."""
     precision: Literal["float32", "float64"] = "float32"
     """Of voxels and data."""
     iterations: int = 50
     """Most iterations on each grid and with each weight."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, allowed in (("basis", tuple(DEGREES)), ("precision", ("float32", "float64"))):
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
@@ -88,15 +73,10 @@ class VoxelReconstructor(Reconstructor):
                 raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if self.step is not None:
             check_step(self.step, self.basis)
-        for name in ("tolerance", "time_limit"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if not self.tolerance >= 0:
+            raise InputError(f"tolerance: expected 0 or more, got {self.tolerance}")
         check_model(self.model)
-        check_aperture(self.aperture)
         check_source(self.source)
-        check_bounds(self.lower, self.upper)
-        parse_faces(self.ambient_faces)
-        parse_faces(self.open_faces, "open_faces")
 
     @property
     def weight(self) -> float | None:

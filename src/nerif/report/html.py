@@ -14,6 +14,7 @@ from nerif.drawing import drawn_of, map_colours
 from nerif.evaluation import rms_text
 from nerif.notebook import number, picture
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
+from nerif.report.moves_figure import draw_moved_rig, draw_moves
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
 from nerif.report.summary import came_out, headline, measured, trust, trust_figures
@@ -119,6 +120,12 @@ def _curves(result: Result) -> list[tuple[str, str]]:
         for name, residuals in residuals_over_sigma(result.reprojection).items():
             of = f" of {name}" if several else ""
             found.append((f"Residuals{of} against the noise", svg(partial(draw_residuals, residuals=residuals))))
+    rig = result.metrics.get("rig")
+    if rig:
+        found.append(("How far the cameras were moved", svg(partial(draw_moves, table=rig))))
+        if result.reprojection is not None:
+            cameras = result.reprojection.measurement.cameras
+            found.append(("Where the cameras were moved to", svg(partial(draw_moved_rig, cameras=cameras, table=rig))))
     if result.metrics.get("slices"):
         slices = result.metrics["slices"]
         found.append(("Against the truth, slice by slice", svg(lambda axes: draw_slice_scores(axes, slices))))

@@ -29,6 +29,7 @@ from nerif.drawing import (
 from nerif.observation import Observation
 from nerif.report.figures import draw_history, draw_line, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
+from nerif.report.moves_figure import draw_moves
 from nerif.report.view_images import lattice_step
 from nerif.reprojection import Reprojection
 from nerif.result import Result
@@ -86,6 +87,10 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
             several = len(result.reprojection.measurement.observations) > 1
             yield f"residuals_{measured}" if several else "residuals", figure
         yield "rig", rig(result.reprojection, double)
+    if result.metrics.get("rig"):
+        figure = _page(single, 0.8)
+        draw_moves(figure.subplots(), result.metrics["rig"])
+        yield "moves", figure
     if result.metrics.get("views"):
         figure = _page(single, 0.8)
         draw_view_scores(figure.subplots(), result.metrics["views"])

@@ -13,6 +13,7 @@ from nerif.evaluation import rms_text
 from nerif.notebook import number, percent, span
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
+from nerif.reconstruction.refined_rig import moved_lines
 from nerif.report.packing import relation
 from nerif.result import METRICS, VOLUME, Result
 from nerif.techniques.registry import TECHNIQUES
@@ -98,6 +99,13 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
             rows.append((name, f"CC {worst}{number(_smallest(own, 'cc'), 5)}, rms error {rms}{beside}"))
         if not views:
             rows.append((title, "none" if seen else "not known"))
+    for view in result.metrics.get("views_refitted") or []:
+        name = f"{view['name']}, camera refined"
+        rows.append((name, f"CC {number(view['cc'], 5)}, rms error {rms_text(view, 3)}"))
+    rig = [row for row in result.metrics.get("rig") or [] if "rms_after" in row]
+    if rig:
+        before, after = (max(row[name] for row in rig) for name in ("rms_before", "rms_after"))
+        rows.append(("Worst view, as calibrated and refined", f"rms {before:.2f} σ, {after:.2f} σ"))
     if "outcome" in result.metrics:
         rows.append(("Outcome", str(result.metrics["outcome"]).replace("_", " ")))
     m = result.metrics
@@ -127,7 +135,7 @@ def trust(result: Result) -> list[Statement]:
     """Return what to know before trusting it, the gravest first."""
     found = [Statement("bad" if gap.what in VITAL else "note", gap.sentence) for gap in result.missing]
     found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_truth(result)
-    found += _of_gas(result) + _of_masks(result) + _of_ensemble(result)
+    found += _of_gas(result) + _of_masks(result) + _of_ensemble(result) + _of_rig(result)
     return sorted(found, key=lambda s: -LEVELS.index(s.level))
 
 
@@ -267,6 +275,16 @@ def _of_ensemble(result: Result) -> list[Statement]:
         return []
     names = ", ".join(map(str, diverged))
     return [Statement("warning", f"Members {names} of the ensemble diverged and are left out of mean and deviation.")]
+
+
+def _of_rig(result: Result) -> list[Statement]:
+    """What a refinement found: views that are not where they were calibrated, and those of which data tell nothing."""
+    table = result.metrics.get("rig")
+    if not table:
+        return []
+    first, *lines = moved_lines(table)
+    found = [Statement("note", f"Cameras or pictures were {first}.")]
+    return found + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
 
 
 def _of_masks(result: Result) -> list[Statement]:

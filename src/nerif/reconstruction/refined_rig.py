@@ -1,0 +1,102 @@
+"""What a refinement found, as metrics.json keeps it: a rig that others can go by, and what to say of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from nerif.conventions import InputError
+from nerif.geometry import Camera
+from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.measurement import Measurement
+from nerif.reconstruction.refinement import NAMES, UNITS, displaced
+
+__all__ = ["MOVED", "UNTOLD", "check_table", "moved_lines", "with_corrections"]
+
+MOVED = 3.0  # sigma, by which a view counts as moved
+FEW = 3  # views, of which a field can be found that fits them wherever they stand, but for their heights
+UNTOLD = 0.3  # of what data tell of a view (rig_posterior.py): below it, next to nothing
+
+
+def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) -> Measurement:
+    """Return a measurement with the cameras that a refinement found, and without the shifts of its pictures.
+
+    Views that the table does not name stay as they are.
+
+    Parameters
+    ----------
+    table : of a Refinement, as metrics.json keeps it
+    """
+    if not table:
+        return measurement
+    check_table(table)
+    known = {row["name"]: row["values"] for row in table}
+    values = torch.tensor(
+        [[known.get(name, {}).get(number, 0.0) for number in NAMES] for name in measurement.names], dtype=torch.float64
+    )
+    cameras = Corrections(measurement.cameras, values[:, : len(GEOMETRY)]).corrected
+    afterwards = {row["name"]: row.get("sigma_after", {}) for row in table}
+    cameras = tuple(_known(camera, afterwards.get(camera.name, {})) for camera in cameras)
+    d = measurement.displacement
+    if d is not None and bool(values[:, len(GEOMETRY) :].any()):
+        d = d.clone()
+        for i, camera in enumerate(cameras):
+            height, width = camera.image_size
+            pixel = camera.pixel_grid().reshape(-1, 2).double()
+            middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+            own = values[i, len(GEOMETRY) :].expand(len(pixel), -1)
+            shift = displaced(own, (pixel - middle) / (max(height, width) / 2)).reshape(height, width, 2)
+            d[i, :height, :width] -= shift.to(d)
+    return replace(measurement, cameras=cameras, displacement=d)
+
+
+def check_table(table: Any) -> None:
+    """Refuse what is no table of refined numbers.
+
+    Raises
+    ------
+    InputError
+        Naming what was expected.
+    """
+    for row in table if isinstance(table, Sequence) else [None]:
+        given = row if isinstance(row, dict) else {}
+        values = given.get("values")
+        good = isinstance(values, dict) and isinstance(given.get("name"), str)
+        numbers = values.items() if isinstance(values, dict) else ()
+        if not good or not all(n in NAMES and isinstance(v, int | float) and math.isfinite(v) for n, v in numbers):
+            raise InputError(f"rig: expected for each view a name and finite values of {', '.join(NAMES)}, got {row!r}")
+
+
+def _known(camera: Camera, sigma: dict[str, float]) -> Camera:
+    """The camera with the standard deviations of its pose that are known afterwards."""
+    if not all(name in sigma for name in NAMES[:6]):
+        return camera
+    return replace(camera, pose_sigma=torch.tensor([sigma[name] for name in NAMES[:6]], dtype=torch.float64))
+
+
+def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
+    """Return what to say of a refinement: how far views moved, and each that moved further than its sigmas allow."""
+    far = [row for row in table if row["moved"] > MOVED]
+    most = max(table, key=lambda row: row["moved"])
+    lines = [f"refined {len(table)} views; furthest is {most['name']}, by {most['moved']:.1f} of its sigmas"]
+    if len(table) <= FEW:
+        lines.append(f"of {len(table)} views the field can follow nearly any movement; take what was moved for a guess")
+    dark = [row["name"] for row in table if row.get("told", 1.0) < UNTOLD]
+    if dark:
+        which = "any view" if len(dark) == len(table) else ", ".join(dark)
+        lines.append(
+            f"the data tell next to nothing of how {which} stands: the field could follow, or noise hides it; "
+            "it stays as calibrated"
+        )
+    for row in far:
+        number, value = max(row["values"].items(), key=lambda n: abs(n[1]) / max(row["sigma"][n[0]], 1e-30))
+        unit = UNITS[NAMES.index(number)]
+        lines.append(
+            f"view {row['name']} is not where its calibration says: {number} {value:.3g} {unit}, {row['moved']:.1f} "
+            f"sigma; it looks {row.get('aside_px', 0.0):.2g} px aside; calibrate it again, or state a larger pose_sigma"
+        )
+    return lines

@@ -1,0 +1,61 @@
+"""Which calibration is off, and by how much? A quick field, refined together with the rig, for the diagnosis alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from nerif.measurement import Measurement
+from nerif.monitor import QUIET, Monitor
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.refined_rig import MOVED, moved_lines
+from nerif.reconstruction.rig_posterior import with_posterior
+
+__all__ = ["RigCheck", "check_rig"]
+
+
+@dataclass(frozen=True)
+class RigCheck:
+    """What was found of a rig.
+
+    Parameters
+    ----------
+    table : for each view the refined numbers, their standard deviations before and after, and what is left of it
+    remarks : what a user should know
+    findings : views that are not where their calibration says, in words
+    """
+
+    table: list[dict[str, Any]]
+    remarks: tuple[str, ...]
+    findings: tuple[str, ...]
+
+
+def check_rig(
+    measurement: Measurement, refine: Sequence[str], seconds: float = 30.0, pose_sigma_mm: float | None = None,
+    pose_sigma_deg: float | None = None, monitor: Monitor = QUIET,
+) -> RigCheck:  # fmt: skip
+    """Refine a rig with a field that is trained for some seconds, and say which views moved.
+
+    Parameters
+    ----------
+    measurement : of views that see the same flow
+    refine : what of the rig (settings.refine of NeRIF)
+    seconds : of training; the field of longer ones is better, and with it what it says of the rig
+    pose_sigma_mm, pose_sigma_deg : how far cameras may be off; None for what the measurement says
+
+    Raises
+    ------
+    InputError
+        If there is no such thing to refine.
+    """
+    settings = NeRIF(
+        time_limit=seconds, refine=tuple(refine), pose_sigma_mm=pose_sigma_mm, pose_sigma_deg=pose_sigma_deg
+    )
+    with monitor.training("refining the rig") as told:
+        result = settings(measurement, told)
+    with monitor.counting("how well the rig is known") as bar:
+        table = with_posterior(result.rig, measurement, result.field, result.settings, bar)
+    lines = moved_lines(table)
+    far = sum(row["moved"] > MOVED for row in table)
+    return RigCheck(table, tuple(lines[: len(lines) - far]), tuple(lines[len(lines) - far :]))
