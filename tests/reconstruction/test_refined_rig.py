@@ -17,8 +17,9 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.measurement import Measurement
+from nerif.reconstruction.refined_numbers import NAMES
 from nerif.reconstruction.refined_rig import UNTOLD, moved_lines, with_corrections
-from nerif.reconstruction.refinement import NAMES, Refinement
+from nerif.reconstruction.refinement import Refinement
 from nerif.reconstruction.refit import refit
 from nerif.reconstruction.rig_posterior import with_posterior
 from nerif.reconstruction.tikhonov import Tikhonov
@@ -169,7 +170,10 @@ def test_the_check_names_a_camera_that_was_knocked(tmp_path):
 
 @pytest.mark.parametrize(
     ("words", "told"),
-    [(["cameras", "--time-limit", "0"], "time_limit: expected seconds above 0"), (["lens"], "refine: expected some of")],
+    [
+        (["cameras", "--time-limit", "0"], "time_limit: expected seconds above 0"),
+        (["lens"], "refine: expected some of"),
+    ],
 )
 def test_a_check_that_cannot_be_is_refused(measured, tmp_path, capsys, words, told):
     measured.write(tmp_path / "m.nc")

@@ -19,8 +19,9 @@ from nerif.imaging.cameras_file import read_cameras
 from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.refined_numbers import NAMES, displaced
 from nerif.reconstruction.refined_rig import moved_lines, with_corrections
-from nerif.reconstruction.refinement import NAMES, Refinement, displaced
+from nerif.reconstruction.refinement import Refinement
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import simulate
@@ -133,6 +134,25 @@ def test_what_is_not_told_stays_at_the_prior(measured):
     for _ in range(5):
         refinement.step(in_sigmas(wrong), lambda part, rays: torch.zeros(len(rays), 2))
     assert float(refinement.values.abs().max()) == 0
+
+
+def test_nothing_is_moved_before_the_data_show_that_the_rig_is_off(measured):
+    right = Refinement.asked(measured, ["cameras"])
+    wrong = Refinement.asked(spoiled(measured)[0], ["cameras"], 0.5, 0.03)
+    for _ in range(4):
+        right.step(in_sigmas(measured), predict, ask=1.0)
+    assert not right.off
+    assert float(right.values.abs().max()) == 0
+    for _ in range(2):
+        assert float(wrong.values.abs().max()) == 0
+        wrong.step(in_sigmas(spoiled(measured)[0]), predict, ask=1.0)
+    assert wrong.off
+    assert float(wrong.values.abs().max()) > 0
+    again = Refinement.asked(measured, ["cameras"])
+    again.restore(wrong.kept())
+    assert again.off
+    table = right.table()
+    assert moved_lines(table) == ["refined 5 views: the data show no sign that one is off, so none was moved"]
 
 
 def test_the_rigid_motion_of_all_cameras_is_taken_out(measured):

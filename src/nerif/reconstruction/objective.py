@@ -30,6 +30,8 @@ JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a thin ray that is held back, of 
 SETTLING = 24  # samples of a ray that brightness is fitted by
 REFINED_SAMPLES, REFINED_RAYS, REFINED_AT_ONCE = 16, 4, 512
 REFINED_FROM, REFINED_EVERY, REFINED_UNTIL, SLOWED_FROM = 0.1, 0.04, 0.94, 0.75  # shares of a run
+SHOWN_EARLY, SHOWN_UNTIL = 0.26, 0.5  # shares by which data have shown that a rig is off: clearly, or at all
+CLEARLY = 1.7
 FEWEST = 4  # samples of a ray through a lens
 MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (docs/architecture.md)
 
@@ -178,7 +180,7 @@ class Objective:
         due = math.ceil((min(progress, REFINED_UNTIL) - REFINED_FROM) / REFINED_EVERY)
         if rig.done > max(due, 0) + 1:  # of the cycle before
             rig.done = 0
-        if rig.done >= due:
+        if rig.done >= due or (progress > SHOWN_UNTIL and not rig.off):
             return
 
         def predict(part: Part, rays: Rays) -> Tensor:
@@ -195,7 +197,8 @@ class Objective:
             return torch.cat(seen)
 
         momentum = MOMENTUM if progress < SLOWED_FROM else 0.0
-        rig.step(data.refined_by(rig.done), predict, data.sigma_known, momentum)
+        ask = CLEARLY if progress < SHOWN_EARLY else 1.0
+        rig.step(data.refined_by(rig.done), predict, data.sigma_known, momentum, ask)
 
     def at_ambient(self, count: int, generator: torch.Generator) -> Tensor | None:
         """Return what the network gives where it should give 0, in full precision; None where no place is known."""

@@ -13,7 +13,7 @@ from nerif.conventions import InputError
 from nerif.geometry import Camera
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.measurement import Measurement
-from nerif.reconstruction.refinement import NAMES, UNITS, displaced
+from nerif.reconstruction.refined_numbers import NAMES, UNITS, displaced
 
 __all__ = ["MOVED", "UNTOLD", "check_table", "moved_lines", "with_corrections"]
 
@@ -82,6 +82,8 @@ def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
     """Return what to say of a refinement: how far views moved, and each that moved further than its sigmas allow."""
     far = [row for row in table if row["moved"] > MOVED]
     most = max(table, key=lambda row: row["moved"])
+    if most["moved"] == 0:
+        return [f"refined {len(table)} views: the data show no sign that one is off, so none was moved"]
     lines = [f"refined {len(table)} views; furthest is {most['name']}, by {most['moved']:.1f} of its sigmas"]
     if len(table) <= FEW:
         lines.append(f"of {len(table)} views the field can follow nearly any movement; take what was moved for a guess")

@@ -27,49 +27,20 @@ from nerif.conventions import InputError
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.measurement import Measurement
+from nerif.reconstruction.refined_numbers import NAMES, REFINED, displaced, prior, refined_words
 from nerif.reconstruction.target import Part, Target
 
-__all__ = ["NAMES", "PICTURE", "REFINED", "UNITS", "Refinement", "check_refined", "displaced", "drawn", "refined_words"]
+__all__ = ["MOMENTUM", "Refinement", "drawn"]
 
-PICTURE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
-"""Displacement of a whole picture, px: constant, and growing from the middle to the edge along columns and rows."""
-NAMES = (*GEOMETRY, *PICTURE)
-UNITS = (*("rad",) * 3, *("mm",) * 3, "1", "mm", *("px",) * 6)
-REFINED = {"cameras": range(6), "focal": range(6, 7), "background": range(7, 8), "shift": range(8, 14)}
-"""What can be refined, and which of NAMES it is."""
-
-POSE_SIGMA = 0.2, 0.02  # mm, degrees
-ZOOM_SIGMA, BACKGROUND_SIGMA = 1e-3, 0.5  # of a focal length, as a share; mm
-LINEAR = 0.2  # of the shift: what turn and zoom of a shaken camera move its edge by
 STEP_PX = 0.3  # by which rays move at the middle of the box, to see what changes
 ALIKE = 20.0  # neighbours that what is not understood is alike in
 MOMENTUM = 0.6
 DRAWN = 150  # pixels a view, for a step
+SIGN, SIGNS = 0.012, 2  # share of a residual that a number explains, and how often, before cameras are moved
 UNTOLD = 0.05  # share that a movement has in the mean of all which no data tell
 
 Predict = Callable[[Part, Rays], Float[Tensor, "n k"]]
 """Gives the path integral of the field that is there, along rays of a part."""
-
-
-def refined_words(refine: Sequence[str]) -> tuple[str, ...]:
-    """Return the words of a setting, which may stand one by one or with commas between."""
-    return tuple(dict.fromkeys(word for given in refine for word in given.replace(",", " ").split()))
-
-
-def check_refined(refine: Sequence[str], mm: float | None, deg: float | None, px: float) -> None:
-    """Refuse what cannot be refined, and standard deviations that are none.
-
-    Raises
-    ------
-    InputError
-        Naming it.
-    """
-    for word in refined_words(refine):
-        if word not in REFINED:
-            raise InputError(f"refine: expected some of {', '.join(REFINED)}, got '{word}'")
-    for name, value in (("pose_sigma_mm", mm), ("pose_sigma_deg", deg), ("shift_sigma_px", px)):
-        if value is not None and not 0 < value < 1e6:
-            raise InputError(f"{name}: expected a standard deviation above 0, got {value}")
 
 
 class Refinement:
@@ -90,6 +61,10 @@ class Refinement:
         self.values, self.velocity = torch.zeros_like(self.sigma), torch.zeros_like(self.sigma)
         self.done = 0
         """Steps in this cycle of a run."""
+        self.signs = 0
+        """How often in a row the data have shown that the rig is off; from SIGNS on it counts as off."""
+        self.explained = torch.zeros(len(self.cameras), dtype=torch.float64)
+        """Share of the residual of each view that its numbers would explain, beyond what they would of noise."""
         self.columns = [i for i in range(len(NAMES)) if bool((self.sigma[:, i] > 0).any())]
         self._half = torch.tensor([max(c.image_size) / 2 for c in self.cameras])
         self._middle = torch.tensor([[(n - 1) / 2 for n in c.image_size[::-1]] for c in self.cameras])
@@ -115,8 +90,7 @@ class Refinement:
             If nothing measured can tell of a shift.
         """
         words = refined_words(refine)
-        rest = torch.tensor([ZOOM_SIGMA, BACKGROUND_SIGMA, px, px, *[LINEAR * px] * 4], dtype=torch.float64)
-        whole = torch.stack([torch.cat([_pose_sigma(camera, mm, deg), rest]) for camera in measurement.cameras])
+        whole = torch.stack([prior(camera, mm, deg, px) for camera in measurement.cameras])
         if "cameras" in words and not bool(whole[:, :6].any()):
             raise InputError("pose_sigma: expected some standard deviations above 0 to refine cameras, got none")
         if "shift" in words and any(not kind.windowed for kind in measurement.techniques):
@@ -156,6 +130,11 @@ class Refinement:
     def corrected(self) -> tuple[Camera, ...]:
         """The cameras as refined."""
         return self._corrections.corrected
+
+    @property
+    def off(self) -> bool:
+        """Whether data have shown that the rig is off."""
+        return self.signs >= SIGNS
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -209,7 +188,9 @@ class Refinement:
 
     # -- steps ---------------------------------------------------------------------------------------------------
 
-    def step(self, parts: Sequence[Part], predict: Predict, known: bool = True, momentum: float = MOMENTUM) -> None:
+    def step(
+        self, parts: Sequence[Part], predict: Predict, known: bool = True, momentum: float = MOMENTUM, ask: float = 0.0
+    ) -> None:  # fmt: skip
         """Move by one step of Gauss and Newton, and a share of the step before, to what some pixels ask for.
 
         Parameters
@@ -217,11 +198,18 @@ class Refinement:
         parts : pixels, with their calibrated rays, residuals in units of sigma
         predict : of the field
         known : whether sigma is; else residuals are in any unit
+        ask : above 0, move nothing before the data have shown that the rig is off by that many times the share SIGN for
+            each number: what an unfinished field leaves moves it too
         """
         self.done += 1
         if not parts:
             return
         normal, right = self.normal_equations(parts, predict, known)
+        if ask and not self.off:
+            sign = float(self.explained.median()) > ask * SIGN * len(self.columns)
+            self.signs = self.signs + 1 if sign else 0
+            if not self.off:
+                return
         sigma = self.sigma[:, self.columns]  # 0 of a number that a view does not refine: it stays
         told, ways = torch.linalg.eigh(sigma[:, :, None] * normal * sigma[:, None])
         pull = torch.einsum("vij,vi->vj", ways, sigma * right)
@@ -254,6 +242,9 @@ class Refinement:
                 level = float((w * r.square()).mean())
                 level, excess = (max(level, 1.0), max(level - 1, 0.0)) if known else (max(level, 1e-30), 1.0)
                 each = 1 / (level * (1 + ALIKE * min(excess, 1.0)))
+                fitted = torch.linalg.lstsq(w.sqrt()[:, None] * j, w.sqrt() * r).solution
+                explained = float((w.sqrt() * (j @ fitted)).square().sum() / (w * r.square()).sum().clamp(min=1e-30))
+                self.explained[v] = explained - k / len(r)
                 normal[v] += each * (j.T * w) @ j
                 right[v] -= each * (j.T * w) @ r
         return normal, right
@@ -291,11 +282,13 @@ class Refinement:
     def kept(self) -> dict[str, Tensor]:
         """Return what a checkpoint keeps."""
         done = torch.tensor(self.done)
-        return {"values": self.values.clone(), "velocity": self.velocity.clone(), "done": done}
+        kept = {"values": self.values.clone(), "velocity": self.velocity.clone(), "done": done}
+        return {**kept, "signs": torch.tensor(self.signs)}
 
     def restore(self, kept: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint kept."""
         self.values, self.velocity, self.done = kept["values"].clone(), kept["velocity"].clone(), int(kept["done"])
+        self.signs = int(kept["signs"])
         self._corrections = self._of(self.values)
 
     def _of(self, values: Float[Tensor, "view 14"]) -> Corrections:
@@ -362,24 +355,6 @@ def drawn(target: Target, views: int, seed: int, each: int = DRAWN) -> list[Part
         some = part[index.to(part.measured.device)]
         parts.append(replace(some, inverse_scale=some.inverse_scale * unit, outlier=some.outlier * unit))
     return parts
-
-
-def displaced(numbers: Float[Tensor, "n 6"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-    """Return the displacement of a whole picture, px, from its middle (PICTURE): at places, 1 at the edge."""
-    return numbers[:, :2] + torch.einsum("nij,nj->ni", numbers[:, 2:].unflatten(1, (2, 2)), place)
-
-
-def _pose_sigma(camera: Camera, mm: float | None, deg: float | None) -> Float[Tensor, 6]:
-    """What is given, else what the camera knows, else POSE_SIGMA."""
-    shift, turn = POSE_SIGMA
-    sigma = torch.tensor([math.radians(turn)] * 3 + [shift] * 3, dtype=torch.float64)
-    if camera.pose_sigma is not None:
-        sigma = camera.pose_sigma.double().clone()
-    if deg is not None:
-        sigma[:3] = math.radians(deg)
-    if mm is not None:
-        sigma[3:] = mm
-    return sigma
 
 
 def _motion(camera: Camera) -> Float[Tensor, "6 6"]:

@@ -8,7 +8,7 @@ from nerif.conventions import InputError, parse_faces
 from nerif.reconstruction.aperture import check_aperture
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
-from nerif.reconstruction.refinement import check_refined
+from nerif.reconstruction.refined_numbers import check_refined
 
 __all__ = ["SharedSettings"]
 
