@@ -17,7 +17,7 @@ from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Differences, Penalty, Problem, conjugate_gradients
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation, _at_faces, _gradient_square
+from nerif.reconstruction.total_variation import TotalVariation, at_faces, gradient_square
 
 SHAPE = (4, 5, 6)
 COUNT = math.prod(SHAPE)
@@ -161,15 +161,15 @@ def test_first_landweber_step_is_the_gradient(problem):
 
 
 def variation(problem: Problem, x: torch.Tensor, softness: float) -> float:
-    return float((_gradient_square(problem.differences(x)) + softness**2).sqrt().mean())
+    return float((gradient_square(problem.differences(x)) + softness**2).sqrt().mean())
 
 
 def test_faces_weigh_as_the_voxels_beside_them(problem):
     generator = torch.Generator().manual_seed(0)
     x, weight = (torch.rand(SHAPE, dtype=torch.float64, generator=generator) for _ in range(2))
     along = problem.differences(x)
-    by_face = sum(float((w * d.square()).sum()) for w, d in zip(_at_faces(weight), along, strict=True))
-    assert by_face == pytest.approx(float((weight * _gradient_square(along)).sum()), rel=1e-12)
+    by_face = sum(float((w * d.square()).sum()) for w, d in zip(at_faces(weight), along, strict=True))
+    assert by_face == pytest.approx(float((weight * gradient_square(along)).sum()), rel=1e-12)
 
 
 def test_total_variation_falls_to_a_minimum(problem):

@@ -138,7 +138,7 @@ def test_what_is_not_told_stays_at_the_prior(measured):
 
 def test_nothing_is_moved_before_the_data_show_that_the_rig_is_off(measured):
     right = Refinement.asked(measured, ["cameras"])
-    wrong = Refinement.asked(spoiled(measured)[0], ["cameras"], 0.5, 0.03)
+    wrong = Refinement.asked(spoiled(measured)[0], ["cameras", "shift"], 0.5, 0.03, 0.03)
     for _ in range(4):
         right.step(in_sigmas(measured), predict, ask=1.0)
     assert not right.off
@@ -148,7 +148,7 @@ def test_nothing_is_moved_before_the_data_show_that_the_rig_is_off(measured):
         wrong.step(in_sigmas(spoiled(measured)[0]), predict, ask=1.0)
     assert wrong.off
     assert float(wrong.values.abs().max()) > 0
-    again = Refinement.asked(measured, ["cameras"])
+    again = Refinement.asked(measured, ["cameras", "shift"])
     again.restore(wrong.kept())
     assert again.off
     table = right.table()

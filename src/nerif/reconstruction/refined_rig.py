@@ -82,9 +82,9 @@ def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
     """Return what to say of a refinement: how far views moved, and each that moved further than its sigmas allow."""
     far = [row for row in table if row["moved"] > MOVED]
     most = max(table, key=lambda row: row["moved"])
-    if most["moved"] == 0:
-        return [f"refined {len(table)} views: the data show no sign that one is off, so none was moved"]
     lines = [f"refined {len(table)} views; furthest is {most['name']}, by {most['moved']:.1f} of its sigmas"]
+    if most["moved"] == 0:
+        lines = [f"refined {len(table)} views: the data show no sign that one is off, so none was moved"]
     if len(table) <= FEW:
         lines.append(f"of {len(table)} views the field can follow nearly any movement; take what was moved for a guess")
     dark = [row["name"] for row in table if row.get("told", 1.0) < UNTOLD]
