@@ -18,6 +18,7 @@ from nerif.reconstruction.refined_numbers import NAMES, UNITS, displaced
 __all__ = ["MOVED", "UNTOLD", "check_table", "moved_lines", "with_corrections"]
 
 MOVED = 3.0  # sigma, by which a view counts as moved
+STILL = 1e-6  # sigma: rounding
 FEW = 3  # views, of which a field can be found that fits them wherever they stand, but for their heights
 UNTOLD = 0.3  # of what data tell of a view (rig_posterior.py): below it, next to nothing
 
@@ -83,7 +84,7 @@ def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
     far = [row for row in table if row["moved"] > MOVED]
     most = max(table, key=lambda row: row["moved"])
     lines = [f"refined {len(table)} views; furthest is {most['name']}, by {most['moved']:.1f} of its sigmas"]
-    if most["moved"] == 0:
+    if most["moved"] < STILL:
         lines = [f"refined {len(table)} views: the data show no sign that one is off, so none was moved"]
     if len(table) <= FEW:
         lines.append(f"of {len(table)} views the field can follow nearly any movement; take what was moved for a guess")
