@@ -2,20 +2,24 @@
 
     python benchmarks/rigs.py ../shared/data/rigs --write benchmarks/results/rigs-cpu.md
 
-The folder holds measurement files and truth.nc (index excess on voxels), made by others. Each row is a process of its
-own, alone on the machine.
+The folder holds measurement files and truth.nc (index excess on voxels), made by others; the row `pictures` renders its
+own, of 200² px through lenses at f/8 (pictures.py). Each row is a process of its own, alone on the machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
+import tempfile
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pictures
 from bench import Table, add_write, alone
 
-GOALS = {"thin": None, "f16": 0.0045, "f8": 0.0060, "f4": 0.015, "window6": None}
+PICTURES = "pictures"
+GOALS = {"thin": None, "f16": 0.0045, "f8": 0.0060, "f4": 0.015, "window6": None, PICTURES: 0.012}
 """Rigs in the order of the table, and the L2 that NeRIF is to reach on them in 90 s."""
 REFINED: dict[str, tuple[tuple[str, ...], float | None, float | None]] = {
     "thin": (("cameras", "shift"), None, None),
@@ -27,7 +31,31 @@ REFINED: dict[str, tuple[tuple[str, ...], float | None, float | None]] = {
 """What is refined of a rig, and the L2 to reach so in 90 s, before and after the best rigid motion of the field."""
 
 
-def run(path: Path, method: str, aperture: str, seconds: float, seed: int, refine: tuple[str, ...]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Way:
+    """How a measurement is taken: what its lenses count as, what is refined, what the field is found from."""
+
+    aperture: str = "auto"
+    refine: tuple[str, ...] = ()
+    source: str = "displacements"
+
+
+def ways(name: str, method: str) -> list[Way]:
+    """Return the ways in which a rig is reconstructed, those that know of its fault first."""
+    if name == PICTURES:
+        return [Way(source="pictures"), Way()]
+    found = [Way(), *([Way("off")] if name.startswith(("f", "window")) else [])]
+    return found + ([Way(refine=REFINED[name][0])] if name in REFINED and method == "nerif" else [])
+
+
+def goals(name: str, method: str, way: Way) -> tuple[float | None, float | None]:
+    """Return the L2 that is to be reached, and that after the best rigid motion."""
+    if method != "nerif" or way.aperture != "auto" or (name == PICTURES and way.source != PICTURES):
+        return None, None
+    return REFINED[name][1:] if way.refine else (GOALS.get(name), None)
+
+
+def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[str, Any]:
     """Reconstruct a file, and compare with the truth beside it."""
     from nerif.alignment import aligned
     from nerif.evaluation import evaluate_views, evaluate_volume
@@ -37,24 +65,36 @@ def run(path: Path, method: str, aperture: str, seconds: float, seed: int, refin
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural import NeRIF
     from nerif.reconstruction.refined_rig import with_corrections
+    from nerif.reconstruction.sources import of_source
     from nerif.reconstruction.total_variation import TotalVariation
     from nerif.volume_file import read_volume
 
     keep_freed_memory()
     measurement = Measurement.read(path)
     if method == "nerif":
-        result = NeRIF(time_limit=seconds, epochs=1e9, seed=seed, aperture=aperture, refine=refine, device="cpu")(
-            measurement
-        )
+        settings = NeRIF(time_limit=seconds, epochs=1e9, seed=seed, aperture=way.aperture, refine=way.refine)
+        result = replace(settings, source=way.source, device="cpu")(measurement)
     else:
-        result = TotalVariation(aperture=aperture, device="cpu")(measurement)
+        result = TotalVariation(aperture=way.aperture, source=way.source, device="cpu")(measurement)
     truth = read_volume(path.with_name("truth.nc"))
     scores = evaluate_volume(result.field, truth, measurement.n_ambient)
     moved = evaluate_volume(aligned(result.field, truth), truth, measurement.n_ambient)
-    views = evaluate_views(reproject(result.field, with_corrections(seen_through(measurement, aperture), result.rig)))
+    seen = seen_through(of_source(measurement, way.source), way.aperture)
+    views = evaluate_views(reproject(result.field, with_corrections(seen, result.rig)))
     worst = max(view["rms_over_sigma"] for view in views)
     steps = result.history[-1].get("step", len(result.history)) if result.history else 0
     return {"l2": scores["l2"], "aligned": moved["l2"], "seconds": result.seconds, "worst": worst, "steps": int(steps)}
+
+
+def cells(name: str, method: str, way: Way, found: dict[str, float]) -> list[str]:
+    """Return the row of what was found, its goals beside it."""
+    before, after = ("" if goal is None else f"{goal:.2%}" for goal in goals(name, method, way))
+    lensed = name == PICTURES or name.startswith(("f", "window"))
+    known = {"auto": "known", "off": "off"}[way.aperture] if lensed else "-"
+    shown = f"{name}, from {way.source}" if name == PICTURES else name
+    errors = [f"{found['l2']:.3%}", before, f"{found['aligned']:.3%}", after, f"{found['worst']:.2f}"]
+    run = [f"{found['steps']:.0f}", f"{found['seconds']:.0f}"]
+    return [shown, method, known, " ".join(way.refine) or "-", *errors, *run]
 
 
 def main() -> None:
@@ -71,25 +111,18 @@ def main() -> None:
     columns += ["worst view, sigma", "steps", "s"]
     more = f"\n\nNeRIF trains for {asked.seconds:g} s; total variation by its defaults; medians of seeds."
     table = Table("Rigs with one fault each", columns, asked.write, more)
-    for name in asked.only:
-        path, lensed = asked.rigs / f"{name}.nc", name.startswith(("f", "window"))
-        for method in asked.methods:
-            ways: list[tuple[str, tuple[str, ...]]] = [("auto", ())]
-            ways += [("off", ())] if lensed else []
-            ways += [("auto", REFINED[name][0])] if name in REFINED and method == "nerif" else []
-            for aperture, refine in ways:
-                seeds = asked.seeds if method == "nerif" else asked.seeds[:1]
-                found = [alone(run, path, method, aperture, asked.seconds, seed, refine) for seed in seeds]
-                middle = {key: statistics.median(one[key] for one in found) for key in found[0]}
-                goals = REFINED[name][1:] if refine else (GOALS.get(name), None)
-                goals = goals if method == "nerif" and aperture == "auto" else (None, None)
-                before, after = ("" if goal is None else f"{goal:.2%}" for goal in goals)
-                known = "-" if not lensed else {"auto": "known", "off": "off"}[aperture]
-                table.row(
-                    [name, method, known, " ".join(refine) or "-", f"{middle['l2']:.3%}", before,
-                     f"{middle['aligned']:.3%}", after, f"{middle['worst']:.2f}", f"{middle['steps']:.0f}",
-                     f"{middle['seconds']:.0f}"]
-                )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        for name in asked.only:
+            path = asked.rigs / f"{name}.nc"
+            if name == PICTURES:
+                path = Path(folder) / "correlation.nc"
+                pictures.photographed(pictures.CASES["200², f/8"], path.parent)
+            for method in asked.methods:
+                for way in ways(name, method):
+                    seeds = asked.seeds if method == "nerif" else asked.seeds[:1]
+                    found = [alone(run, path, method, way, asked.seconds, seed) for seed in seeds]
+                    middle = {key: statistics.median(one[key] for one in found) for key in found[0]}
+                    table.row(cells(name, method, way, middle))
 
 
 if __name__ == "__main__":

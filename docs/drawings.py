@@ -1,4 +1,4 @@
-"""The drawings of conventions.md, method.md, pixels.md and pictures.md, as SVG: `python docs/drawings.py FOLDER`.
+"""The drawings of the pages on conventions, method, pixels, pictures and rigs as SVG: `python docs/drawings.py FOLDER`.
 
 What they show is computed by nerif itself: camera axes, pixels and rays by `Camera`, voxel centres by `Grid`, the
 displacement by warping dots as its definition says. A convention that changed would change the drawing.
@@ -16,6 +16,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
+from drawing_of_rig import observable
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -467,6 +468,7 @@ DRAWINGS: dict[str, Callable[[], Figure]] = {
     "lever_arm": lever_arm,
     "cone": cone,
     "pictures": pictures,
+    "observable": observable,
 }
 
 

@@ -66,6 +66,19 @@ def total_variation(scan: LineScan, held_out: tuple[int, ...], weights: tuple[fl
     return replace(method, regularisation=min(weights, key=error))
 
 
+def refined_axis(scan: LineScan, told: Told, method: TotalVariation) -> float:
+    """Return the position of the axis of rotation, mm, that a rig refined together with the field shows.
+
+    The rig is set up as if the axis were at 0; the angles' shifts sideways are s = c + a cos(theta) + b sin(theta), of
+    which a and b move rig and field alike, and c is what the axis is off by.
+    """
+    rig = replace(method, refine=("cameras",), pose_sigma_mm=0.3, pose_sigma_deg=1e-4)
+    found = rig(scan.without_offset(told.offset).unbent(told.bend).measurement(0.0))
+    shifts = np.array([view["values"]["shift_x"] for view in found.rig])
+    waves = np.stack([np.ones_like(scan.angles), np.cos(scan.angles), np.sin(scan.angles)], axis=1)
+    return -float(np.linalg.lstsq(waves, shifts, rcond=None)[0][0])
+
+
 def relative_error(predicted: np.ndarray, measured: np.ndarray) -> float:
     """Return |predicted - measured| / |measured|."""
     return float(np.linalg.norm(predicted - measured) / np.linalg.norm(measured))
@@ -115,12 +128,16 @@ def main() -> None:
     parser.add_argument("--method", default="nerif", choices=["nerif", "tv"])
     parser.add_argument("--hold-out", type=int, nargs="*", default=list(HELD_OUT), help="numbers of angles")
     parser.add_argument("--steps", type=int, default=300, help="of training")
+    parser.add_argument("--find-axis", action="store_true", help="find the axis of rotation by a refined rig as well")
     parser.add_argument("--out", type=Path, default=Path("spray"))
     asked = parser.parse_args()
     methods: dict[str, Reconstructor] = {
         "nerif": NeRIF(max_steps=asked.steps, samples=(24, 40)),
     }
     scan, held_out = read(asked.data, asked.slice), tuple(asked.hold_out)
+    if asked.find_axis:
+        at = refined_axis(scan, scan.tell(), TotalVariation(voxels=40, basis="linear"))
+        print(f"axis by a rig that is refined with the field: {at:.3f} mm")
     if asked.method == "tv":
         methods["tv"] = total_variation(scan, held_out)
     scan, predicted, found, told = reconstruct(scan, held_out, methods[asked.method])

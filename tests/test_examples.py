@@ -72,6 +72,19 @@ def test_spray(tmp_path, monkeypatch, capsys):
     assert told.scatter_after < 0.5 * told.scatter
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not SPRAY.is_file(), reason="the data of the spray are not beside the project (shared/data)")
+@pytest.mark.parametrize("name", ["impingement", "jets", "near"])
+def test_axis_of_a_spray_by_refinement(name):
+    """A rig refined together with the field has its axis of rotation where the centres of mass have it."""
+    example = runpy.run_path(str(EXAMPLES / "spray.py"))
+    scan = example["read"](SPRAY, name)
+    told = scan.tell()
+    found = example["refined_axis"](scan, told, example["TotalVariation"](voxels=40, basis="linear", device="cpu"))
+    assert abs(found - told.axis) < 0.03  # mm; the readings are 0.2 to 0.4 mm apart
+    assert -0.36 < found < -0.24
+
+
 def test_examples_are_all_tested():
     tested = {"own_data.py", "from_images.py", "particles.py", "spray.py"}
     assert {p.name for p in EXAMPLES.glob("*.py")} == tested

@@ -28,6 +28,7 @@ from nerif.quick_views import (
     with_values,
     without_spikes,
 )
+from nerif.reconstruction.aperture import seen_through
 from nerif.symptoms import looks, open_faces
 from nerif.volume import INDEX
 
@@ -83,8 +84,9 @@ class Consistency:
 
 
 def check_consistency(
-    measurement: Measurement, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None
-) -> Consistency:
+    measurement: Measurement, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
+    aperture: str = "auto",
+) -> Consistency:  # fmt: skip
     """Compare every view with a quick reconstruction from the others, technique by technique.
 
     Parameters
@@ -92,7 +94,14 @@ def check_consistency(
     measurement : of three views or more; of fewer only the data themselves are looked at
     voxels : of the quick reconstructions, along the longest edge
     on_step : called with the number of reconstructions done, and of those in this round
+    aperture : whether views see through the whole of their lens (seen_through)
+
+    Raises
+    ------
+    InputError
+        If the aperture is "on" and none is known.
     """
+    measurement = seen_through(measurement, aperture)
     observations = integrals_of(measurement)
     several = len(observations) > 1
     views: list[ViewAgreement] = []

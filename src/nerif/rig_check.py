@@ -8,6 +8,7 @@ from typing import Any
 
 from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
+from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.refined_rig import MOVED, moved_lines
 from nerif.reconstruction.rig_posterior import with_posterior
@@ -33,7 +34,7 @@ class RigCheck:
 
 def check_rig(
     measurement: Measurement, refine: Sequence[str], seconds: float = 30.0, pose_sigma_mm: float | None = None,
-    pose_sigma_deg: float | None = None, monitor: Monitor = QUIET,
+    pose_sigma_deg: float | None = None, monitor: Monitor = QUIET, aperture: str = "auto",
 ) -> RigCheck:  # fmt: skip
     """Refine a rig with a field that is trained for some seconds, and say which views moved.
 
@@ -44,18 +45,22 @@ def check_rig(
     seconds : of training; the field of longer ones is better, and with it what it says of the rig
     pose_sigma_mm, pose_sigma_deg : how far cameras may be off; None for what the measurement says
 
+    monitor : is shown how far it is
+    aperture : whether views see through the whole of their lens (seen_through)
+
     Raises
     ------
     InputError
-        If there is no such thing to refine.
+        If there is no such thing to refine, or the aperture is "on" and none is known.
     """
     settings = NeRIF(
-        time_limit=seconds, refine=tuple(refine), pose_sigma_mm=pose_sigma_mm, pose_sigma_deg=pose_sigma_deg
-    )
+        time_limit=seconds, refine=tuple(refine), pose_sigma_mm=pose_sigma_mm, pose_sigma_deg=pose_sigma_deg,
+        aperture=aperture,
+    )  # fmt: skip
     with monitor.training("refining the rig") as told:
         result = settings(measurement, told)
     with monitor.counting("how well the rig is known") as bar:
-        table = with_posterior(result.rig, measurement, result.field, result.settings, bar)
+        table = with_posterior(result.rig, seen_through(measurement, aperture), result.field, result.settings, bar)
     lines = moved_lines(table)
     far = sum(row["moved"] > MOVED for row in table)
     return RigCheck(table, tuple(lines[: len(lines) - far]), tuple(lines[len(lines) - far :]))

@@ -10,6 +10,7 @@ import torch
 import xarray as xr
 
 from nerif.cli import main
+from nerif.consistency import check_consistency
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.phantoms import make_phantom
@@ -240,3 +241,14 @@ def test_the_cone_of_a_rig_of_others_is_known(method):
         for aperture in ("auto", "off")
     ]
     assert errors[0] < 0.8 * errors[1]
+
+
+def test_a_check_goes_by_the_lenses_unless_told_otherwise(wide, tmp_path, capsys):
+    through = [view.agreement for view in check_consistency(wide, 12).views]
+    thin = [view.agreement for view in check_consistency(wide, 12, aperture="off").views]
+    assert len(through) == len(thin) == len(wide.names)
+    assert through != thin
+    seen_through(wide, "off").write(tmp_path / "thin.nc")
+    for more in ([], ["--refine", "cameras", "--time-limit", "1"]):
+        assert main(["check", str(tmp_path / "thin.nc"), "--aperture", "on", *more]) == 2
+        assert "aperture: expected a measurement that knows aperture_diameter" in capsys.readouterr().err

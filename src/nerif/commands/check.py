@@ -31,6 +31,9 @@ class Check(Settings):
     """Measurement file."""
     voxels: int = 24
     """Of the quick reconstructions, along the longest edge of the box."""
+    aperture: str = "auto"
+    """Views see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
+    (off)."""
     refine: tuple[str, ...] = ()
     """Look at the rig instead: refine cameras, shift, focal or background with a quick field, and say which view's
     calibration is off by how much."""
@@ -53,7 +56,8 @@ def _rig(settings: Check) -> RigCheck:
     if not settings.time_limit > 0:
         raise InputError(f"time_limit: expected seconds above 0, got {settings.time_limit}")
     sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg)
-    found = check_rig(Measurement.read(settings.measurement), settings.refine, settings.time_limit, *sigma, MONITOR)
+    measurement = Measurement.read(settings.measurement)
+    found = check_rig(measurement, settings.refine, settings.time_limit, *sigma, MONITOR, settings.aperture)
     heads = ("moved [sigma]", "aside [px]", "+- [px]", "told", "residual [sigma]")
     say(f"{'view':<14}" + "".join(f"{head:>16}" for head in heads))
     for row in found.table:
@@ -75,7 +79,7 @@ def _views(settings: Check) -> Consistency:
         raise InputError(f"voxels: expected at least 8, got {settings.voxels}")
     measurement = Measurement.read(settings.measurement)
     with counting_bar("comparing views") as bar:
-        result = check_consistency(measurement, settings.voxels, bar)
+        result = check_consistency(measurement, settings.voxels, bar, settings.aperture)
     of = "measured      " if len({view.measured for view in result.views}) > 1 else ""
     if result.views:
         say(f"{'view':<14}{of}{'valid':>8}{'agreement':>11}{'gain':>7}")
