@@ -15,6 +15,8 @@ from nerif.reconstruction.rig_posterior import with_posterior
 
 __all__ = ["RigCheck", "check_rig"]
 
+ROUGH = 2.0  # sigma, above which a field is too far from the data for the rig to be judged by it
+
 
 @dataclass(frozen=True)
 class RigCheck:
@@ -44,7 +46,6 @@ def check_rig(
     refine : what of the rig (settings.refine of NeRIF)
     seconds : of training; the field of longer ones is better, and with it what it says of the rig
     pose_sigma_mm, pose_sigma_deg : how far cameras may be off; None for what the measurement says
-
     monitor : is shown how far it is
     aperture : whether views see through the whole of their lens (seen_through)
 
@@ -63,4 +64,11 @@ def check_rig(
         table = with_posterior(result.rig, seen_through(measurement, aperture), result.field, result.settings, bar)
     lines = moved_lines(table)
     far = sum(row["moved"] > MOVED for row in table)
-    return RigCheck(table, tuple(lines[: len(lines) - far]), tuple(lines[len(lines) - far :]))
+    remarks = lines[: len(lines) - far]
+    worst = max(table, key=lambda row: row.get("rms_after", 0.0))
+    if worst.get("rms_after", 0.0) > ROUGH:
+        remarks.append(
+            f"the field still leaves {worst['rms_after']:.1f} sigma in view {worst['name']} after {seconds:g} s: views "
+            "may be off without showing; take a larger time limit, or look for what else is wrong"
+        )
+    return RigCheck(table, tuple(remarks), tuple(lines[len(lines) - far :]))

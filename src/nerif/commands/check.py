@@ -59,12 +59,12 @@ def _rig(settings: Check) -> RigCheck:
     measurement = Measurement.read(settings.measurement)
     found = check_rig(measurement, settings.refine, settings.time_limit, *sigma, MONITOR, settings.aperture)
     heads = ("moved [sigma]", "aside [px]", "+- [px]", "told", "residual [sigma]")
-    say(f"{'view':<14}" + "".join(f"{head:>16}" for head in heads))
+    say(f"{'view':<14}" + "".join(f"{head:>18}" for head in heads))
     for row in found.table:
         left = f"{row['rms_before']:.2f} -> {row['rms_after']:.2f}" if "rms_after" in row else "unknown"
         aside = (f"{row['aside_px']:.3f}", f"{row['aside_sigma_px']:.3f}")
         figures = (f"{row['moved']:.1f}", *aside, f"{row['told']:.0%}", left)
-        say(f"{row['name']:<14}" + "".join(f"{figure:>16}" for figure in figures))
+        say(f"{row['name']:<14}" + "".join(f"{figure:>18}" for figure in figures))
     for remark in found.remarks:
         say(f"note: {remark}")
     for finding in found.findings:

@@ -88,7 +88,7 @@ def _sigma_known(measurement: Measurement) -> bool:
 
 def covariance(
     rig: Refinement, measurement: Measurement, field: Field, open_faces: tuple[str, ...] = (),
-    on_voxel: Callable[[int, int], None] = lambda done, total: None, voxels: int = VOXELS,
+    on_voxel: Callable[[int, int], None] = lambda done, total: None, voxels: int | None = None,
 ) -> Float[Tensor, "m m"]:  # fmt: skip
     """Return the covariance of all refined numbers in units of their sigmas, view by view in the order of its columns.
 
@@ -99,9 +99,9 @@ def covariance(
     field : that was found with it
     open_faces : faces whose rays are dropped
     on_voxel : told how many voxels are done, the bulk of the work
-    voxels : along the longest edge of the box, on which the field follows
+    voxels : along the longest edge of the box, on which the field follows; None for VOXELS
     """
-    grid = Grid.of_resolution(measurement.box, voxels)
+    grid = Grid.of_resolution(measurement.box, voxels or VOXELS)
     target = Target.of(measurement, open_faces, bins_of(measurement, grid), linear=True).without_outliers()
     target = replace(target, parts=tuple(part.to("cpu") for part in target.parts))
     boundary = Boundary(ambient_faces(measurement, ()))
