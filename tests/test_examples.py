@@ -52,6 +52,19 @@ def test_from_images(tmp_path):
     assert len(metrics["views"]) == 9
 
 
+@pytest.mark.slow
+def test_knocked_camera(tmp_path):
+    """The camera is named, and the field as good as with the calibration of where it stands, within a tenth."""
+    script = [sys.executable, str(EXAMPLES / "knocked_camera.py"), str(tmp_path)]
+    done = subprocess.run(script, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "FOUND: view 85deg is not where its calibration says" in done.stdout
+    row = r"^(good|knocked|refined) +[\d.]+% +([\d.]+)%"
+    errors = {name: float(aligned) for name, aligned in re.findall(row, done.stdout, re.M)}
+    assert errors["knocked"] > 1.1 * errors["good"]
+    assert errors["refined"] < 1.1 * errors["good"]
+
+
 SPRAY = Path(__file__).parents[2] / "shared" / "data" / "spray_absorption" / "spray_Re6700.hdf5"
 
 
@@ -86,5 +99,5 @@ def test_axis_of_a_spray_by_refinement(name):
 
 
 def test_examples_are_all_tested():
-    tested = {"own_data.py", "from_images.py", "particles.py", "spray.py"}
+    tested = {"own_data.py", "from_images.py", "knocked_camera.py", "particles.py", "spray.py"}
     assert {p.name for p in EXAMPLES.glob("*.py")} == tested

@@ -12,6 +12,7 @@ from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.refined_rig import MOVED, moved_lines
 from nerif.reconstruction.rig_posterior import with_posterior
+from nerif.reconstruction.sources import of_source
 
 __all__ = ["RigCheck", "check_rig"]
 
@@ -54,14 +55,15 @@ def check_rig(
     InputError
         If there is no such thing to refine, or the aperture is "on" and none is known.
     """
+    data = of_source(measurement, "auto", preferred="displacements")  # pictures tell more, and take longer
     settings = NeRIF(
         time_limit=seconds, refine=tuple(refine), pose_sigma_mm=pose_sigma_mm, pose_sigma_deg=pose_sigma_deg,
         aperture=aperture,
     )  # fmt: skip
     with monitor.training("refining the rig") as told:
-        result = settings(measurement, told)
+        result = settings(data, told)
     with monitor.counting("how well the rig is known") as bar:
-        table = with_posterior(result.rig, seen_through(measurement, aperture), result.field, result.settings, bar)
+        table = with_posterior(result.rig, seen_through(data, aperture), result.field, result.settings, bar)
     lines = moved_lines(table)
     far = sum(row["moved"] > MOVED for row in table)
     remarks = lines[: len(lines) - far]
