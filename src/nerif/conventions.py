@@ -17,6 +17,7 @@ __all__ = [
     "FACES",
     "LARGEST_INDEX",
     "LARGEST_LENGTH",
+    "STATISTICS",
     "InputError",
     "Mask",
     "Matrix3",
@@ -42,6 +43,9 @@ DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
 
 AMBIENT_INDEX = 1.00027
 """Of air at 20 °C and one atmosphere, where nothing else is said."""
+
+STATISTICS = {"mean": "mean", "std": "standard deviation", "p05": "5th percentile", "p95": "95th percentile"}
+"""Endings of what repetitions of a reconstruction tell of a quantity (density_std), in words."""
 
 LARGEST_INDEX = 4.0
 """Of gases, liquids and glasses."""

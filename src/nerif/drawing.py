@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from nerif.conventions import STATISTICS
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from torch import Tensor
@@ -72,8 +74,7 @@ LABELS = {
 
 def drawn_of(quantities: Iterable[str]) -> tuple[str, ...]:
     """Return which of the quantities of a result are drawn: of an index n, which stands for the excess too."""
-    statistics = ("mean", "std")
-    return tuple(q for q in quantities if q != "index_excess" and q.rpartition("_")[2] not in statistics)
+    return tuple(q for q in quantities if q != "index_excess" and q.rpartition("_")[2] not in STATISTICS)
 
 
 @contextmanager
@@ -102,9 +103,9 @@ def style(size: float = 7.0) -> Iterator[None]:
 def label_of(quantity: str) -> str:
     """Return the label of a colour bar, with its unit: of density, density_std and so on."""
     base, _, statistic = quantity.rpartition("_")
-    if statistic in ("mean", "std") and base in LABELS:
+    if statistic in STATISTICS and base in LABELS:
         name, unit = LABELS[base]
-        return f"{'standard deviation of' if statistic == 'std' else 'mean'} {name} [{unit}]"
+        return f"{STATISTICS[statistic]} of {name} [{unit}]"
     name, unit = LABELS.get(quantity, (quantity, "1"))
     return f"{name} [{unit}]"
 

@@ -19,7 +19,7 @@ from nerif.fields.grid import VoxelField
 from nerif.gains import gains_of, with_gains
 from nerif.geometry import Box
 from nerif.measurement import Measurement
-from nerif.metrics import slice_metrics, view_metrics, volume_metrics
+from nerif.metrics import coverage, slice_metrics, view_metrics, volume_metrics
 from nerif.notebook import number
 from nerif.observation import Observation
 from nerif.prediction import check_sees, reproject
@@ -221,7 +221,9 @@ def _held_out(asked: Sequence[str] | None, settings: dict[str, Any], measurement
 
 
 def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
-    """Share of the truth's voxels within two standard deviations of the mean, if there is an ensemble."""
+    """How often the truth lies within the standard deviations, if there are any: from the ensemble's mean or, where
+    there is none, from the reconstruction.
+    """
     found = directory.volumes() if directory.has(VOLUME) else {}
     quantity = directory.quantity()
     if f"{quantity}_std" not in found:
@@ -232,8 +234,7 @@ def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
             return volume.values
         return VoxelField.through(volume.values, volume.grid).sample(truth.grid)
 
-    mean, std = (on_its_grid(found[f"{quantity}_{s}"]) for s in ("mean", "std"))
-    within = (truth.values - mean).abs() <= 2 * std
+    centre = on_its_grid(found.get(f"{quantity}_mean", found[quantity]))
+    std = on_its_grid(found[f"{quantity}_std"])
     flow = truth.values.abs() > FLOW * truth.values.abs().max()
-    share = {"share": float(within.float().mean()), "share_in_flow": float(within[flow].float().mean())}
-    return {"coverage": share}
+    return {"coverage": coverage((truth.values - centre).numpy(), std.numpy(), flow.numpy())}

@@ -5,11 +5,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-__all__ = ["correlation", "psnr", "slice_metrics", "ssim", "view_metrics", "volume_errors", "volume_metrics"]
+__all__ = [
+    "LEVELS", "correlation", "coverage", "psnr", "slice_metrics", "ssim", "view_metrics", "volume_errors",
+    "volume_metrics",
+]  # fmt: skip
 
 Array = np.ndarray
+
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+"""Shares of Gaussian errors, at which a reliability diagram is drawn."""
 
 
 def correlation(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> float:
@@ -101,3 +107,31 @@ def view_metrics(
             maps.append(structural_similarity(x, y, data_range=span, full=True)[1][valid])
         similarity = float(np.mean(maps))
     return {"cc": correlation(a, b), "ssim": similarity, "psnr": psnr(a, b), "rms": rms}
+
+
+def coverage(
+    error: Float[Array, "*n"], std: Float[Array, "*n"], flow: Bool[Array, "*n"]
+) -> dict[str, float | list[float]]:
+    """Return how often errors lie within standard deviations, everywhere and in the flow.
+
+    share and share_in_flow count those within two, share_in_one and share_in_one_in_flow those within one; reliability
+    lists, for each of LEVELS, the share in the flow within as many as hold that share of Gaussian errors; spearman is
+    the rank correlation of |error| and std, everywhere.
+
+    Source: Guo et al., On calibration of modern neural networks, Proc. ICML (2017), for the diagram.
+    """
+    from scipy.stats import norm, spearmanr
+
+    size, std = np.abs(error).ravel(), std.ravel()
+    inside = flow.ravel()
+    one, two = size <= std, size <= 2 * std
+    times = [float(norm.ppf((1 + level) / 2)) for level in LEVELS]
+    own, held = size[inside], std[inside]
+    return {
+        "share": float(two.mean()),
+        "share_in_flow": float(two[inside].mean()),
+        "share_in_one": float(one.mean()),
+        "share_in_one_in_flow": float(one[inside].mean()),
+        "reliability": [float((own <= z * held).mean()) for z in times],
+        "spearman": float(spearmanr(size, std).statistic),
+    }

@@ -376,12 +376,12 @@ def _checked(found: Any) -> dict[str, Any]:
         rows = found.get(name, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) and known in row for row in rows):
             raise ValueError(f"'{name}' is not a list of tables with '{known}'")
-    for name, known in (("ensemble", "members"), ("coverage", "share")):
+    for name, known in (("ensemble", "members"), ("uncertainty", "members"), ("coverage", "share")):
         table = found.get(name, {known: 0})
         if not isinstance(table, dict) or known not in table:
             raise ValueError(f"'{name}' is not a table with '{known}'")
-    ensemble = found.get("ensemble") or {}
-    for row in (*found.get("views", []), *(ensemble.get("left_out") or [])):  # older files knew displacements only
+    repeated = found.get("ensemble") or found.get("uncertainty") or {}
+    for row in (*found.get("views", []), *(repeated.get("left_out") or [])):  # older files knew displacements only
         for key, value in (("measured", "displacement"), ("unit", "px"), ("rms", row.get("rms_px"))):
             row.setdefault(key, value)
     return found

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError, ambient_index
+from nerif.conventions import STATISTICS, InputError, ambient_index
 from nerif.geometry import Grid
 
-__all__ = ["INDEX", "QUANTITIES", "STATISTICS", "Volume", "describe", "field_of", "name_of", "quantities_of"]
+__all__ = ["INDEX", "QUANTITIES", "Volume", "describe", "field_of", "name_of", "quantities_of"]
 
 QUANTITIES = {
     "index_excess": ("1", "refractive index minus that of the ambient"),
@@ -43,16 +43,12 @@ def name_of(quantity: str) -> str:
     return describe("n" if quantity == INDEX else quantity)[1]
 
 
-STATISTICS = {"mean": "mean", "std": "standard_deviation"}
-"""Endings of what an ensemble adds to a quantity (density_std), and CF's names for them."""
-
-
 def describe(quantity: str) -> tuple[str, str]:
-    """Return unit and long name of a quantity such as density, or density_std of an ensemble."""
+    """Return unit and long name of a quantity such as density, or density_std."""
     base, _, statistic = quantity.rpartition("_")
     if statistic in STATISTICS and base in QUANTITIES:
         unit, name = QUANTITIES[base]
-        return unit, f"{STATISTICS[statistic].replace('_', ' ')} of {name} over the ensemble"
+        return unit, f"{STATISTICS[statistic]} of {name}"
     return QUANTITIES.get(quantity, ("1", quantity))
 
 

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from nerif.atomic import atomic
-from nerif.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError
+from nerif.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
 from nerif.geometry import Box, Grid
 from nerif.netcdf import opened, values
-from nerif.volume import QUANTITIES, STATISTICS, Volume, describe, field_of, name_of
+from nerif.volume import QUANTITIES, Volume, describe, field_of, name_of
 from nerif.vti import read_vti
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["REFERENCES", "read_volume", "read_volumes", "write_netcdf"]
 
+CELL_METHODS = {"mean": "mean", "std": "standard_deviation"}  # that CF has names for
 REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
 
 
@@ -61,8 +62,8 @@ def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
     """How CF says that one variable is the spread of another."""
     base, _, statistic = quantity.rpartition("_")
     if statistic in STATISTICS and base in QUANTITIES:
-        return {"cell_methods": f"realization: {STATISTICS[statistic]}"}
-    beside = [v.quantity for v in volumes if v.quantity in (f"{quantity}_mean", f"{quantity}_std")]
+        return {"cell_methods": f"realization: {CELL_METHODS[statistic]}"} if statistic in CELL_METHODS else {}
+    beside = [v.quantity for v in volumes if v.quantity in [f"{quantity}_{name}" for name in STATISTICS]]
     return {"ancillary_variables": " ".join(beside)} if beside else {}
 
 

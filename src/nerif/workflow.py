@@ -28,9 +28,11 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.refined_rig import moved_lines, with_corrections
 from nerif.reconstruction.refit import refit
+from nerif.reconstruction.repetition import Repetitions
 from nerif.reconstruction.rig_posterior import with_posterior
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.trials import Trials
 from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
@@ -64,6 +66,9 @@ class Run:
     """Reconstruct so many times more with other seeds and noise, for mean and standard deviation of every quantity."""
     leave_one_out: bool = False
     """Let each member of the ensemble do without one view, in turn."""
+    uncertainty: str = "off"
+    """Reconstruct twice (fast) or eight times (full) more, without a view and of fields that are known, for standard
+    deviations of every quantity."""
     report: bool = True
     """Write report.html at the end."""
     checkpoint_every: float = 60.0
@@ -122,7 +127,7 @@ def reconstruct_into(
     if gains:
         monitor.say("gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in gains.items()))
         measurement, training = with_gains(measurement, gains), with_gains(training, gains)
-    _check_ensemble(run, training)
+    repetitions = _repetitions(run, training)
     run = replace(run, gas=run.gas.for_measurement(measurement))
     if measurement.bad_pixels:
         where = "the measurement" if path is None else path
@@ -130,7 +135,7 @@ def reconstruct_into(
         what = f"pixels left out whose {seen} or sigma is NaN, infinite or impossible"
         monitor.say(f"{where}: {measurement.bad_pixels} {what}")
     state = out.state() if resume else None
-    start = _start(run, measurement) if run.ensemble or not resume else None
+    start = _start(run, measurement) if repetitions is not None or not resume else None
     if not resume:
         out.check_free(force)
     ranks = Ranks.from_environment()
@@ -149,9 +154,9 @@ def reconstruct_into(
     begin(None)
     _write(out, measurement, result, run, settings, gains, voxels, monitor)
     try:
-        if run.ensemble and result.outcome.reason != "interrupted":
-            ensemble, made_of = Ensemble(run.ensemble, run.leave_one_out), {"start_from": str(run.start_from)}
-            members = Members(out, ensemble, reconstructor, training, start, made_of, monitor)
+        if repetitions is not None and result.outcome.reason != "interrupted":
+            made_of = {"start_from": str(run.start_from)}
+            members = Members(out, repetitions, reconstructor, training, start, made_of, monitor)
             members.add_to(result, run.gas, voxels)
     finally:  # the page of the main result, whatever becomes of the members
         if run.report:
@@ -248,13 +253,18 @@ def _write(
     )
 
 
-def _check_ensemble(run: Run, training: Measurement) -> None:
+def _repetitions(run: Run, training: Measurement) -> Repetitions | None:
+    """What is repeated to tell how far off the result may be, if anything; a wrong wish is refused before the work."""
+    trials = Trials(run.uncertainty)
     if run.ensemble:
-        Ensemble(run.ensemble)  # refuses a wrong number before the long work
+        if trials.members:
+            raise InputError(f"uncertainty: expected off together with --ensemble K, got '{run.uncertainty}'")
         if run.leave_one_out and len(training.cameras) < 2:
             raise InputError("leave_one_out: expected two training views or more, got one, which cannot be left out")
-    elif run.leave_one_out:
+        return Ensemble(run.ensemble, run.leave_one_out)
+    if run.leave_one_out:
         raise InputError("leave_one_out: expected together with --ensemble K, got no ensemble")
+    return trials if trials.members else None
 
 
 def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:
@@ -262,8 +272,9 @@ def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:
     if not isinstance(reconstructor, NeRIF):
         method = _method(reconstructor)
         raise InputError(f"method: expected nerif under torchrun, got '{method}', which runs in one process")
-    if run.ensemble:
-        raise InputError("ensemble: expected none under torchrun; run the ensemble in one process")
+    if run.ensemble or run.uncertainty != "off":
+        name = "ensemble" if run.ensemble else "uncertainty"
+        raise InputError(f"{name}: expected none under torchrun; run it in one process")
 
 
 def _start(run: Run, measurement: Measurement) -> Field | None:

@@ -45,8 +45,9 @@ def run(settings: Evaluate) -> dict[str, Any]:
     if settings.truth is not None:
         if "coverage" in metrics:
             share = metrics["coverage"]
-            say(f"truth within 2 standard deviations of the ensemble's mean: {share['share']:.1%} of the voxels,")
-            say(f"  {share['share_in_flow']:.1%} of those where the field is above {FLOW:.0%} of its largest")
+            one, two = share["share_in_one_in_flow"], share["share_in_flow"]
+            say(f"truth within 2 standard deviations in {share['share']:.1%} of the voxels; where the field is")
+            say(f"  above {FLOW:.0%} of its largest, in {two:.1%} (95 % would be right), within 1 in {one:.1%} (68 %)")
         if metrics["quantity"] == INDEX:
             say(f"L2            {metrics['l2']:8.3%}   |n_gt - n_rec| / |n_gt - 1|, the paper's")
             say(f"L2 variation  {metrics['l2_variation']:8.3%}   |n_gt - n_rec| / |n_gt - n_ambient|")

@@ -9,18 +9,19 @@ the method smooths away.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError
+from nerif.geometry import Grid
 from nerif.measurement import Measurement
-from nerif.reconstruction.base import Reconstructor
+from nerif.physics.quantities import GasSettings, derive_all
+from nerif.reconstruction.base import Reconstruction
+from nerif.reconstruction.repetition import Found, Member, other_seed
 from nerif.volume import Volume, describe
 
 __all__ = ["Ensemble", "Spread"]
@@ -43,6 +44,14 @@ class Ensemble:
         if self.members < 2:
             raise InputError(f"ensemble: expected 2 members or more (0 for none), got {self.members}")
 
+    @property
+    def word(self) -> str:
+        return "ensemble"
+
+    @property
+    def fewest(self) -> int:
+        return 2
+
     def left_out(self, number: int, measurement: Measurement) -> tuple[str, ...]:
         """Names of the views that member `number` (from 1) does without."""
         names = measurement.names
@@ -50,23 +59,10 @@ class Ensemble:
             return ()
         return (names[(number - 1) % len(names)],)
 
-    def member(
-        self,
-        number: int,
-        reconstructor: Reconstructor,
-        measurement: Measurement,
-        noise: Mapping[str, Float[Tensor, "view row column c"]],
-    ) -> tuple[Reconstructor, Measurement]:
-        """Return what member `number` is reconstructed by and from.
-
-        Parameters
-        ----------
-        number : 1 to members
-        reconstructor : settings of the run; its seed, if it has one, is moved on
-        measurement : what was measured
-        noise : standard deviation of the noise to add, by the name of the technique
-        """
-        seed = getattr(reconstructor, "seed", 0)
+    def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None] = ()) -> Member:
+        """Return member `number`, from 1 on: noise of the measurement's size is added once more."""
+        measurement, noise = found.measurement, found.noise()
+        seed = getattr(found.reconstructor, "seed", 0)
         generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + number)
         noisy, sigmas = {}, {}
         for o in measurement.observations:
@@ -74,28 +70,37 @@ class Ensemble:
             noisy[name] = o.values + noise[name] * torch.randn(o.values.shape, generator=generator)
             # the noise is there twice now, and independent: variances add
             sigmas[name] = None if o.sigma is None else o.sigma * math.sqrt(2)
-        member = measurement.observed(noisy, sigmas)
-        out = self.left_out(number, measurement)
+        member, out = measurement.observed(noisy, sigmas), self.left_out(number, measurement)
         if out:
             member = member.select([name for name in member.names if name not in out])
-        if any(f.name == "seed" for f in dataclasses.fields(reconstructor)):  # type: ignore[arg-type]
-            reconstructor = replace(reconstructor, seed=seed + number)  # type: ignore[type-var]
-        return reconstructor, member
+        about = "".join(f", without {name}" for name in out)
+        return Member(other_seed(found.reconstructor, number), member, out, about=about)
+
+    def taken(self, main: Volume, gas: GasSettings) -> Spread:
+        return Spread(main.grid, gas)
 
 
 @dataclass
 class Spread:
-    """Running mean and standard deviation of volumes by quantity (Welford's update); NaN where any member is masked."""
+    """Running mean and standard deviation of volumes by quantity (Welford's update); NaN where any member is masked.
 
+    Parameters
+    ----------
+    grid : on which members are sampled
+    gas : what density and temperature are computed for
+    """
+
+    grid: Grid
+    gas: GasSettings
     count: int = 0
     first: dict[str, Volume] = field(default_factory=dict)
     mean: dict[str, Tensor] = field(default_factory=dict)
     squares: dict[str, Tensor] = field(default_factory=dict)
 
-    def add(self, volumes: list[Volume]) -> None:
+    def add(self, member: Member, result: Reconstruction) -> None:
         """Take in the quantities of one more member."""
         self.count += 1
-        for v in volumes:
+        for v in derive_all(result.volume(self.grid), self.gas):
             values = v.values.double()
             if v.quantity not in self.first:
                 self.first[v.quantity] = v

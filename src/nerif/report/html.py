@@ -17,7 +17,8 @@ from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.moves_figure import draw_moved_rig, draw_moves
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
-from nerif.report.summary import came_out, headline, measured, trust, trust_figures
+from nerif.report.summary import came_out, headline, measured, repeated, trust, trust_figures
+from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
 from nerif.techniques.registry import technique_of
@@ -68,7 +69,7 @@ def render(result: Result) -> str:
         first_view=first,
         scales=scales,
         scores=metrics,
-        left_out=(result.metrics.get("ensemble") or {}).get("left_out") or [],
+        left_out=repeated(result).get("left_out") or [],
         curves=_curves(result),
         assumptions=[
             (name_of(q).capitalize(), result.volumes[q].notes)
@@ -76,6 +77,7 @@ def render(result: Result) -> str:
             if "assumption" in result.volumes[q].notes
         ],
         ensemble=result.metrics.get("ensemble"),
+        trials=result.metrics.get("uncertainty"),
         coverage=result.metrics.get("coverage"),
         settings=flat(result.settings),
         about=flat(result.about),
@@ -126,6 +128,12 @@ def _curves(result: Result) -> list[tuple[str, str]]:
         if result.reprojection is not None:
             cameras = result.reprojection.measurement.cameras
             found.append(("Where the cameras were moved to", svg(partial(draw_moved_rig, cameras=cameras, table=rig))))
+    for quantity in banded(result.volumes):
+        draw = partial(draw_bands, volumes=result.volumes, quantity=quantity)
+        found.append((f"{name_of(quantity).capitalize()} with bands that hold 90 %", svg(draw)))
+    if "reliability" in (result.metrics.get("coverage") or {}):
+        draw = partial(draw_reliability, coverage=result.metrics["coverage"])
+        found.append(("Are the bands right? Against the truth", svg(draw)))
     if result.metrics.get("slices"):
         slices = result.metrics["slices"]
         found.append(("Against the truth, slice by slice", svg(lambda axes: draw_slice_scores(axes, slices))))

@@ -30,6 +30,7 @@ from nerif.observation import Observation
 from nerif.report.figures import draw_history, draw_line, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.moves_figure import draw_moves
+from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import lattice_step
 from nerif.reprojection import Reprojection
 from nerif.result import Result
@@ -95,6 +96,14 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         figure = _page(single, 0.8)
         draw_view_scores(figure.subplots(), result.metrics["views"])
         yield "views", figure
+    for quantity in banded(result.volumes):
+        figure = _page(single, 0.7)
+        draw_bands(figure.subplots(), result.volumes, quantity)
+        yield f"bands_{quantity}", figure
+    if "reliability" in (result.metrics.get("coverage") or {}):
+        figure = _page(single, 0.9)
+        draw_reliability(figure.subplots(), result.metrics["coverage"])
+        yield "reliability", figure
     if result.history:
         figure = _page(single, 0.7)
         draw_history(figure.subplots(), result.history, str(result.settings.get("method", "nerif")))

@@ -128,7 +128,9 @@ def _variants(sources: dict[str, Volume]) -> dict[str, str]:
     """What can be switched to, and its button."""
     found = {"value": "Reconstruction"}
     if "mean" in sources:
-        found |= {"mean": "Ensemble mean", "std": "Standard deviation"}
+        found["mean"] = "Ensemble mean"
+    if "std" in sources:
+        found["std"] = "Standard deviation"
     if "error" in sources:
         found |= {"truth": "Truth", "error": "Error"}
     return found

@@ -19,7 +19,7 @@ from nerif.result import METRICS, VOLUME, Result
 from nerif.techniques.registry import TECHNIQUES
 from nerif.volume import INDEX, field_of, name_of
 
-__all__ = ["Statement", "came_out", "headline", "measured", "trust", "trust_figures"]
+__all__ = ["Statement", "came_out", "headline", "measured", "repeated", "trust", "trust_figures"]
 
 VITAL = (FIELD, METRICS, VOLUME)
 """Without these nothing can be said of a result; without the others less can be shown."""
@@ -114,15 +114,16 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
         if field_of(result.volumes) in (None, INDEX):  # the paper's L2 counts the ambient in
             errors += f", of the variation {m['l2_variation']:.2%}"
         rows.append(("Against the truth", f"{errors}; CC {number(m.get('cc'), 5)}, SSIM {number(m.get('ssim'), 4)}"))
-    ensemble = result.metrics.get("ensemble")
+    repetitions = repeated(result)
     found = field_of(result.volumes)
     spread = result.volumes.get("density_std", result.volumes.get(f"{found}_std"))
-    if isinstance(ensemble, dict) and spread is not None:
+    if repetitions and spread is not None:
         base = spread.quantity.removesuffix("_std")
         size = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
         name, unit = LABELS.get(base, (base, spread.unit))
         text = f"σ of {name} rms {with_unit(number(size, 2), unit)}"
-        rows.append((f"Ensemble of {ensemble.get('members')}", text))
+        kind = "Trials" if "uncertainty" in result.metrics else "Ensemble"
+        rows.append((f"{kind}, {repetitions.get('members')}", text))
     coverage = result.metrics.get("coverage")
     if isinstance(coverage, dict):
         flow = coverage.get("share_in_flow")
@@ -135,7 +136,7 @@ def trust(result: Result) -> list[Statement]:
     """Return what to know before trusting it, the gravest first."""
     found = [Statement("bad" if gap.what in VITAL else "note", gap.sentence) for gap in result.missing]
     found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_truth(result)
-    found += _of_gas(result) + _of_masks(result) + _of_ensemble(result) + _of_rig(result)
+    found += _of_gas(result) + _of_masks(result) + _of_repetitions(result) + _of_rig(result)
     return sorted(found, key=lambda s: -LEVELS.index(s.level))
 
 
@@ -192,10 +193,10 @@ def _of_outcome(result: Result) -> list[Statement]:
 
 def _of_held_out(result: Result) -> list[Statement]:
     seen, held = _views(result, False), _views(result, True)
-    left_out = (result.metrics.get("ensemble") or {}).get("left_out") or []
+    left_out = repeated(result).get("left_out") or []
     what = "The field predicts"
     if not held and left_out:
-        held, what = left_out, "Members of the ensemble predict"
+        held, what = left_out, "Repetitions without a view predict"
     if not held:
         if not seen:
             text = "The field was not compared with any view: nerif evaluate --measurement FILE does it."
@@ -269,12 +270,18 @@ def _of_gas(result: Result) -> list[Statement]:
     return [Statement("warning", f"{text}: density and temperature do not apply here. See --gas.composition.")]
 
 
-def _of_ensemble(result: Result) -> list[Statement]:
-    diverged = (result.metrics.get("ensemble") or {}).get("diverged") or []
+def repeated(result: Result) -> dict[str, Any]:
+    """Return what metrics.json tells of repetitions, of an ensemble or of trials; nothing where there are none."""
+    found = result.metrics.get("ensemble") or result.metrics.get("uncertainty")
+    return found if isinstance(found, dict) else {}
+
+
+def _of_repetitions(result: Result) -> list[Statement]:
+    diverged = repeated(result).get("diverged") or []
     if not diverged:
         return []
-    names = ", ".join(map(str, diverged))
-    return [Statement("warning", f"Members {names} of the ensemble diverged and are left out of mean and deviation.")]
+    names, which = ", ".join(map(str, diverged)), "trials" if "uncertainty" in result.metrics else "ensemble"
+    return [Statement("warning", f"Members {names} of the {which} diverged and are left out of the deviations.")]
 
 
 def _of_rig(result: Result) -> list[Statement]:

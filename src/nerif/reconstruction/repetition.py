@@ -1,0 +1,107 @@
+"""A reconstruction done again, to see how far off it may be: what every kind of repetition is given and gives."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.fields.base import Field
+from nerif.measurement import Measurement
+from nerif.physics.quantities import GasSettings
+from nerif.reconstruction.base import Reconstruction, Reconstructor
+from nerif.volume import Volume
+
+__all__ = ["Found", "Maps", "Member", "Repetitions", "Taken", "other_seed"]
+
+Maps = Mapping[str, Float[Tensor, "view row column c"]]
+"""What views see, or its noise, by the name of the technique."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What there is to repeat.
+
+    Parameters
+    ----------
+    result : of the reconstruction
+    reconstructor : settings it was made by
+    measurement : that it was made from
+    noise : gives the standard deviation of what was measured, pixel by pixel
+    seen : gives what the views would see of a field, and of them those that are named
+    """
+
+    result: Reconstruction
+    reconstructor: Reconstructor
+    measurement: Measurement
+    noise: Callable[[], Maps]
+    seen: Callable[[Field], Maps]
+
+
+@dataclass(frozen=True)
+class Member:
+    """One repetition.
+
+    Parameters
+    ----------
+    reconstructor : settings
+    measurement : what it is reconstructed from
+    left_out : views of the measurement that are not in it
+    expected : what it would find if it made no error, where that is known
+    about : what is particular to it, in words
+    """
+
+    reconstructor: Reconstructor
+    measurement: Measurement
+    left_out: tuple[str, ...] = ()
+    expected: Volume | None = None
+    about: str = ""
+
+
+@runtime_checkable
+class Taken(Protocol):
+    """What becomes of the repetitions, taken in one by one."""
+
+    @property
+    def count(self) -> int:
+        """How many were."""
+
+    def add(self, member: Member, result: Reconstruction) -> None:
+        """Take in what one more has found."""
+
+    def volumes(self) -> list[Volume]:
+        """Return what they tell of every quantity."""
+
+
+@runtime_checkable
+class Repetitions(Protocol):
+    """A kind of repetitions, how many, and what each is reconstructed from."""
+
+    @property
+    def word(self) -> str:
+        """What it is called, in metrics.json and to the user."""
+
+    @property
+    def members(self) -> int:
+        """How many."""
+
+    @property
+    def fewest(self) -> int:
+        """How many have to succeed."""
+
+    def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
+        """Return one of them, from 1 on, by what those before have found; None where one has failed."""
+
+    def taken(self, main: Volume, gas: GasSettings) -> Taken:
+        """Return what takes them in, beside the main result as it is written."""
+
+
+def other_seed(reconstructor: Reconstructor, number: int) -> Reconstructor:
+    """Return settings with another seed, if they have one."""
+    if not any(f.name == "seed" for f in dataclasses.fields(reconstructor)):  # type: ignore[arg-type]
+        return reconstructor
+    return replace(reconstructor, seed=getattr(reconstructor, "seed") + number)  # type: ignore[type-var]  # noqa: B009

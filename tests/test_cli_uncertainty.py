@@ -1,0 +1,98 @@
+"""nerif reconstruct --uncertainty from end to end: files, report, resuming, refusals."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from nerif.cli import main
+
+RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "4", "--steps", "30", "--truth-voxels", "12"]
+QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]
+QUICK += ["--regularisation", "0.01"]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny measurement with noise, and its truth."""
+    path = tmp_path_factory.mktemp("uncertainty") / "m.nc"
+    assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", str(path), *RIG]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(measured: Path) -> tuple[Path, str]:
+    """A result with fast standard deviations, compared with the truth, and what was said meanwhile."""
+    out, said = measured.parent / "r", io.StringIO()
+    with redirect_stdout(said):
+        assert main(["reconstruct", str(measured), "-o", str(out), *QUICK, "--uncertainty", "fast"]) == 0
+        assert main(["evaluate", str(out), "--truth", str(measured.with_suffix(".truth.nc"))]) == 0
+    return out, said.getvalue()
+
+
+def test_standard_deviations_and_percentiles_are_written(result):
+    out, said = result
+    assert "uncertainty of 2: rms standard deviation of index_excess" in said
+    with xr.open_dataset(out / "volume.nc") as volume:
+        for quantity in ("index_excess", "n", "density", "temperature"):
+            assert volume[f"{quantity}_std"].attrs["members"] == 2
+            assert f"{quantity}_std" in volume[quantity].attrs["ancillary_variables"]
+            assert f"{quantity}_mean" not in volume
+        assert "standard_deviation" in volume["density_std"].attrs["cell_methods"]
+        assert volume["temperature_p95"].attrs["long_name"] == "95th percentile of temperature"
+        assert "cell_methods" not in volume["temperature_p95"].attrs
+        low, high = volume["temperature_p05"].values, volume["temperature_p95"].values
+        assert bool((low < high)[np.isfinite(low) & np.isfinite(high)].all())
+        assert float(volume["index_excess_std"].min()) > 0
+    about = json.loads((out / "metrics.json").read_text())["uncertainty"]
+    assert (about["kind"], about["members"], about["diverged"]) == ("fast", 2, [])
+    assert len(about["left_out"]) == 1
+
+
+def test_the_truth_is_compared_with_them(result):
+    out, said = result
+    coverage = json.loads((out / "metrics.json").read_text())["coverage"]
+    assert 0 <= coverage["share_in_one_in_flow"] <= coverage["share_in_flow"] <= 1
+    assert coverage["reliability"] == sorted(coverage["reliability"])
+    assert "truth within 2 standard deviations" in said
+    assert main(["report", str(out)]) == 0
+    page = (out / "report.html").read_text()
+    for words in ("Standard deviation", "Density with bands that hold 90 %", "Are the bands right?", "Trials, 2"):
+        assert words in page
+    assert main(["figures", str(out)]) == 0
+    names = {path.stem for path in (out / "figures").iterdir()}
+    assert {"bands_density", "bands_temperature", "reliability", "slices_density_std"} <= names
+
+
+def test_trials_that_are_there_are_not_done_again(result, tmp_path):
+    out = Path(shutil.copytree(result[0], tmp_path / "r"))
+    with xr.open_dataset(out / "volume.nc") as volume:
+        before = volume["index_excess_std"].values
+    stamps = {p: p.stat().st_mtime_ns for p in sorted((out / "ensemble").rglob("field.safetensors"))}
+    assert len(stamps) == 2
+    (out / "ensemble" / "02" / "field.safetensors").write_bytes(b"broken")
+    assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
+    with xr.open_dataset(out / "volume.nc") as volume:
+        after = volume["index_excess_std"].values  # the main result has gone on by a little
+    assert float(after.mean()) == pytest.approx(float(before.mean()), rel=0.02)
+    assert [p.stat().st_mtime_ns != stamp for p, stamp in stamps.items()] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--uncertainty", "quick"], "uncertainty: expected one of off, fast, full, got 'quick'"),
+        (["--uncertainty", "fast", "--ensemble", "3"], "uncertainty: expected off together with --ensemble"),
+    ],
+)
+def test_refusals(measured, tmp_path, capsys, more, words):
+    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), *QUICK, *more]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
