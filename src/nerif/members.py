@@ -77,7 +77,7 @@ class Members:
             member = self.kind.member(number, found, earlier)
             result = self._result(number, member)
             if result.outcome.reason == "interrupted":
-                say(f"{word}: interrupted after {taken.count} of {self.kind.members} members; --resume goes on")
+                say(f"{word}: interrupted after {number - 1} of {self.kind.members} members; --resume goes on")
                 break
             earlier.append(None if result.outcome.failed else result)
             if result.outcome.failed:
@@ -91,10 +91,11 @@ class Members:
         if taken.count < self.kind.fewest:
             say(f"{word}: {taken.count} members are too few for a standard deviation; none is written")
             return
+        done = sum(result is not None for result in earlier)
         volumes = [*quantities, *taken.volumes()]
         self.out.write_volumes(volumes)
         about: dict[str, Any] = {
-            **dataclasses.asdict(self.kind), "members": taken.count, "diverged": diverged, "noise": source,  # type: ignore[call-overload]
+            **dataclasses.asdict(self.kind), "members": done, "diverged": diverged, "noise": source,  # type: ignore[call-overload]
             "left_out": left_out, "seconds": time.monotonic() - started,
         }  # fmt: skip
         self.out.add_metrics({word: about})
@@ -104,7 +105,7 @@ class Members:
         largest = float(volumes[0].values.abs().max())
         rms = float(excess.values.square().mean().sqrt())
         share = f"{rms / largest:.2%} of the largest"
-        say(f"{word} of {taken.count}: rms standard deviation of {volumes[0].quantity} {rms:.3g}, {share}")
+        say(f"{word} of {done}: rms standard deviation of {volumes[0].quantity} {rms:.3g}, {share}")
         for v in left_out:
             say(f"left out {v['name']}: CC {v['cc']:.4f}, rms error {rms_text(v)}")
 

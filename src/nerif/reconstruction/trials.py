@@ -1,12 +1,13 @@
 """How far off a reconstruction may be, from a few more of them whose errors are known.
 
-    std(x)^2 = FACTOR^2 / 2 G * (mean_j (q_-j - q)^2 + mean_j (q'_j - p_j)^2)(x),      p_j = q + s_j (q - q_-j)
+    std(x)^2 = G * mean_j (q'_j - p_j)^2 (x),      p_j = q + SHARE (q - q_-j)
 
-One kind does without a view: how far q_-j is from q is what that view told. The other is of a field p_j that is known,
-seen by the same cameras: q changed once more by what a view told, so that it holds, where the views tell least, what
-they may have missed. What it looks like is predicted, with what the reconstruction left unexplained added in blocks of
-random sign: whatever noise there is, of the right size and correlated as it is. Errors of few such trials are noisy, so
-squares are averaged around each voxel by a Gaussian G, WIDTH wide. No trial sees a truth.
+Trials come in pairs. One does without a view: where it differs from q, q_-j tells what that view told. The other is of
+a field p_j that is known, seen by the same cameras: q changed once more by what a view told, so that it holds, where
+the views tell least, what they may have missed. What it looks like is predicted, with what the reconstruction left
+unexplained added in blocks of random sign: whatever noise there is, of the right size and correlated as it is. How far
+the reconstruction q'_j of it is off is an error as q may have it. One error is noisy, so squares are averaged around
+each voxel by a Gaussian G, WIDTH wide. No trial sees a truth.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ __all__ = ["KINDS", "Deviations", "Trials", "best_covered"]
 KINDS = {"off": 0, "fast": 1, "full": 4}
 """Trials without a view, and as many of a field that is known."""
 
-FACTOR = 1.0  # from benchmarks/trust.py, over phantoms of development
+SHARE = 0.5  # 0 stays below the errors of flames, 1 above those of smooth balls (docs/architecture.md)
 WIDTH = 0.04  # of the box edge, standard deviation
 VOXELS = 64  # along the longest edge, on which errors are compared
 BLOCK = 8  # px, in which what is left unexplained keeps its sign
@@ -66,7 +67,7 @@ class Trials:
 
     @property
     def fewest(self) -> int:
-        return 2
+        return 1
 
     def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
         """Return a trial: those of odd numbers do without a view, each followed by one of a field that is known."""
@@ -76,11 +77,11 @@ class Trials:
         out = order[((number - 1) // 2) % len(order)]
         if number % 2 and len(order) > 1:
             rest = measurement.select([name for name in measurement.names if name != out])
-            return Member(method, rest, (out,), volume, f", without {out}")
+            return Member(method, rest, (out,), about=f", without {out}")
         known = volume.values.double()
         before = earlier[number - 2] if number > 1 else None
         if before is not None and len(order) > 1:
-            known = known + (known - _sampled(before).values.double())
+            known = known + SHARE * (known - _sampled(before).values.double())
         drawn = torch.Generator().manual_seed(2_000_003 + number)
         expected = Volume.of(known, volume.grid, volume.quantity, found.result.n_ambient)
         simulated = _simulated(found, volume, expected, drawn)
@@ -141,32 +142,30 @@ class Deviations:
 
     def __init__(self, main: Volume, gas: GasSettings) -> None:
         self.main, self.gas = main, gas
-        self.squares: dict[bool, list[Tensor]] = {True: [], False: []}
-        """Of trials without a view, and of those of a field that is known."""
+        self.squares: list[Tensor] = []
         self.grid: Grid | None = None
 
     @property
     def count(self) -> int:
-        """How many trials were taken in."""
-        return sum(len(squares) for squares in self.squares.values())
+        """How many errors are known."""
+        return len(self.squares)
 
     def add(self, member: Member, result: Reconstruction) -> None:
-        """Take in what one more has found."""
-        assert member.expected is not None
-        self.grid = member.expected.grid
-        error = result.volume(self.grid).values.double() - member.expected.values.double()
-        self.squares[bool(member.left_out)].append(error.square())
+        """Take in what one more has found, if it is known what it should have."""
+        if member.expected is not None:
+            self.grid = member.expected.grid
+            error = result.volume(self.grid).values.double() - member.expected.values.double()
+            self.squares.append(error.square())
 
     def std(self) -> Volume:
         """Return the standard deviation of the field."""
         from scipy.ndimage import gaussian_filter
 
         assert self.grid is not None
-        kinds = [torch.stack(squares).mean(dim=0) for squares in self.squares.values() if squares]
-        mean = torch.stack(kinds).mean(dim=0)
+        mean = torch.stack(self.squares).mean(dim=0)
         edge = math.prod(self.grid.box.edges) ** (1 / 3)
         width = [WIDTH * edge / h for h in self.grid.spacing[::-1]]  # voxels along z, y, x
-        local = FACTOR * torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")).sqrt()
+        local = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")).sqrt()
         values = VoxelField.through(local, self.grid).sample(self.main.grid).clamp(min=0)
         return Volume(values, self.main.grid, f"{self.main.quantity}_std")
 
@@ -198,7 +197,7 @@ class Deviations:
     def _statistic(self, quantity: str, statistic: str, values: Tensor) -> Volume:
         label = f"{quantity}_{statistic}"
         derived = derive(self.main, quantity, self.gas)
-        notes: dict[str, float | str] = {"members": self.count}
+        notes: dict[str, float | str] = {"trials": self.count}
         if "assumption" in derived.notes:
             masked = {"masked_voxels": int(torch.isnan(values).sum()), "masked_where": derived.notes["masked_where"]}
             notes |= {"assumption": derived.notes["assumption"], **masked}
