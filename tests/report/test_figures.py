@@ -101,7 +101,7 @@ def test_the_command_writes_pdf_and_png(copy, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "left out: volume.nc is not there" in out
     assert sorted(p.name for p in (tmp_path / "f").iterdir()) == [
-        f"{n}.{e}" for n in ("history", "slice_scores", "views") for e in ("pdf", "png")
+        f"{n}.{e}" for n in ("history", "reliability", "slice_scores", "views") for e in ("pdf", "png")
     ]
     assert (tmp_path / "f" / "views.pdf").read_bytes().startswith(b"%PDF")
 
@@ -211,7 +211,7 @@ def test_colours_do_not_go_to_a_few_outliers(volume):
     [
         ("n", "n − 1 [1]"),
         ("density_std", "standard deviation of density [kg m⁻³]"),
-        ("temperature_mean", "mean temperature [K]"),
+        ("temperature_mean", "mean of temperature [K]"),
         ("concentration", "concentration [1]"),
     ],
 )

@@ -122,8 +122,8 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
         size = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
         name, unit = LABELS.get(base, (base, spread.unit))
         text = f"σ of {name} rms {with_unit(number(size, 2), unit)}"
-        kind = "Trials" if "uncertainty" in result.metrics else "Ensemble"
-        rows.append((f"{kind}, {repetitions.get('members')}", text))
+        kind, count = result.metrics.get("ensemble"), repetitions.get("members")
+        rows.append((f"Ensemble of {count}" if kind else f"Error bars by {count} trials", text))
     coverage = result.metrics.get("coverage")
     if isinstance(coverage, dict):
         flow = coverage.get("share_in_flow")
