@@ -65,7 +65,8 @@ def test_the_truth_is_compared_with_them(result):
     assert "truth within 2 standard deviations" in said
     assert main(["report", str(out)]) == 0
     page = (out / "report.html").read_text()
-    for words in ("Standard deviation", "Density with bands that hold 90 %", "Are the bands right?", "Error bars by 2 trials"):
+    told = ("Standard deviation", "Density with bands that hold 90 %", "Are the bands right?", "Error bars by 2 trials")
+    for words in told:
         assert words in page
 
 

@@ -183,6 +183,7 @@ def test_a_file_keeps_the_lenses(wide, tmp_path):
     assert all(c.lens is None for c in Measurement.from_dataset(dataset).cameras)
 
 
+@pytest.mark.slow
 def test_knowing_the_lens_pays(wide):
     truth = flame().sample(grid := Grid.of_resolution(BOX, 32))
     errors = []
