@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import torch
@@ -67,8 +68,8 @@ class Members:
         done so far. One that diverges is left out, and told.
         """
         say, started, word = self.monitor.say, time.monotonic(), self.kind.word
-        noise, source = self._noise(main)
-        found = Found(main, self.reconstructor, self.training, lambda: noise, lambda f: self._seen(f, main))
+        noise = cache(lambda: self._noise(main))  # which not every kind asks for
+        found = Found(main, self.reconstructor, self.training, lambda: noise()[0], lambda f: self._seen(f, main))
         quantities = all_quantities(main, gas, voxels)
         taken = self.kind.taken(quantities[0], gas)
         earlier: list[Reconstruction | None] = []
@@ -95,9 +96,11 @@ class Members:
         volumes = [*quantities, *taken.volumes()]
         self.out.write_volumes(volumes)
         about: dict[str, Any] = {
-            **dataclasses.asdict(self.kind), "members": done, "diverged": diverged, "noise": source,  # type: ignore[call-overload]
+            **dataclasses.asdict(self.kind), "members": done, "diverged": diverged,  # type: ignore[call-overload]
             "left_out": left_out, "seconds": time.monotonic() - started,
         }  # fmt: skip
+        if noise.cache_info().currsize:
+            about["noise"] = noise()[1]
         self.out.add_metrics({word: about})
         for line in masked_lines(volumes):
             say(line)

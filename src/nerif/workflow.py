@@ -156,7 +156,8 @@ def reconstruct_into(
     try:
         if repetitions is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
-            members = Members(out, repetitions, reconstructor, training, start, made_of, monitor)
+            known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
+            members = Members(out, repetitions, reconstructor, known, start, made_of, monitor)
             members.add_to(result, run.gas, voxels)
     finally:  # the page of the main result, whatever becomes of the members
         if run.report:

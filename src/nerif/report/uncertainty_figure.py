@@ -9,6 +9,7 @@ import numpy as np
 
 from nerif.drawing import COLOURS, drawn_of, label_of, shown
 from nerif.metrics import LEVELS
+from nerif.reconstruction.trials import TAILS
 from nerif.volume import Volume
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["banded", "draw_bands", "draw_reliability"]
 
-WIDE = 1.645  # standard deviations on either side of a band of 90 %
+WIDE = TAILS["p95"]  # standard deviations on either side of a band of 90 %
 
 
 def banded(volumes: Mapping[str, Volume]) -> list[str]:
@@ -32,7 +33,7 @@ def draw_bands(axes: Axes, volumes: Mapping[str, Volume], quantity: str) -> Axes
     volumes : of a result, the quantity and its standard deviation among them, and its percentiles if it has some
     quantity : one of `banded`
     """
-    volume = volumes[quantity]
+    volume = volumes.get(f"{quantity}_mean", volumes[quantity])  # an ensemble's deviations are about its mean
     values, std = shown(volume), volumes[f"{quantity}_std"].values.double().numpy()
     ends = [volumes.get(f"{quantity}_{name}") for name in ("p05", "p95")]
     low, high = (
