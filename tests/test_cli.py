@@ -252,7 +252,8 @@ def test_ctrl_c_leaves_a_usable_result_to_resume(work, tmp_path):
     out = tmp_path / "r"
     command = [sys.executable, "-m", "nerif", "reconstruct", str(work / "m.nc"), "-o", str(out), "--no-report", *QUICK]
     command[command.index("--max-steps") + 1] = "100000"
-    process = subprocess.Popen([*command, "--checkpoint-every", "0.2"], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+    command += ["--checkpoint-every", "0.2", "--hold-out", "none"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     deadline = time.monotonic() + 90
     while not (out / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -12,7 +12,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions", "netcdf", "toml"),
+    ("atomic", "conventions", "json_file", "netcdf", "toml"),
     ("geometry",),
     ("techniques",),
     ("drawing",),
@@ -27,7 +27,7 @@ LAYERS = (
     ("reconstruction",),
     ("result", "monitor"),
     ("prediction", "evaluation", "consistency", "rig_check", "mistakes", "quick_views", "symptoms", "gains"),
-    ("members",),
+    ("kept_run", "members", "first_look"),
     ("report", "sequence"),
     ("workflow",),
     ("commands",),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -12,25 +11,20 @@ from typing import Any
 
 import torch
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, rms_text
 from nerif.fields.base import Field
 from nerif.geometry import Grid
+from nerif.kept_run import KeptRun
 from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.prediction import reproject
-from nerif.reconstruction.base import Outcome, Reconstruction, Reconstructor
-from nerif.reconstruction.files import FIELD
-from nerif.reconstruction.fingerprint import fingerprint
-from nerif.reconstruction.repetition import Found, Maps, Member, Repetitions
+from nerif.reconstruction.base import Reconstruction, Reconstructor
+from nerif.reconstruction.repetition import Found, Maps, Repetitions
 from nerif.result import ResultDirectory
 from nerif.volume import Volume
 
 __all__ = ["Members", "all_quantities"]
-
-ASKED = "asked.json"
 
 
 def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
@@ -50,6 +44,7 @@ class Members:
     training : what that was reconstructed from
     start : field that every one starts from, or None
     made_of : what else they depend on; those made of anything else are done again
+    checkpoint_every : seconds
     monitor : told how the work goes
     """
 
@@ -59,6 +54,7 @@ class Members:
     training: Measurement
     start: Field | None = None
     made_of: Mapping[str, str] = field(default_factory=dict)
+    checkpoint_every: float = 60.0
     monitor: Monitor = QUIET
 
     def add_to(self, main: Reconstruction, gas: GasSettings, voxels: int) -> None:
@@ -76,7 +72,11 @@ class Members:
         left_out, diverged = [], []
         for number in range(1, self.kind.members + 1):
             member = self.kind.member(number, found, earlier)
-            result = self._result(number, member)
+            kept = KeptRun(
+                self.out.member(number), member.reconstructor, member.measurement, self.start, self.made_of,
+                self.checkpoint_every, self.monitor,
+            )  # fmt: skip
+            result = kept(f"member {number} of {self.kind.members}{member.about}")
             if result.outcome.reason == "interrupted":
                 say(f"{word}: interrupted after {number - 1} of {self.kind.members} members; --resume goes on")
                 break
@@ -133,36 +133,6 @@ class Members:
             rms = torch.tensor([views.get((o.technique.measured, name), 0.0) for name in training.names])
             noise[o.technique.name] = rms.nan_to_num(0.0)[:, None, None, None].expand(o.values.shape).clone()
         return noise, "rms residual"
-
-    def _result(self, number: int, member: Member) -> Reconstruction:
-        """One of them: read if it is there already, made by the same settings from the same data, or reconstructed."""
-        directory = self.out.member(number)
-        reconstructor, data = member.reconstructor, member.measurement
-        made_of = self._made_of(reconstructor, data)
-        if directory.has(FIELD) and directory.has(ASKED) and (directory / ASKED).read_text() == made_of:
-            try:
-                kept, settings = Outcome("converged", "read from disc"), dataclasses.asdict(reconstructor)  # type: ignore[call-overload]
-                return Reconstruction(*directory.field(), [], kept, settings, quantity=directory.quantity())
-            except InputError as error:
-                self.monitor.say(f"{error}; this member is done again")
-        with self.monitor.training(f"member {number} of {self.kind.members}{member.about}") as told:
-            result = reconstructor(data, told, None, self.start)
-        if result.outcome.reason != "interrupted" and not result.outcome.failed:
-            directory.path.mkdir(parents=True, exist_ok=True)
-            (directory / ASKED).unlink(missing_ok=True)
-            directory.write_field(dataclasses.replace(result, state=None))
-            with atomic(directory / ASKED) as part:
-                part.write_text(made_of)
-        return result
-
-    def _made_of(self, reconstructor: Reconstructor, data: Measurement) -> str:
-        """What a member was made by and from, as text: another one of either gives another text."""
-        asked = {
-            "data": fingerprint(data),
-            **self.made_of,
-            **dataclasses.asdict(reconstructor),  # type: ignore[call-overload]
-        }
-        return json.dumps(asked, indent=1, default=str) + "\n"
 
 
 def _compared(result: Reconstruction, data: Measurement, held_out: Collection[str] = ()) -> list[dict[str, Any]]:

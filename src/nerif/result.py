@@ -19,6 +19,7 @@ from nerif.conventions import InputError
 from nerif.exports import export
 from nerif.fields.base import Field
 from nerif.geometry import Box
+from nerif.json_file import write_json
 from nerif.measurement import Measurement
 from nerif.reconstruction import files as kept
 from nerif.reconstruction.base import Reconstruction, State
@@ -30,12 +31,11 @@ from nerif.volume_file import read_volume, read_volumes
 
 __all__ = [
     "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions",
-    "write_json",
 ]  # fmt: skip
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
-ENSEMBLE, FIGURES, CALIBRATION = "ensemble", "figures", "calibration.toml"
+ENSEMBLE, FIRST_LOOK, FIGURES, CALIBRATION = "ensemble", "first_look", "figures", "calibration.toml"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
@@ -149,7 +149,7 @@ class ResultDirectory:
         """Remove the files of a reconstruction, and nothing else."""
         for name in FILES:
             (self.path / name).unlink(missing_ok=True)
-        for name in (ENSEMBLE, FIGURES):
+        for name in (ENSEMBLE, FIRST_LOOK, FIGURES):
             shutil.rmtree(self.path / name, ignore_errors=True)
 
     def write_settings(self, settings: Mapping[str, Any], about: Mapping[str, Any] | None = None) -> None:
@@ -241,6 +241,11 @@ class ResultDirectory:
     def member(self, number: int) -> ResultDirectory:
         """Return the directory of one member of an ensemble."""
         return ResultDirectory(self.path / ENSEMBLE / f"{number:02d}")
+
+    @property
+    def first_look(self) -> ResultDirectory:
+        """The directory of what was found while a view was kept out."""
+        return ResultDirectory(self.path / FIRST_LOOK)
 
     def read(self) -> Result:
         """Read what there is, whole, half-finished or broken: what is missing is told in the Result, never fatal.
@@ -336,22 +341,6 @@ def versions() -> dict[str, str]:
     }
 
 
-def write_json(path: Path, entries: Mapping[str, Any]) -> None:
-    """Write a JSON file, atomically; NaN and infinity as null."""
-    with atomic(path) as part:
-        part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def _without_none(value: Any) -> Any:
     """Settings as TOML has them: no word for nothing, paths as text."""
     if isinstance(value, Mapping):
@@ -376,12 +365,16 @@ def _checked(found: Any) -> dict[str, Any]:
         rows = found.get(name, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) and known in row for row in rows):
             raise ValueError(f"'{name}' is not a list of tables with '{known}'")
-    for name, known in (("ensemble", "members"), ("uncertainty", "members"), ("coverage", "share")):
+    for name, known in (
+        ("ensemble", "members"), ("uncertainty", "members"), ("coverage", "share"), ("first_look", "views"),
+    ):  # fmt: skip
         table = found.get(name, {known: 0})
         if not isinstance(table, dict) or known not in table:
             raise ValueError(f"'{name}' is not a table with '{known}'")
     repeated = found.get("ensemble") or found.get("uncertainty") or {}
-    for row in (*found.get("views", []), *(repeated.get("left_out") or [])):  # older files knew displacements only
+    first = found.get("first_look", {}).get("views") or []
+    # older files knew displacements only
+    for row in (*found.get("views", []), *(repeated.get("left_out") or []), *first):
         for key, value in (("measured", "displacement"), ("unit", "px"), ("rms", row.get("rms_px"))):
             row.setdefault(key, value)
     return found

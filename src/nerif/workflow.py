@@ -11,6 +11,7 @@ from typing import Any
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
+from nerif.first_look import AUTO, FEWEST, FirstLook, kept_out
 from nerif.gains import fit_gains, with_gains
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.measurement import Measurement
@@ -21,7 +22,7 @@ from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
-from nerif.reconstruction.files import checkpoints
+from nerif.reconstruction.files import CHECKPOINT, checkpoints
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
@@ -56,8 +57,9 @@ METHODS: dict[str, type[Reconstructor]] = {
 class Run:
     """What is asked of a reconstruction into a directory, beside the settings of the method."""
 
-    hold_out: tuple[str, ...] = ()
-    """Views kept out of the reconstruction and re-projected from it."""
+    hold_out: tuple[str, ...] = AUTO
+    """Views kept out of the reconstruction and re-projected from it; auto: one is kept out of a short run first, from
+    which the run with all goes on; none."""
     start_from: Path | None = None
     """Result directory of another reconstruction in the same box, of any method, to start from."""
     fit_gains: bool = False
@@ -122,7 +124,8 @@ def reconstruct_into(
         voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
     if voxels < 1:
         raise InputError(f"voxels: expected at least 1, got {voxels}")
-    training = measurement.without(run.hold_out)
+    unseen = kept_out(run.hold_out, measurement.names)
+    training = measurement.without(unseen)
     gains = fit_gains(training) if run.fit_gains else {}
     if gains:
         monitor.say("gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in gains.items()))
@@ -134,7 +137,8 @@ def reconstruct_into(
         seen = " or ".join(o.technique.measured for o in measurement.observations)
         what = f"pixels left out whose {seen} or sigma is NaN, infinite or impossible"
         monitor.say(f"{where}: {measurement.bad_pixels} {what}")
-    state = out.state() if resume else None
+    look = _first_look(out, run, reconstructor, training, repetitions, not resume, monitor)
+    state = out.state() if resume and (look is None or out.has(CHECKPOINT) or not look.begun) else None
     start = _start(run, measurement) if repetitions is not None or not resume else None
     if not resume:
         out.check_free(force)
@@ -147,17 +151,26 @@ def reconstruct_into(
     settings = _settings(run, path, reconstructor, voxels, keep or {})
     if "density" not in quantities_of(measurement.quantity):
         del settings["gas"]
-    begin = _begin(out, settings, resume)
-    with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
-        callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
-        result = reconstructor(training, compose(*callbacks), state, start if state is None else None)
+    run, begin = replace(run, hold_out=unseen), _begin(out, settings, resume)
+    first, method, origin = look(begin) if look is not None and state is None else None, reconstructor, start
+    if first is not None:
+        origin, method = first.field, reconstructor.in_two()[1]
+    if look is not None and first is not None and first.outcome.reason == "interrupted":
+        result, run = replace(first, state=None), replace(run, hold_out=(*unseen, look.view))
+    else:
+        with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
+            callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
+            result = method(training, compose(*callbacks), state, origin if state is None else None)
     begin(None)
-    _write(out, measurement, result, run, settings, gains, voxels, monitor)
+    scores = {} if look is None else look.scores()
+    _write(out, measurement, result, run, settings, gains, voxels, monitor, {"first_look": scores} if scores else {})
     try:
         if repetitions is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
             known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
-            members = Members(out, repetitions, reconstructor, known, start, made_of, monitor)
+            members = Members(
+                out, repetitions, reconstructor, known, start, made_of, run.checkpoint_every, monitor
+            )
             members.add_to(result, run.gas, voxels)
     finally:  # the page of the main result, whatever becomes of the members
         if run.report:
@@ -203,6 +216,7 @@ def _write(
     gains: dict[str, float],
     voxels: int,
     monitor: Monitor,
+    metrics: dict[str, Any],
 ) -> None:
     """Write what came out: the field first, it is the costliest; what only looks at it comes last."""
     out.write_field(result)
@@ -212,7 +226,8 @@ def _write(
     out.write_volumes(volumes)
     for line in masked_lines(volumes):
         monitor.say(line)
-    metrics: dict[str, Any] = {
+    metrics = {
+        **metrics,
         "seconds": result.seconds,
         "peak_memory_bytes": result.peak_memory_bytes,
         "device": result.device,
@@ -266,6 +281,20 @@ def _repetitions(run: Run, training: Measurement) -> Repetitions | None:
     if run.leave_one_out:
         raise InputError("leave_one_out: expected together with --ensemble K, got no ensemble")
     return trials if trials.members else None
+
+
+def _first_look(
+    out: ResultDirectory, run: Run, reconstructor: Reconstructor, training: Measurement,
+    repetitions: Repetitions | None, afresh: bool, monitor: Monitor,
+) -> FirstLook | None:  # fmt: skip
+    """The short run without a view, unless other runs without one are asked for, or the start has seen them all."""
+    if run.hold_out != AUTO or AUTO[0] in training.names or run.start_from is not None:
+        return None
+    if len(training.cameras) < FEWEST or Ranks.from_environment().size > 1:
+        return None
+    if repetitions is not None and repetitions.without_views:
+        return None
+    return FirstLook(out, reconstructor, training, run.checkpoint_every, monitor, afresh)
 
 
 def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:

@@ -197,3 +197,7 @@ class Reconstructor(ABC):
             If nothing in the measurement fixes the ambient index, no ray is left, the device does not exist or has too
             little memory, or `resume` is of another method, other settings or other data.
         """
+
+    @abstractmethod
+    def in_two(self) -> tuple[Reconstructor, Reconstructor]:
+        """Return settings of a short run, and of one within the limits asked for that goes on from what that finds."""

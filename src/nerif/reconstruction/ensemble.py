@@ -52,6 +52,10 @@ class Ensemble:
     def fewest(self) -> int:
         return 2
 
+    @property
+    def without_views(self) -> bool:
+        return self.leave_one_out
+
     def left_out(self, number: int, measurement: Measurement) -> tuple[str, ...]:
         """Names of the views that member `number` (from 1) does without."""
         names = measurement.names

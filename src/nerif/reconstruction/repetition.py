@@ -93,6 +93,10 @@ class Repetitions(Protocol):
     def fewest(self) -> int:
         """How many have to succeed."""
 
+    @property
+    def without_views(self) -> bool:
+        """Whether some do without a view, which tells how well it is predicted."""
+
     def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
         """Return one of them, from 1 on, by what those before have found; None where one has failed."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import NetworkShape
@@ -22,6 +22,9 @@ CHOICES = {
     "precision": ("auto", "float32", "tf32", "bf16"),
     "compile": ("auto", "on", "off"),
 }
+
+
+FIRST = 0.2  # of the limits, in a first run of two
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,16 @@ class TrainingSettings(SharedSettings):
             raise InputError("weights: the head and consistency terms need gradient_head = true")
         check_model(self.model)
         check_source(self.source)
+
+    def in_two(self) -> tuple[TrainingSettings, TrainingSettings]:
+        if self.limited:
+            steps = max(1, round(FIRST * self.max_steps)) if self.max_steps else 0
+            first = replace(
+                self, epochs=FIRST * self.epochs, max_steps=steps, time_limit=FIRST * self.time_limit
+            )  # fmt: skip
+        else:
+            first = replace(self, max_steps=self.first_cycle)
+        return first, replace(self, rate_after_fit=1.0)  # a field found in haste is no end to start from
 
     @property
     def limited(self) -> bool:

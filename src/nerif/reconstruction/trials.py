@@ -69,6 +69,10 @@ class Trials:
     def fewest(self) -> int:
         return 1
 
+    @property
+    def without_views(self) -> bool:
+        return True
+
     def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
         """Return a trial: those of odd numbers do without a view, each followed by one of a field that is known."""
         method, measurement = other_seed(found.reconstructor, number), found.measurement

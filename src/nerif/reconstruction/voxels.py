@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -32,6 +32,7 @@ from nerif.techniques.registry import AUTO, check_model
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 
 VOLUMES = 22  # arrays the size of the grid that the hungriest method holds at once (tests/reconstruction)
+FIRST, COARSEST = 0.2, 8  # of a first run of two: the share of the time limit, and the fewest voxels
 DATA = 8  # arrays the size of the data
 COMPILER_BYTES = 1 << 28  # of Numba, whatever the grid (benchmarks/results/voxel-cost-cpu.md)
 
@@ -77,6 +78,10 @@ class VoxelReconstructor(SharedSettings):
             raise InputError(f"tolerance: expected 0 or more, got {self.tolerance}")
         check_model(self.model)
         check_source(self.source)
+
+    def in_two(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
+        voxels = max(min(COARSEST, self.voxels), self.voxels // 2)
+        return replace(self, voxels=voxels, time_limit=FIRST * self.time_limit), self
 
     @property
     def weight(self) -> float | None:

@@ -17,7 +17,7 @@ from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.moves_figure import draw_moved_rig, draw_moves
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
-from nerif.report.summary import came_out, headline, measured, repeated, trust, trust_figures
+from nerif.report.summary import came_out, headline, looked, measured, repeated, trust, trust_figures
 from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
@@ -70,6 +70,7 @@ def render(result: Result) -> str:
         scales=scales,
         scores=metrics,
         left_out=repeated(result).get("left_out") or [],
+        kept_out=looked(result),
         curves=_curves(result),
         assumptions=[
             (name_of(q).capitalize(), result.volumes[q].notes)

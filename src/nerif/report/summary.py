@@ -19,7 +19,7 @@ from nerif.result import METRICS, VOLUME, Result
 from nerif.techniques.registry import TECHNIQUES
 from nerif.volume import INDEX, field_of, name_of
 
-__all__ = ["Statement", "came_out", "headline", "measured", "repeated", "trust", "trust_figures"]
+__all__ = ["Statement", "came_out", "headline", "looked", "measured", "repeated", "trust", "trust_figures"]
 
 VITAL = (FIELD, METRICS, VOLUME)
 """Without these nothing can be said of a result; without the others less can be shown."""
@@ -50,7 +50,7 @@ def measured(result: Result) -> list[tuple[str, str]]:
     if m is None:
         return [("Measurement", str(result.settings.get("measurement", "unknown")))]
     held_out = result.settings.get("hold_out", ()) if result.reprojection is None else result.reprojection.held_out
-    return m.summary(len(held_out))
+    return m.summary(len(set(held_out) & set(m.names)))
 
 
 def came_out(result: Result) -> list[tuple[str, str]]:
@@ -97,11 +97,18 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
             rms = rms_text(max(own, key=lambda v: v.get("rms") or 0.0), 3)
             worst = "" if len(own) == 1 else "at least "
             rows.append((name, f"CC {worst}{number(_smallest(own, 'cc'), 5)}, rms error {rms}{beside}"))
+        if views is held and not views and looked(result):
+            continue
         if not views:
             rows.append((title, "none" if seen else "not known"))
+    for unseen in looked(result):
+        place = _place(unseen, looked(result))
+        rows.append((f"View {place}, while it was kept out", _scores(unseen)))
+        same = [v for v in seen if (v["name"], v["measured"]) == (unseen["name"], unseen["measured"])]
+        rows += [(f"View {place}, in the end", _scores(v)) for v in same]
     for view in result.metrics.get("views_refitted") or []:
         name = f"{view['name']}, camera refined"
-        rows.append((name, f"CC {number(view['cc'], 5)}, rms error {rms_text(view, 3)}"))
+        rows.append((name, _scores(view)))
     rig = [row for row in result.metrics.get("rig") or [] if "rms_after" in row]
     if rig:
         before, after = (max(row[name] for row in rig) for name in ("rms_before", "rms_after"))
@@ -130,6 +137,11 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
         beside = "" if flow is None else f", {flow:.0%} of those in the flow"
         rows.append(("Truth within ±2 σ", f"{coverage['share']:.0%} of the voxels{beside}"))
     return rows
+
+
+def _scores(view: dict[str, Any]) -> str:
+    noise = view.get("rms_over_sigma")
+    return f"CC {number(view['cc'], 5)}, rms error {rms_text(view, 3)}{'' if noise is None else f' = {noise:.2f} σ'}"
 
 
 def trust(result: Result) -> list[Statement]:
@@ -165,6 +177,11 @@ def _views(result: Result, held_out: bool) -> list[dict[str, Any]]:
     return [v for v in views if v.get("held_out") is held_out] if isinstance(views, list) else []
 
 
+def looked(result: Result) -> list[dict[str, Any]]:
+    """Scores of the view that was kept out of a short run first."""
+    return list((result.metrics.get("first_look") or {}).get("views") or [])
+
+
 def _values(views: list[dict[str, Any]], key: str) -> list[float]:
     return [float(v[key]) for v in views if v.get(key) is not None]
 
@@ -197,12 +214,14 @@ def _of_held_out(result: Result) -> list[Statement]:
     what = "The field predicts"
     if not held and left_out:
         held, what = left_out, "Repetitions without a view predict"
+    elif not held and looked(result):
+        held, what = looked(result), "A first, short run predicts"
     if not held:
         if not seen:
             text = "The field was not compared with any view: nerif evaluate --measurement FILE does it."
             return [Statement("warning", text)]
         text = "No view was held out, so the field was not checked against data the reconstruction has not seen."
-        return [Statement("warning", f"{text} Repeat with --hold-out VIEW.")]
+        return [Statement("warning", f"{text} Repeat with --hold-out auto, or a view.")]
     known = [v for v in held if v.get("cc") is not None]
     if not known:
         return [Statement("warning", "The held-out views have no pixels to compare.")]

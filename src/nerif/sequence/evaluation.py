@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from nerif.conventions import InputError
+from nerif.json_file import write_json
 from nerif.metrics import volume_errors
-from nerif.result import write_json
 from nerif.sequence.store import DONE, SequenceStore
 from nerif.techniques.registry import ASSUMED, technique
 from nerif.volume import INDEX

@@ -1,0 +1,115 @@
+"""A view is kept out first: a short run tells how well it is predicted, and the run with all goes on from there."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from nerif.conventions import InputError
+from nerif.evaluation import evaluate_views
+from nerif.json_file import write_json
+from nerif.kept_run import KeptRun
+from nerif.measurement import Measurement
+from nerif.monitor import QUIET, Monitor
+from nerif.prediction import reproject
+from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
+from nerif.reconstruction.trials import best_covered
+from nerif.result import ResultDirectory
+
+__all__ = ["AUTO", "FEWEST", "NONE", "FirstLook", "kept_out"]
+
+AUTO: tuple[str, ...] = ("auto",)
+NONE: tuple[str, ...] = ("none",)
+"""May be asked for in place of the names of views: AUTO, one is kept out first, and NONE."""
+
+FEWEST = 4
+"""Views of which one is kept out first: of three, the other two would tell little."""
+
+LIMITS = ("epochs", "max_steps", "time_limit", "longest", "iterations")
+"""Settings that a run may be gone on with others of."""
+
+SCORES = "views.json"
+
+
+def kept_out(hold_out: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the views that are kept out of the whole run, out of all names."""
+    words = tuple(hold_out)
+    return () if words in (AUTO, NONE) and words[0] not in names else words
+
+
+@dataclass(frozen=True)
+class FirstLook:
+    """The short run without a view, kept in the result directory.
+
+    Parameters
+    ----------
+    out : the result directory
+    reconstructor : settings of the whole run
+    data : that the whole run reconstructs from
+    checkpoint_every : seconds
+    monitor : told how the work goes
+    afresh : whatever is in the directory
+    """
+
+    out: ResultDirectory
+    reconstructor: Reconstructor
+    data: Measurement
+    checkpoint_every: float = 60.0
+    monitor: Monitor = QUIET
+    afresh: bool = False
+
+    @property
+    def view(self) -> str:
+        """Which is kept out: the one that the others cover best."""
+        return best_covered(self.data.cameras)[0]
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is something of it to go on with."""
+        return self._run.begun
+
+    def __call__(self, begin: OnStep) -> Reconstruction | None:
+        """Reconstruct without the view, or read what is there; None, which is told, where no field is found without it.
+
+        Parameters
+        ----------
+        begin : told every step
+        """
+        started, name, say = time.monotonic(), self.view, self.monitor.say
+        try:
+            result = self._run(f"without {name} first", begin)
+        except InputError as error:
+            say(f"no view is kept out first: without {name}, {error}")
+            return None
+        if result.outcome.reason == "interrupted" or self.scores():
+            return result
+        if result.outcome.failed:
+            say(f"without {name}: {result.outcome.reason}; all views begin from nothing")
+            return None
+        seen = reproject(result.field, self.data.select([name]), [name], result.device, model=result.model)
+        views = evaluate_views(seen)
+        write_json(self._directory / SCORES, {"views": views, "seconds": time.monotonic() - started})
+        for v in views:
+            noise = f" = {v['rms_over_sigma']:.2f} sigma" if "rms_over_sigma" in v else ""
+            say(f"{name}, not seen so far, is predicted with CC {v['cc']:.4f}, rms error{noise}")
+        return result
+
+    def scores(self) -> dict[str, Any]:
+        """Return how well the view was predicted, and in which time; nothing where it was not."""
+        path = self._directory / SCORES
+        return json.loads(path.read_text()) if path.is_file() else {}
+
+    @property
+    def _directory(self) -> ResultDirectory:
+        return self.out.first_look
+
+    @property
+    def _run(self) -> KeptRun:
+        rest = self.data.without([self.view])
+        first, _ = self.reconstructor.in_two()
+        return KeptRun(
+            self._directory, first, rest, None, {}, self.checkpoint_every, self.monitor, self.afresh, LIMITS
+        )  # fmt: skip
