@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.refined_rig import with_corrections
 from nerif.reprojection import Reprojection
+from nerif.residuals import leftover
 from nerif.result import METRICS, VOLUME, ResultDirectory
 from nerif.techniques.registry import AUTO, forward_model
 from nerif.volume import INDEX, Volume
@@ -106,7 +108,8 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     Of pictures it is the change by the flow that is compared: what they would show without it is taken off both.
 
     The rms is in the unit of what was measured, and also called rms_px where that is px. Where sigma is known,
-    rms_over_sigma tells whether the residual is the noise (1) or more.
+    rms_over_sigma tells whether the residual is the noise (1) or more; leftover, where there are enough pixels, whether
+    it is white, and of what it has the pattern if not (residuals.py). rms_predicted is that of what is predicted.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -127,10 +130,14 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         found |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
         if kind.unit != "1":
             found[f"rms_{kind.unit}"] = found["rms"]
+        residual = measured - predicted
+        found["rms_predicted"] = float(predicted[mask].square().mean().sqrt()) if bool(mask.any()) else float("nan")
         if observation.sigma is not None and bool(mask.any()):
-            residual = (predicted - measured)[mask] / observation.sigma[inside][mask]
-            found["rms_over_sigma"] = float(residual.square().mean().sqrt())
-        return found
+            residual = residual / observation.sigma[inside]
+            found["rms_over_sigma"] = float(residual[mask].square().mean().sqrt())
+        patterns = None if kind.derived else predicted.numpy()
+        left = leftover(residual.nan_to_num(0.0, 0.0, 0.0).numpy(), patterns, mask.numpy())
+        return found if left is None else {**found, "leftover": {**asdict(left), "alike": left.alike}}
 
     views: list[dict[str, Any]] = []
     side_by_side = int(min(torch.get_num_threads(), AT_A_TIME // sees_box[0].numel()))

@@ -38,6 +38,7 @@ from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.result import CALIBRATION, REPORT, ResultDirectory, versions
+from nerif.verdict import verdict
 from nerif.volume import quantities_of
 from nerif.volume_sequence import VolumeSequence
 
@@ -172,9 +173,12 @@ def reconstruct_into(
                 out, repetitions, reconstructor, known, start, made_of, run.checkpoint_every, monitor
             )
             members.add_to(result, run.gas, voxels)
-    finally:  # the page of the main result, whatever becomes of the members
+    finally:  # the verdict and the page of the main result, whatever becomes of the members
+        judged = verdict(out.read())
+        out.add_metrics({"verdict": asdict(judged)})
         if run.report:
             write_report(out.path, monitor=monitor)
+        monitor.say(judged.sentence)
     return result
 
 

@@ -56,7 +56,7 @@ def render(result: Result) -> str:
         title=result.directory.resolve().name,
         source=_source(result),
         finished=result.about.get("finished", ""),
-        headline=headline(statements),
+        headline=headline(result),
         statements=statements,
         cards=(
             ("What was measured", measured(result)),

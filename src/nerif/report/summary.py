@@ -15,8 +15,10 @@ from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.refined_rig import moved_lines
 from nerif.report.packing import relation
+from nerif.residuals import CAUSES
 from nerif.result import METRICS, VOLUME, Result
 from nerif.techniques.registry import TECHNIQUES
+from nerif.verdict import verdict
 from nerif.volume import INDEX, field_of, name_of
 
 __all__ = ["Statement", "came_out", "headline", "looked", "measured", "repeated", "trust", "trust_figures"]
@@ -25,8 +27,11 @@ VITAL = (FIELD, METRICS, VOLUME)
 """Without these nothing can be said of a result; without the others less can be shown."""
 
 LEVELS = ("good", "note", "warning", "bad")
+OF_WORD = {"use": "good", "use with care": "warning", "do not use": "bad", "cannot tell": "note"}
 HELD_OUT_CC = 0.95  # a view that was not seen is predicted this well in all our simulated cases with nine views
 TRUTH_CC = 0.98, 0.9  # good and fair, of all our simulated cases
+NAMED = 4  # views
+ALIKE = 0.01  # of what is predicted: smaller leftovers, even if they are alike, move a field by less than noise does
 NOISE_BAND = 0.7, 1.4  # rms residual over sigma that noise alone explains; sigma itself is known to a factor of about 2
 
 
@@ -147,23 +152,19 @@ def _scores(view: dict[str, Any]) -> str:
 def trust(result: Result) -> list[Statement]:
     """Return what to know before trusting it, the gravest first."""
     found = [Statement("bad" if gap.what in VITAL else "note", gap.sentence) for gap in result.missing]
-    found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_truth(result)
+    found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_leftovers(result)
+    found += _of_truth(result)
     found += _of_gas(result) + _of_masks(result) + _of_repetitions(result) + _of_rig(result)
     return sorted(found, key=lambda s: -LEVELS.index(s.level))
 
 
-def headline(statements: list[Statement]) -> Statement:
-    """Return the sum of it in one sentence."""
-    worst = max((s.level for s in statements), key=LEVELS.index, default="note")
-    return Statement(
-        worst,
-        {
-            "good": "It predicts a view it has not seen, and what remains unexplained is noise.",
-            "note": "No problems found; see the notes below.",
-            "warning": "Usable, with the reservations below.",
-            "bad": "Not to be relied on as it stands; see below.",
-        }[worst],
-    )
+def headline(result: Result) -> Statement:
+    """Return the verdict, or that a file without which there is none is missing."""
+    gap = next((gap for gap in result.missing if gap.what in VITAL), None)
+    if gap is not None:
+        return Statement("bad", f"Cannot tell: {gap.what} is missing or damaged, see below.")
+    judged = verdict(result)
+    return Statement(OF_WORD[judged.word], judged.sentence)
 
 
 def _place(view: dict[str, Any], views: list[dict[str, Any]]) -> str:
@@ -234,7 +235,8 @@ def _of_held_out(result: Result) -> list[Statement]:
         return [Statement("warning" if beyond else "good", text)]
     text = f"{what} poorly what has not been seen (view {name}{among}): CC {cc:.3f}."
     remedy = "More views, or a look at the calibration (nerif check), may help."
-    return [Statement("warning" if cc >= 0.8 else "bad", f"{text} {remedy}")]
+    of_noise = noise is not None and noise <= 2
+    return [Statement("warning" if cc >= 0.8 or of_noise else "bad", f"{text} {remedy}")]
 
 
 def _of_residual(result: Result) -> list[Statement]:
@@ -254,7 +256,9 @@ def _of_residual(result: Result) -> list[Statement]:
     if high > NOISE_BAND[1]:
         text = f"The residual of training view {_place(highest, known)} is {high:.1f} times the stated noise"
         remedy = "Look at the length of the run, open faces, the calibration (nerif check), whether sigma is too small."
-        found.append(Statement("warning" if high <= 3 else "bad", f"{text}: not explained. {remedy}"))
+        white = bool((highest.get("leftover") or {"white": False})["white"])
+        level = "warning" if high <= 3 or white else "bad"  # what is white may be noise that is mis-stated
+        found.append(Statement(level, f"{text}: not explained. {remedy}"))
     if low < NOISE_BAND[0]:
         text = f"The residual of training view {_place(lowest, known)} is {low:.2f} of the stated noise"
         found.append(Statement("warning", f"{text}: the field follows noise, or sigma is too large."))
@@ -262,6 +266,32 @@ def _of_residual(result: Result) -> list[Statement]:
         text = "What the field leaves unexplained in the training views"
         found.append(Statement("good", f"{text} is {low:.2f} to {high:.2f} of the noise."))
     return found
+
+
+def _of_leftovers(result: Result) -> list[Statement]:
+    """Residuals of which neighbours are alike, by what they have the pattern of."""
+    seen = [v for v in _views(result, False) if not (v.get("leftover") or {"white": True})["white"]]
+    found = []
+    for cause in dict.fromkeys(v["leftover"]["cause"] for v in seen):
+        own = sorted((v for v in seen if v["leftover"]["cause"] == cause), key=lambda v: -v["leftover"]["grain"])
+        worst, size = own[0], _left_alike(own[0])
+        names = ", ".join(_place(v, seen) for v in own[:NAMED]) + (", ..." if len(own) > NAMED else "")
+        where = f"row {worst['leftover']['row']:.0f}, column {worst['leftover']['column']:.0f}"
+        text = (
+            f"What is left of {len(own)} training view{'s' if len(own) > 1 else ''} ({names}) is not white: neighbours "
+            f"are alike, to {size:.1%} of what is predicted, most in {_place(worst, seen)} around {where}"
+        )
+        why = CAUSES.get(cause, "it has the pattern of no cause that is known: flow beyond the box, too short a run?")
+        found.append(
+            Statement("warning" if size > ALIKE else "note", f"{text}. As where {why}." if cause else f"{text}; {why}")
+        )
+    return found
+
+
+def _left_alike(view: dict[str, Any]) -> float:
+    """The size of what is alike in a residual, over what is predicted."""
+    signal = view.get("rms_predicted") or float("inf")
+    return float(view["leftover"]["alike"] * view["rms"] / signal)
 
 
 def _of_pictures(measured: str) -> bool:
