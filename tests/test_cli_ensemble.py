@@ -52,7 +52,8 @@ def test_mean_and_spread_of_every_quantity_are_written(ensemble):
         for quantity in ("index_excess", "n", "density", "temperature"):
             for statistic in ("mean", "std"):
                 assert volume[f"{quantity}_{statistic}"].attrs["members"] == 3
-            assert volume[quantity].attrs["ancillary_variables"] == f"{quantity}_mean {quantity}_std"
+            statistics = ("mean", "std", "certainty") if quantity == "index_excess" else ("mean", "std")
+            assert volume[quantity].attrs["ancillary_variables"] == " ".join(f"{quantity}_{s}" for s in statistics)
         assert volume["density_std"].attrs["units"] == "kg m-3"
         assert "standard_deviation" in volume["density_std"].attrs["cell_methods"]
         assert float(volume["index_excess_std"].mean()) > 0
@@ -84,7 +85,7 @@ def test_members_that_are_there_are_of_what_was_measured(tmp_path):
     before = read_volumes(out / "volume.nc")
     assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
     after = read_volumes(out / "volume.nc")
-    assert list(after) == list(before) == ["emission", "emission_mean", "emission_std"]
+    assert list(after) == list(before) == ["emission", "emission_mean", "emission_std", "emission_certainty"]
     assert torch.equal(after["emission_std"].values, before["emission_std"].values)
 
 

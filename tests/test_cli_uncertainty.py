@@ -6,6 +6,7 @@ import io
 import json
 import shutil
 from contextlib import redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 import xarray as xr
 
 from nerif.cli import main
+from nerif.report.pages import slices
+from nerif.volume_file import read_volumes
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "4", "--steps", "30", "--truth-voxels", "12"]
 QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]
@@ -52,9 +55,23 @@ def test_standard_deviations_and_percentiles_are_written(result):
         low, high = volume["temperature_p05"].values, volume["temperature_p95"].values
         assert bool((low < high)[np.isfinite(low) & np.isfinite(high)].all())
         assert float(volume["index_excess_std"].min()) > 0
+        excess, std = (volume[name].values.astype(float) for name in ("index_excess", "index_excess_std"))
+        sure = volume["index_excess_certainty"]
+        np.testing.assert_allclose(sure.values, excess**2 / (excess**2 + std**2), rtol=1e-4, atol=1e-7)
+        assert sure.attrs["units"] == "1"
+        assert sure.attrs["long_name"].startswith("certainty of")
+    assert "index_excess_certainty" in read_volumes(out / "volume.vti")  # an opacity for ParaView
     about = json.loads((out / "metrics.json").read_text())["uncertainty"]
     assert (about["kind"], about["members"], about["diverged"]) == ("fast", 2, [])
     assert len(about["left_out"]) == 1
+
+
+def test_slices_are_hatched_where_they_are_in_doubt(result):
+    volumes = read_volumes(result[0] / "volume.nc")
+    density, std = volumes["density"], volumes["density_std"]
+    wide = replace(std, values=std.values * 0 + 1e3)
+    hatched = [bool(a.collections) for given in (None, wide) for a in slices(density, 100.0, given).axes[:3]]
+    assert hatched == [False] * 3 + [True] * 3
 
 
 def test_the_truth_is_compared_with_them(result):

@@ -44,7 +44,13 @@ DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
 AMBIENT_INDEX = 1.00027
 """Of air at 20 °C and one atmosphere, where nothing else is said."""
 
-STATISTICS = {"mean": "mean", "std": "standard deviation", "p05": "5th percentile", "p95": "95th percentile"}
+STATISTICS = {
+    "mean": "mean",
+    "std": "standard deviation",
+    "p05": "5th percentile",
+    "p95": "95th percentile",
+    "certainty": "certainty",
+}
 """Endings of what repetitions of a reconstruction tell of a quantity (density_std), in words."""
 
 LARGEST_INDEX = 4.0

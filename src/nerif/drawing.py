@@ -143,13 +143,30 @@ def draw_slice(
 
 
 def draw_slices(
-    line: Sequence[Axes], volume: Drawable, limits: tuple[float, float], colour_map: str | None = None, name: str = ""
-) -> None:
-    """Draw the middle slices across z, y and x side by side, each under where it lies (mm) and a name, if given."""
+    line: Sequence[Axes], volume: Drawable, limits: tuple[float, float], colour_map: str | None = None, name: str = "",
+    doubtful: np.ndarray | None = None,
+) -> None:  # fmt: skip
+    """Draw the middle slices across z, y and x side by side, each under where it lies (mm) and a name, if given.
+
+    Where `doubtful` (z, y, x) is true, they are hatched.
+    """
     for axes, normal in zip(line, "zyx", strict=True):
         draw_slice(axes, volume, normal, limits, colour_map)
+        if doubtful is not None:
+            _hatch(axes, doubtful, normal)
         along = volume.grid.axis(normal)
         axes.set_title(f"{name}{', ' if name else ''}{normal} = {float(along[len(along) // 2]):.1f} mm")
+
+
+def _hatch(axes: Axes, doubtful: np.ndarray, normal: str) -> None:
+    """Hatch where the middle slice of a mask is true."""
+    axis = "zyx".index(normal)
+    plane = np.take(doubtful, doubtful.shape[axis] // 2, axis=axis)
+    if plane.any() and min(plane.shape) > 1:
+        left, right, bottom, top = axes.images[-1].get_extent()
+        across = left + (np.arange(plane.shape[1]) + 0.5) * (right - left) / plane.shape[1]
+        up = bottom + (np.arange(plane.shape[0]) + 0.5) * (top - bottom) / plane.shape[0]
+        axes.contourf(across, up, plane.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
 def colour_range(values: np.ndarray) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Reconstruction, Reconstructor
-from nerif.reconstruction.repetition import Found, Maps, Repetitions
+from nerif.reconstruction.repetition import Found, Maps, Repetitions, certainty
 from nerif.result import ResultDirectory
 from nerif.volume import Volume
 
@@ -94,6 +94,8 @@ class Members:
             return
         done = sum(result is not None for result in earlier)
         volumes = [*quantities, *taken.volumes()]
+        excess = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
+        volumes.append(certainty(volumes[0], excess))
         self.out.write_volumes(volumes)
         about: dict[str, Any] = {
             **dataclasses.asdict(self.kind), "members": done, "diverged": diverged,  # type: ignore[call-overload]
@@ -104,7 +106,6 @@ class Members:
         self.out.add_metrics({word: about})
         for line in masked_lines(volumes):
             say(line)
-        excess = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
         largest = float(volumes[0].values.abs().max())
         rms = float(excess.values.square().mean().sqrt())
         share = f"{rms / largest:.2%} of the largest"

@@ -48,7 +48,7 @@ def describe(quantity: str) -> tuple[str, str]:
     base, _, statistic = quantity.rpartition("_")
     if statistic in STATISTICS and base in QUANTITIES:
         unit, name = QUANTITIES[base]
-        return unit, f"{STATISTICS[statistic]} of {name}"
+        return "1" if statistic == "certainty" else unit, f"{STATISTICS[statistic]} of {name}"
     return QUANTITIES.get(quantity, ("1", quantity))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,9 +15,9 @@ from nerif.fields.base import Field
 from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstruction, Reconstructor
-from nerif.volume import Volume
+from nerif.volume import Volume, describe
 
-__all__ = ["Found", "Maps", "Member", "Repetitions", "Taken", "other_seed"]
+__all__ = ["Found", "Maps", "Member", "Repetitions", "Taken", "certainty", "other_seed"]
 
 Maps = Mapping[str, Float[Tensor, "view row column c"]]
 """What views see, or its noise, by the name of the technique."""
@@ -102,6 +103,19 @@ class Repetitions(Protocol):
 
     def taken(self, main: Volume, gas: GasSettings) -> Taken:
         """Return what takes them in, beside the main result as it is written."""
+
+
+def certainty(field: Volume, std: Volume) -> Volume:
+    """Return how sure a field is, from 0 to 1: q^2 / (q^2 + std^2), 0 where there is nothing to be sure of.
+
+    As the opacity of a volume it leaves out what is ambient and fades what is in doubt.
+
+    Source: the gain of Wiener's filter, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
+    """
+    signal, noise = field.values.double().square(), std.values.double().square()
+    values = torch.where(signal + noise > 0, signal / (signal + noise), 0.0).nan_to_num(0.0)
+    label = f"{field.quantity}_certainty"
+    return Volume(values.float(), field.grid, label, *describe(label)[:1], field.attributes)
 
 
 def other_seed(reconstructor: Reconstructor, number: int) -> Reconstructor:

@@ -46,6 +46,7 @@ JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature":
 
 NOT_IN_FILES = r"[^\w.+-]"
 
+DOUBTFUL = 0.1  # standard deviation over the range of the colours, above which slices are hatched
 FEW = 3  # rows or columns of pictures that are drawn as lines
 
 Seen = tuple[Observation, np.ndarray, np.ndarray, np.ndarray | None]
@@ -69,7 +70,8 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
     quantities = drawn_of(result.volumes)
     for quantity in (*quantities, *(f"{q}_std" for q in quantities)):
         if quantity in result.volumes:
-            yield f"slices_{quantity}", slices(result.volumes[quantity], double)
+            std = result.volumes.get(f"{quantity}_std")
+            yield f"slices_{quantity}", slices(result.volumes[quantity], double, std)
     error = error_of(result)
     if error is not None and result.field is not None:
         yield "comparison", comparison(result.field, error, double)
@@ -122,14 +124,16 @@ def _page(width: float, height_over_width: float, layout: str = "constrained") -
     return Figure(figsize=(inches, inches * height_over_width), layout=layout)  # type: ignore[arg-type]
 
 
-def slices(volume: Volume, width: float) -> Figure:
-    """The three middle slices of a volume, with one colour bar."""
+def slices(volume: Volume, width: float, std: Volume | None = None) -> Figure:
+    """The three middle slices of a volume, with one colour bar; hatched where a standard deviation is too large."""
     ex, ey, ez = volume.grid.box.edges
     ratios = [ex, ex, ey]
     tallest = max(ey, ez)
     figure = _page(width, max(0.2, 0.80 * tallest / sum(ratios)) + 0.06)
     line = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
-    draw_slices(line, volume, colour_range(shown(volume)))
+    low, high = limits = colour_range(shown(volume))
+    doubtful = None if std is None else std.values.double().numpy() > DOUBTFUL * (high - low)
+    draw_slices(line, volume, limits, doubtful=doubtful)
     add_colour_bar(line, label_of(volume.quantity))
     return figure
 
