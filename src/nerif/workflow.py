@@ -70,8 +70,8 @@ class Run:
     leave_one_out: bool = False
     """Let each member of the ensemble do without one view, in turn."""
     uncertainty: str = "off"
-    """Reconstruct twice (fast) or eight times (full) more, without a view and of fields that are known, for standard
-    deviations of every quantity."""
+    """Reconstruct the field that was found twice (fast) or eight times (full) more, as it would be measured again, for
+    standard deviations of every quantity."""
     report: bool = True
     """Write report.html at the end."""
     checkpoint_every: float = 60.0

@@ -80,7 +80,7 @@ class Ensemble:
         about = "".join(f", without {name}" for name in out)
         return Member(other_seed(found.reconstructor, number), member, out, about=about)
 
-    def taken(self, main: Volume, gas: GasSettings) -> Spread:
+    def taken(self, found: Found, main: Volume, gas: GasSettings) -> Spread:
         return Spread(main.grid, gas)
 
 

@@ -101,7 +101,7 @@ class Repetitions(Protocol):
     def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
         """Return one of them, from 1 on, by what those before have found; None where one has failed."""
 
-    def taken(self, main: Volume, gas: GasSettings) -> Taken:
+    def taken(self, found: Found, main: Volume, gas: GasSettings) -> Taken:
         """Return what takes them in, beside the main result as it is written."""
 
 

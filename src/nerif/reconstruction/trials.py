@@ -1,20 +1,25 @@
-"""How far off a reconstruction may be, from a few more of them whose errors are known.
+"""How far off a reconstruction may be, from more of them whose errors are known, and from what it leaves unexplained.
 
-    std(x)^2 = G * mean_j (q'_j - p_j)^2 (x),      p_j = q + SHARE (q - q_-j)
+    std(x)^2 = G * (mean_j (q'_j - q)^2 + t^2) (x)
 
-Trials come in pairs. One does without a view: where it differs from q, q_-j tells what that view told. The other is of
-a field p_j that is known, seen by the same cameras: q changed once more by what a view told, so that it holds, where
-the views tell least, what they may have missed. What it looks like is predicted, with what the reconstruction left
-unexplained added in blocks of random sign: whatever noise there is, of the right size and correlated as it is. How far
-the reconstruction q'_j of it is off is an error as q may have it. One error is noisy, so squares are averaged around
-each voxel by a Gaussian G, WIDTH wide. No trial sees a truth.
+Trial q'_j is of a field that is known, the one that was found, q, seen by the same cameras. What it looks like is
+predicted, with what the reconstruction left unexplained added in blocks of random sign: whatever noise there is, of the
+right size and correlated as it is. How far the reconstruction of it is off is an error as q may have it.
+
+What q has not taken up at all, no trial of q can miss. It shows in the residuals, where they are larger than sigma. It
+is taken for detail t = a (q - g * q) as large as q has it at each place, g as wide as pixels see, but incoherent: a is
+such that t, with its size multiplied by noise r that g has smoothed, would leave what is more than the noise:
+
+    a^2 mean |F (|q - g * q| r)|^2 / sigma^2 = max(mean |d - F q|^2 / sigma^2 - 1, 0)
+
+One error is noisy, so squares are averaged around each voxel by a Gaussian G, WIDTH wide. No trial sees a truth.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,12 +37,12 @@ from nerif.volume import Volume, describe, quantities_of
 
 __all__ = ["KINDS", "Deviations", "Trials", "best_covered"]
 
-KINDS = {"off": 0, "fast": 1, "full": 4}
-"""Trials without a view, and as many of a field that is known."""
+KINDS = {"off": 0, "fast": 2, "full": 8}
+"""How many trials."""
 
-SHARE = 0.5  # 0 stays below the errors of flames, 1 above those of smooth balls (docs/architecture.md)
 WIDTH = 0.04  # of the box edge, standard deviation
 VOXELS = 64  # along the longest edge, on which errors are compared
+DETAIL = 1.3  # px, as wide as they see in the middle of the box: what a smaller thing is, is no longer resolved
 BLOCK = 8  # px, in which what is left unexplained keeps its sign
 TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations at which percentiles lie
 
@@ -63,7 +68,7 @@ class Trials:
 
     @property
     def members(self) -> int:
-        return 2 * KINDS[self.kind]
+        return KINDS[self.kind]
 
     @property
     def fewest(self) -> int:
@@ -71,28 +76,17 @@ class Trials:
 
     @property
     def without_views(self) -> bool:
-        return True
+        return False
 
     def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
-        """Return a trial: those of odd numbers do without a view, each followed by one of a field that is known."""
-        method, measurement = other_seed(found.reconstructor, number), found.measurement
+        """Return a trial: of the field that was found, and what was left of the measurement with other signs."""
         volume = _sampled(found.result)
-        order = best_covered(measurement.cameras)
-        out = order[((number - 1) // 2) % len(order)]
-        if number % 2 and len(order) > 1:
-            rest = measurement.select([name for name in measurement.names if name != out])
-            return Member(method, rest, (out,), about=f", without {out}")
-        known = volume.values.double()
-        before = earlier[number - 2] if number > 1 else None
-        if before is not None and len(order) > 1:
-            known = known + SHARE * (known - _sampled(before).values.double())
         drawn = torch.Generator().manual_seed(2_000_003 + number)
-        expected = Volume.of(known, volume.grid, volume.quantity, found.result.n_ambient)
-        simulated = _simulated(found, volume, expected, drawn)
-        return Member(method, simulated, (), expected, ", of a field that is known")
+        simulated = _simulated(found, volume, drawn)
+        return Member(other_seed(found.reconstructor, number), simulated, (), volume, ", of a field that is known")
 
-    def taken(self, main: Volume, gas: GasSettings) -> Deviations:
-        return Deviations(main, gas)
+    def taken(self, found: Found, main: Volume, gas: GasSettings) -> Deviations:
+        return Deviations(main, gas, _detail(found))
 
 
 def _sampled(result: Reconstruction) -> Volume:
@@ -113,17 +107,65 @@ def best_covered(cameras: Sequence[Camera]) -> list[str]:
     return [cameras[int(i)].name for i in order]
 
 
-def _simulated(found: Found, volume: Volume, known: Volume, drawn: torch.Generator) -> Measurement:
+def _simulated(found: Found, known: Volume, drawn: torch.Generator) -> Measurement:
     """What would have been measured of a field that is known, with what was left unexplained of the one found."""
-    own = found.seen(VoxelField.through(volume.values.double(), volume.grid))
-    other = found.seen(VoxelField.through(known.values, known.grid))
-    maps = {}
+    seen, maps = found.seen(_spline(known)), {}
     for o in found.measurement.observations:
-        name = o.technique.name
-        left = (o.values - own[name].to(o.values)) * _signs(o.values, drawn)
-        maps[name] = other[name].to(o.values) + left
+        predicted = seen[o.technique.name].to(o.values)
+        maps[o.technique.name] = predicted + (o.values - predicted) * _signs(o.values, drawn)
     sigmas = {o.technique.name: o.sigma for o in found.measurement.observations}
     return found.measurement.observed(maps, sigmas)
+
+
+def _spline(volume: Volume) -> VoxelField:
+    return VoxelField.through(volume.values.double(), volume.grid)
+
+
+def _detail(found: Found) -> Volume | None:
+    """What the field lacks, by what is left beyond the noise: t; None where nothing is, or the noise is not known."""
+    from scipy.ndimage import gaussian_filter
+
+    measurement = found.measurement
+    known = [o for o in measurement.observations if o.sigma is not None]
+    if not known:
+        return None
+    volume = _sampled(found.result)
+    width = [max(1.0, DETAIL * _footprint(measurement) / h) for h in volume.grid.spacing[::-1]]
+    values = volume.values.double()
+
+    def smooth(x: Tensor) -> Tensor:
+        return torch.from_numpy(gaussian_filter(x.numpy(), width, mode="nearest"))
+
+    fine = values - smooth(values)
+    drawn = smooth(torch.randn(fine.shape, generator=torch.Generator().manual_seed(0), dtype=fine.dtype))
+    texture = smooth(fine.square()).sqrt() * drawn / drawn.std()
+    with_it = found.seen(VoxelField.through(values + texture, volume.grid))
+    without, explained = found.seen(_spline(volume)), found.seen(found.result.field)
+    beyond, shown, count = 0.0, 0.0, 0
+    for o in known:
+        name, used = o.technique.name, measurement.usable_for(o) & measurement.sees_box
+        assert o.sigma is not None
+        sigma = o.sigma[used].double()
+        left, more = o.values - explained[name].to(o.values), with_it[name] - without[name]
+        beyond += float((left[used].double() / sigma).square().sum()) - sigma.numel()
+        shown += float((more[used].double() / sigma).square().sum())
+        count += sigma.numel()
+    if not (count and shown > 0 and beyond > 0):
+        return None
+    return replace(volume, values=(math.sqrt(beyond / shown) * fine).to(volume.values))
+
+
+def _footprint(measurement: Measurement) -> float:
+    """How wide a pixel sees in the middle of the box, mm, on the mean of the cameras."""
+    middle = torch.tensor(measurement.box.centre, dtype=torch.float64)
+    apart = []
+    for camera in measurement.cameras:
+        rows, columns = camera.image_size
+        pixels = torch.tensor([[columns / 2, rows / 2], [columns / 2 + 1, rows / 2]], dtype=torch.float64)
+        rays = camera.rays(pixels)
+        along = ((middle - rays.origin) * rays.direction).sum(-1, keepdim=True)
+        apart.append(float((rays.origin + along * rays.direction).diff(dim=0).norm()))
+    return sum(apart) / len(apart)
 
 
 def _signs(like: Float[Tensor, "view row column c"], drawn: torch.Generator) -> Float[Tensor, "view row column c"]:
@@ -142,10 +184,11 @@ class Deviations:
     ----------
     main : (z, y, x) the field that was found, as it is written
     gas : what density and temperature are computed for
+    detail : what the field lacks, or None
     """
 
-    def __init__(self, main: Volume, gas: GasSettings) -> None:
-        self.main, self.gas = main, gas
+    def __init__(self, main: Volume, gas: GasSettings, detail: Volume | None = None) -> None:
+        self.main, self.gas, self.detail = main, gas, detail
         self.squares: list[Tensor] = []
         self.grid: Grid | None = None
 
@@ -167,6 +210,8 @@ class Deviations:
 
         assert self.grid is not None
         mean = torch.stack(self.squares).mean(dim=0)
+        if self.detail is not None:
+            mean = mean + self.detail.values.double().square()
         edge = math.prod(self.grid.box.edges) ** (1 / 3)
         width = [WIDTH * edge / h for h in self.grid.spacing[::-1]]  # voxels along z, y, x
         local = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")).sqrt()
