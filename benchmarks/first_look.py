@@ -1,4 +1,4 @@
-"""What it costs to keep a view out first (nerif reconstruct --hold-out auto, the default), and what it does to the field.
+"""What it costs to keep a view out first (nerif reconstruct --hold-out auto, the default), and what it does to fields.
 
     python benchmarks/first_look.py ../shared/data/rigs --write benchmarks/results/first-look-cpu.md
 

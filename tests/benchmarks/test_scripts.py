@@ -18,10 +18,11 @@ SMALLEST = {
     "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",
     "particles": "--per-pixel 0.05 --pixels 48 --depth 12 --displacement 1 --window 12 --seeds 1",
     "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5 --joint 5",
+    "verdicts": "--cases 1 --method tv",
     "voxel_cost": "--voxels 8 --basis linear --iterations 1 --pixels 12",
     "warm_start": "--pixels 12 --seconds 8 --voxels 12 --fit-steps 5",
 }
-SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem != "bench")
+SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in ("bench", "spoiling"))
 
 
 @pytest.mark.slow

@@ -65,6 +65,19 @@ def test_trials_are_of_the_field_found_with_what_was_left_unexplained_in_blocks_
     assert not torch.equal(Trials("fast").member(2, found, []).measurement.displacement, left + seen)
 
 
+def test_pixels_that_were_not_measured_stay_so(found):
+    values = found.measurement.displacements.clone()
+    values[1, 2:5, 3:7] = float("nan")
+    holes = replace(found, measurement=replace(found.measurement, displacement=values))
+    data = Trials("fast").member(1, holes, []).measurement
+    assert torch.equal(data.usable, holes.measurement.usable)
+    assert int(holes.measurement.usable.sum()) < int(found.measurement.usable.sum())
+    main = Volume.of(torch.zeros(4, 4, 4), Grid(found.result.box, (4, 4, 4)), "index_excess", AMBIENT)
+    detail = Trials("fast").taken(holes, main, GasSettings()).detail
+    assert detail is not None
+    assert bool(torch.isfinite(detail.values).all())
+
+
 def noisy(found: Found, more: Tensor, sigma: float) -> Found:
     """Measured: what the field found shows, more of it, and noise of that sigma; for one view as for many."""
     seen = found.seen(found.result.field)["deflection"]

@@ -42,7 +42,7 @@ KINDS = {"off": 0, "fast": 2, "full": 8}
 
 WIDTH = 0.04  # of the box edge, standard deviation
 VOXELS = 64  # along the longest edge, on which errors are compared
-DETAIL = 1.3  # px, as wide as they see in the middle of the box: what a smaller thing is, is no longer resolved
+DETAIL = 1.6  # px, as wide as they see in the middle of the box: what a smaller thing is, is no longer resolved
 BLOCK = 8  # px, in which what is left unexplained keeps its sign
 TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations at which percentiles lie
 
