@@ -28,6 +28,7 @@ def view(name: str, rms: float = 0.05, held_out: bool = False, **left: Any) -> d
     return {"name": name, "held_out": held_out, "rms": rms, "rms_predicted": 1.0, "leftover": {**WHITE, **left}, **kind}
 
 
+SMEARED = [view(name, 0.06, grain=3.0, white=False, alike=0.36, cause="blur") for name in "abcd"]
 SEEN = [view(name) for name in "abcdef"]
 FIRST = {"views": [view("a", 0.2, True)], "seconds": 1.0}
 ALIKE = {"grain": 3.0, "white": False, "alike": 0.36}
@@ -51,7 +52,7 @@ def judged(**metrics: Any) -> Any:
         ({"views": [*SEEN[1:], view("a", 0.06, **ALIKE)], "first_look": FIRST}, "do not use"),
         ({"views": [*SEEN[1:], view("a", 0.02, **ALIKE)], "first_look": FIRST}, "use with care"),
         ({"views": [view(n, 0.06, **ALIKE) for n in "abcdef"], "first_look": FIRST}, "use"),  # as windows leave it
-        ({"views": [view(n, 0.06, **ALIKE, **{"cause": "blur"}) for n in "abc"], "first_look": FIRST}, "use with care"),
+        ({"views": SMEARED, "first_look": FIRST}, "use with care"),
         ({"views": SEEN, "first_look": FIRST, "outcome": "interrupted"}, "use with care"),
         ({"views": SEEN, "first_look": FIRST, "outcome": "diverged"}, "do not use"),
         ({"views": SEEN, "ensemble": {"members": 3, "left_out": [view("a", 0.1, True)]}}, "use"),
@@ -82,10 +83,14 @@ def test_standard_deviations_tell_the_error():
     std = torch.full(grid.shape, 2e-6)
     std[0] = 1.0  # outside of the flow
     volumes = {"index_excess": Volume(excess, grid), "index_excess_std": Volume(std, grid, "index_excess_std")}
-    found = verdict(Result(Path(), metrics={"views": SEEN, "first_look": FIRST}, volumes=volumes))
+    found = verdict(Result(Path(), metrics={"views": SEEN}, volumes=volumes))
     assert found.error == pytest.approx(0.02)
     assert found.word == "use"
     assert "standard deviations" in found.sentence
+    three = verdict(Result(Path(), metrics={"views": SEEN[:3]}, volumes=volumes))
+    assert three.word == "use with care"  # what three views do not show is in no deviation
+    worse = {"views": [*SEEN, view("g", 0.3, True)]}
+    assert verdict(Result(Path(), metrics=worse, volumes=volumes)).error == pytest.approx(0.3 * 0.3, rel=0.05)
 
 
 def test_the_first_screen_has_it():

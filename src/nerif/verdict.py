@@ -3,9 +3,9 @@
     e = sqrt(max(r_unseen^2 - r_seen^2, 0)) / rms predicted,      error of the field, over its variation = ratio e
 
 r_unseen is the rms error of a view that was not seen, r_seen that of the views that were, which is their noise whatever
-was stated. The ratios, and the limits below, are those of simulated measurements, good and spoiled; what they are worth
-on others is in benchmarks/results/trust-cpu.md. Standard deviations, where there are some, tell the error better. No
-truth is looked at.
+was stated. Standard deviations, where there are some, count if they tell more. The ratios, and the limits below, are
+those of simulated measurements, good and spoiled; what they are worth on others is in
+benchmarks/results/verdicts-cpu.md. No truth is looked at.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ RATIO = 0.3  # error of the field over e of a view that a whole run has not seen
 HASTE = {"nerif": 0.08}  # of e in a first, short run, which a network ends far from where it will be
 USE, NOT = 0.035, 0.12  # of the variation: below it is to be used, above not
 DOUBT, GRAVE = (1.7, 0.005), (2.2, 0.02)  # grain of a view's residual, and what is alike over what is predicted
+FEW = 4  # views
 STANDS = 1.5  # times what is alike in the median view
 UNEVEN = 1.35  # residual of the worst view over that of the median one, each over what is predicted
 FLOW = 0.02  # share of the largest value above which a voxel counts as flow
@@ -72,6 +73,8 @@ def verdict(result: Result) -> Verdict:
     if error is None:
         why = "no view was kept out, and there are no standard deviations (--uncertainty fast)"
         return Verdict("use with care" if doubt else "cannot tell", None, doubt or why)
+    if len(seen) < FEW:  # what they do not show is in no figure
+        doubt = "; ".join(filter(None, (doubt, f"{len(seen)} views leave much open")))
     doubts = [by, *([doubt] if doubt else []), *(["the run was interrupted"] if outcome == "interrupted" else [])]
     if len(doubts) > 1 or error > USE:
         return Verdict("use with care", error, "; but ".join(doubts))
@@ -84,9 +87,16 @@ def _known(view: Any) -> bool:
 
 def _error(result: Result, views: Sequence[dict[str, Any]], seen: Sequence[dict[str, Any]]) -> tuple[float | None, str]:
     """The likely error over the variation, and what it is judged by."""
-    deviation = _deviation(result)
-    if deviation is not None:
-        return deviation, "its standard deviations"
+    told = [(deviation, "its standard deviations")] if (deviation := _deviation(result)) is not None else []
+    predicted, by = _unseen(result, views, seen)
+    told += [(predicted, by)] if predicted is not None else []
+    return max(told) if told else (None, "")
+
+
+def _unseen(
+    result: Result, views: Sequence[dict[str, Any]], seen: Sequence[dict[str, Any]]
+) -> tuple[float | None, str]:
+    """The same by how well a view was predicted that had not been seen."""
     if not seen:
         return None, ""
     noise = {name: statistics.median(v["rms"] for v in seen if v["measured"] == name) for name in _measured(seen)}
