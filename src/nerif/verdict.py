@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nerif.residuals import CAUSES
 from nerif.result import Result
 from nerif.volume import field_of
 
@@ -67,7 +68,7 @@ def verdict(result: Result) -> Verdict:
     error, by = _error(result, views, seen)
     doubt, grave = _contradicted(seen)
     if grave:
-        return Verdict("do not use", None, f"{doubt}; nerif check may tell what is wrong with it")
+        return Verdict("do not use", None, doubt)
     if error is not None and error > NOT:
         return Verdict("do not use", error, by)
     if error is None:
@@ -150,7 +151,8 @@ def _contradicted(seen: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         if out:
             views = f"{len(out)} view{'s' if len(out) > 1 else ''}"
             text = f"what is left of {views} is no noise, {alike[worst]:.1%} of what {worst} shows"
-            grain = lefts[worst]["grain"]
+            grain, cause = lefts[worst]["grain"], lefts[worst]["cause"]
+            text += f", as where {CAUSES[cause]}" if cause else "; nerif check may tell what is wrong with it"
             return text, grain > GRAVE[0] and alike[worst] > GRAVE[1] and alike[worst] > STANDS * middle
         shares = {v["name"]: v["rms"] / v["rms_predicted"] for v in own}
         worst, middle = max(shares, key=lambda k: shares[k]), statistics.median(shares.values())
