@@ -24,7 +24,7 @@ from nerif.volume import Volume
 from nerif.volume_file import read_volumes, write_netcdf
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "3", "--steps", "30", "--truth-voxels", "12"]
-QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]
+QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "80", "--tolerance", "1e-7"]
 QUICK += ["--regularisation", "0.01"]
 
 
@@ -173,7 +173,7 @@ def test_interrupted_in_the_second_member(measured, ensemble, tmp_path, capsys, 
     assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
     with xr.open_dataset(out / "volume.nc") as a, xr.open_dataset(ensemble[0] / "volume.nc") as b:
         spread, undisturbed = a["index_excess_std"].values, b["index_excess_std"].values
-        assert abs(spread - undisturbed).max() < 0.05 * undisturbed.max()  # a solver starts with a new direction
+        assert abs(spread - undisturbed).max() < 0.01 * undisturbed.max()  # a solver begins anew, to the same end
 
 
 def test_without_sigma_the_residual_takes_its_place(measured, tmp_path, capsys):
