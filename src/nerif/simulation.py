@@ -164,8 +164,8 @@ class Simulation:
     """A phantom, and how it is measured."""
 
     phantom: str = "flame"
-    """One of gaussians, flame, octahedron, turbulence, fire, 1-7 (the paper's numbers), or a volume file (.nc, .vti) of
-    your own."""
+    """One of gaussians, flame, octahedron, turbulence, fire, gaussian-jet, plume, underexpanded (flows around an axis),
+    1-7 (the paper's numbers), or a volume file (.nc, .vti) of your own."""
     technique: tuple[str, ...] = (ASSUMED.name,)
     """What a pixel measures: deflection, absorption, emission or interferometry; of one field also several."""
     peak: float = 0.0

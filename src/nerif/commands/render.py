@@ -32,7 +32,8 @@ class Render(Settings):
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder to write."""
     phantom: str = "flame"
-    """One of gaussians, flame, octahedron, turbulence, fire, 1-7 (the paper's numbers)."""
+    """One of gaussians, flame, octahedron, turbulence, fire, gaussian-jet, plume, underexpanded, 1-7 (the paper's
+    numbers)."""
     phantom_seed: int = 0
     """Of the phantom."""
     box: tuple[float, float, float] = (50.0, 50.0, 50.0)

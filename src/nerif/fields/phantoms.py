@@ -5,6 +5,8 @@ flame        a turbulent Bunsen flame (in the place of the paper's Phantoms 2-7)
 octahedron   paper, Eq. (SRphantom), for the spatial resolution
 turbulence   a plume with the spectrum of the inertial range down to the pixel (turbulence.py)
 fire         the folded front of a buoyant fire (turbulence.py)
+gaussian-jet, plume, underexpanded
+             flows around an axis (jets.py)
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from nerif.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field
+from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.turbulence import Fire, TurbulentPlume
 from nerif.geometry import Box
 
@@ -184,7 +187,7 @@ FLAME_INTERVAL = 1e-4  # s between the six instants that stand for the paper's P
 
 
 def make_phantom(name: str, box: Box, seed: int = 0, time: float = 0.0) -> Field:
-    """Return the phantom called `name`: gaussians, flame, octahedron, or the paper's number 1-7.
+    """Return the phantom called `name`, one of those above, or of the paper's number 1-7.
 
     Raises
     ------
@@ -203,7 +206,9 @@ def make_phantom(name: str, box: Box, seed: int = 0, time: float = 0.0) -> Field
         return TurbulentPlume(box, seed)
     if name == "fire":
         return Fire(box, seed)
+    if name in AXISYMMETRIC:
+        return AXISYMMETRIC[name](box)
     raise InputError(
-        f"phantom: expected gaussians, flame, octahedron, turbulence, fire, 1-7 (the paper's) or a .nc or .vti volume, "
-        f"got '{name}'"
+        f"phantom: expected gaussians, flame, octahedron, turbulence, fire, {', '.join(AXISYMMETRIC)}, "
+        f"1-7 (the paper's) or a .nc or .vti volume, got '{name}'"
     )
