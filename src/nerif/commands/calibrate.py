@@ -1,4 +1,4 @@
-"""nerif calibrate: from target pictures, or from another program's file, to calibrated cameras."""
+"""nerif calibrate: from target pictures, another program's file, or what a ruler tells, to calibrated cameras."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
@@ -17,7 +18,8 @@ from nerif.geometry import Box, Camera
 from nerif.imaging.calibration import CalibrationSettings, calibrate_views, target_pictures
 from nerif.imaging.calibration_result import MOUNT, Calibration
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
-from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
+from nerif.imaging.importers import ImportSettings, import_box, import_cameras, is_calibration
+from nerif.imaging.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
 from nerif.imaging.targets import CalibrationTarget
 from nerif.imaging.views import find_views
 from nerif.measurement import Measurement
@@ -27,15 +29,18 @@ __all__ = ["Calibrate", "main", "run"]
 
 @dataclass(frozen=True)
 class Calibrate(Settings):
-    """Calibrate cameras from target pictures, or take over a calibration; both draw the rig in 3-D.
+    """Calibrate cameras from target pictures, take them over, or one from a ruler; all draw the rig in 3-D.
 
     SOURCE is a folder with a folder for each view (VIEW/target/*.tif: the target free in space, one pose under one
     number in all views; VIEW/background/*.tif: the target laid on the view's background), or with a views.toml; or the
     calibration of another program (.mat, .yml, .xml, transforms.json, .csv, .toml). With --check only the rig is drawn.
+
+    With --simple SOURCE is the folder of an experiment of one view (VIEW/reference) or a picture, and one camera that
+    looks across the axis of a flow comes from --distance, --background-distance and --mm-per-px.
     """
 
     source: tyro.conf.Positional[Path]
-    """Folder of pictures, or a file with a calibration, or (with --check) a measurement."""
+    """Folder of pictures, or a file with a calibration, or (with --check) a measurement, (with --simple) a picture."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("calibration.toml")
     """Calibration to write, NAME.toml; NAME.rig.png and NAME.errors.png come with it."""
     check: bool = False
@@ -44,13 +49,16 @@ class Calibrate(Settings):
     background_scale: float = 1.0
     """The target laid on the backgrounds is the same one printed this many times larger."""
     views: tuple[str, ...] = ()
-    """Only these views."""
+    """Only these views; with --simple and a picture, what its view is called (default: camera)."""
+    simple: bool = False
+    """One camera from distances, no target: its frame has z along the axis of the flow, y away from the camera."""
+    rig: Annotated[SimpleRig, Flat] = field(default_factory=SimpleRig)
     method: Annotated[CalibrationSettings, Flat] = field(default_factory=CalibrationSettings)
     taken_over: Annotated[ImportSettings, Flat] = field(default_factory=ImportSettings)
     lower: tuple[float, float, float] | None = None
-    """Lower corner of the box to draw, mm."""
+    """Lower corner of the box to draw and to keep with the cameras, mm; with --simple by default all that is seen."""
     upper: tuple[float, float, float] | None = None
-    """Upper corner of the box to draw, mm."""
+    """Upper corner of the box, mm."""
     force: bool = False
     """Overwrite existing files."""
 
@@ -59,24 +67,35 @@ def run(settings: Calibrate) -> None:
     """Write the calibration and its pictures."""
     if settings.out.suffix != ".toml":
         raise InputError(f"out: expected a name ending in .toml, got '{settings.out.name}'")
-    box = _box(settings)
+    box = Box.between(settings.lower, settings.upper)
+    if settings.simple and not settings.method.kind.shows_depth:
+        raise InputError(f"projection: expected perspective with --simple, got {settings.method.projection}")
+    if not settings.simple and settings.rig.given:
+        raise InputError(f"{', '.join(settings.rig.given)}: expected together with --simple; add it, or leave them out")
     rig, errors = settings.out.with_suffix(".rig.png"), settings.out.with_suffix(".errors.png")
     if settings.check:
         check_file(rig, settings.force)
-        cameras, found = _existing(settings)
-        _draw(rig, cameras, box or found)
+        _draw(rig, *_existing(settings, box))
         return
-    if is_calibration(settings.source):
+    cameras: Sequence[CalibratedCamera]
+    if settings.simple:
+        check_file(settings.out, settings.force, rig)
+        camera, box = _simple(settings, box)
+        cameras = (camera,)
+        write_cameras(settings.out, cameras, {"source": str(settings.source), "simple": settings.rig.given}, box)
+        _tell_simple(settings.out, camera, box)
+    elif is_calibration(settings.source):
         check_file(settings.out, settings.force, rig)
         cameras = import_cameras(settings.source, settings.taken_over, settings.views)
-        write_cameras(settings.out, cameras, {"source": str(settings.source)})
+        box = box or import_box(settings.source, settings.taken_over)
+        write_cameras(settings.out, cameras, {"source": str(settings.source)}, box)
         say(f"{settings.out}: {len(cameras)} cameras taken over from {settings.source}")
     else:
         check_file(settings.out, settings.force, rig, errors)
         given = settings.taken_over
         calibration = replace(_calibrate(settings), lens=given.lens, mount=given.pose_sigma or MOUNT)
         cameras = calibration.cameras
-        calibration.write(settings.out)
+        calibration.write(settings.out, box)
         _tell(calibration)
         from nerif.report.calibration_figure import save_errors
 
@@ -85,10 +104,22 @@ def run(settings: Calibrate) -> None:
     _draw(rig, cameras, box)
 
 
-def _box(settings: Calibrate) -> Box | None:
-    if (settings.lower is None) != (settings.upper is None):
-        raise InputError("lower, upper: expected both corners of the box or neither")
-    return None if settings.lower is None or settings.upper is None else Box(settings.lower, settings.upper)
+def _simple(settings: Calibrate, box: Box | None) -> tuple[CalibratedCamera, Box]:
+    name, size = find_picture(settings.source, settings.views, settings.taken_over.image_size)
+    camera = simple_camera(settings.rig, size, settings.taken_over, name)
+    return camera, box or box_about_axis(camera)
+
+
+def _tell_simple(out: Path, camera: CalibratedCamera, box: Box) -> None:
+    whole = camera.camera()
+    scale = float(whole.pixel_size(torch.zeros(3, dtype=torch.float64)))
+    edges = ", ".join(f"{axis} {a:g} to {b:g}" for axis, a, b in zip("xyz", box.lower, box.upper, strict=True))
+    say(
+        f"{out}: camera '{camera.name}', {float(camera.translation[2]):g} mm from the axis of the flow, the background "
+        f"{-whole.plane.offset:g} mm behind it"
+    )
+    say(f"scale: {scale:.4g} mm per px at the axis; hold a ruler there if in doubt")
+    say(f"box: {edges} mm; z along the axis, y away from the camera")
 
 
 def _calibrate(settings: Calibrate) -> Calibration:
@@ -119,11 +150,17 @@ def _tell(calibration: Calibration) -> None:
         say(f"note: {note}")
 
 
-def _existing(settings: Calibrate) -> tuple[Sequence[CalibratedCamera] | Sequence[Camera], Box | None]:
+def _existing(
+    settings: Calibrate, box: Box | None
+) -> tuple[Sequence[CalibratedCamera] | Sequence[Camera], Box | None]:
+    if settings.simple:
+        camera, box = _simple(settings, box)
+        return (camera,), box
     if settings.source.suffix == ".nc":
         measurement = Measurement.read(settings.source)
-        return measurement.cameras, measurement.box
-    return import_cameras(settings.source, settings.taken_over, settings.views), None
+        return measurement.cameras, box or measurement.box
+    cameras = import_cameras(settings.source, settings.taken_over, settings.views)
+    return cameras, box or import_box(settings.source, settings.taken_over)
 
 
 def _draw(path: Path, cameras: Sequence[CalibratedCamera] | Sequence[Camera], box: Box | None) -> None:

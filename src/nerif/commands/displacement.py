@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -39,12 +39,12 @@ class Displacement(Settings):
     """Folder of the experiment."""
     calibration: Path
     """Calibrated cameras: of nerif calibrate, or any file it can take over. Names are those of the views."""
-    lower: tuple[float, float, float]
-    """Lower corner (x y z) of the box to reconstruct, mm."""
-    upper: tuple[float, float, float]
-    """Upper corner of the box, mm."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Measurement to write, NAME.nc, and NAME.png to show the displacements; NAME.zarr with --frames."""
+    lower: tuple[float, float, float] | None = None
+    """Lower corner (x y z) of the box to reconstruct, mm; default: the box of the calibration, if it holds one."""
+    upper: tuple[float, float, float] | None = None
+    """Upper corner of the box, mm."""
     views: tuple[str, ...] = ()
     """Only these views."""
     frame: int = 0
@@ -67,10 +67,16 @@ class Displacement(Settings):
     method: Annotated[DisplacementSettings, Flat] = field(default_factory=DisplacementSettings)
 
     def recording(self) -> Recording:
-        """Find the pictures and the cameras."""
-        from nerif.imaging.importers import import_cameras
+        """Find the pictures, the cameras and the box."""
+        from nerif.imaging.importers import import_box, import_cameras
 
-        scene = Scene(Box(self.lower, self.upper), self.surroundings)
+        box = Box.between(self.lower, self.upper) or import_box(self.calibration)
+        if box is None:
+            raise InputError(
+                f"lower, upper: expected the corners of the box to reconstruct, since {self.calibration} holds none; "
+                "give --lower X Y Z and --upper X Y Z, mm"
+            )
+        scene = Scene(box, self.surroundings)
         masks = MaskSettings(self.mask) if self.mask else None
         views = find_views(self.folder, self.views)
         cameras = {c.name: c for c in import_cameras(self.calibration)}
@@ -86,6 +92,8 @@ def run(settings: Displacement) -> Measurement:
         if not getattr(settings, name) >= least:
             raise InputError(f"{name}: expected {least} or more, got {getattr(settings, name)}")
     recording = settings.recording()
+    box = recording.scene.box
+    settings = replace(settings, lower=box.lower, upper=box.upper)
     if settings.frames:
         return run_over_time(settings, recording).first_good()
     picture = settings.out.with_suffix(".png")
@@ -130,5 +138,4 @@ def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
 def main(arguments: list[str]) -> None:
     """Parse and run."""
     missing = tyro.MISSING
-    default = Displacement(folder=missing, calibration=missing, lower=missing, upper=missing, out=missing)
-    run(read_settings(default, arguments, "displacement"))
+    run(read_settings(Displacement(folder=missing, calibration=missing, out=missing), arguments, "displacement"))

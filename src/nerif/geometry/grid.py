@@ -53,6 +53,21 @@ class Box:
         x, y, z = (e / 2 for e in edges)
         return cls((-x, -y, -z), (x, y, z))
 
+    @classmethod
+    def between(
+        cls, lower: tuple[float, float, float] | None, upper: tuple[float, float, float] | None
+    ) -> Box | None:
+        """Return the box between two corners (mm) that may be left out, together: None then.
+
+        Raises
+        ------
+        InputError
+            If one of them is there and the other is not.
+        """
+        if (lower is None) != (upper is None):
+            raise InputError("lower, upper: expected both corners of the box or neither")
+        return None if lower is None or upper is None else cls(lower, upper)
+
     @property
     def edges(self) -> tuple[float, float, float]:
         """Edge lengths along x, y, z, mm."""

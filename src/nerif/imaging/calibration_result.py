@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from nerif.conventions import InputError
-from nerif.geometry import PERSPECTIVE, Lens, Plane, Projection
+from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
 from nerif.imaging.bundle import Bundle, Observation, Pose, crossing
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 
@@ -226,8 +226,8 @@ class Calibration:
                     "background move, or does a picture show the target off it?"
                 )
 
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the cameras as a calibration file, with how well they fit under [about]."""
+    def write(self, path: str | os.PathLike[str], box: Box | None = None) -> None:
+        """Write the cameras as a calibration file, with the box and, under [about], how well they fit."""
         about = {
             "date": datetime.date.today().isoformat(),
             "rms_px": self.rms(),
@@ -236,7 +236,7 @@ class Calibration:
             "sigma_translation_mm": dict(zip(self.names, self.sigma_translation.tolist(), strict=True)),
             "notes": list(self.notes),
         }
-        write_cameras(path, self.cameras, about)
+        write_cameras(path, self.cameras, about, box)
 
 
 def _pose_sigma(camera: Pose, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, 6]:

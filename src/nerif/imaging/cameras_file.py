@@ -1,6 +1,7 @@
 """The calibration file: cameras as TOML that a person can read, and mend.
 
 format = "nerif-calibration-1"
+box = [[x, y, z], [x, y, z]]            # lower and upper corner of what to reconstruct, mm; may be left out
 [[camera]]
 name = "cam1"
 projection = "perspective"              # or "telecentric"; may be left out
@@ -30,12 +31,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import InputError, Matrix3
-from nerif.geometry import PERSPECTIVE, Camera, Lens, Plane, Projection, projection_named
+from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = [
     "FORMAT", "CalibratedCamera", "check_model", "checked", "five", "flat", "image_size", "numbers", "plane",
-    "read_cameras", "upright", "write_cameras",
+    "read_box", "read_cameras", "upright", "write_cameras",
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
@@ -207,9 +208,10 @@ def upright(matrix: Any, where: str) -> Tensor:
 
 
 def write_cameras(
-    path: str | os.PathLike[str], cameras: Sequence[CalibratedCamera], about: dict[str, Any] | None = None
-) -> None:
-    """Write cameras, and what else is worth keeping under [about], atomically and in full precision."""
+    path: str | os.PathLike[str], cameras: Sequence[CalibratedCamera], about: dict[str, Any] | None = None,
+    box: Box | None = None,
+) -> None:  # fmt: skip
+    """Write cameras, the box, and what else is worth keeping under [about], atomically and in full precision."""
     tables = []
     for camera in cameras:
         table: dict[str, Any] = {"name": camera.name}
@@ -228,7 +230,27 @@ def write_cameras(
         if camera.background is not None:
             table["background"] = {"normal": camera.background.normal.tolist(), "offset": camera.background.offset}
         tables.append(table)
-    write_toml(path, {"format": FORMAT, "camera": tables, **({"about": about} if about else {})})
+    corners = {"box": [list(box.lower), list(box.upper)]} if box else {}
+    write_toml(path, {"format": FORMAT, **corners, "camera": tables, **({"about": about} if about else {})})
+
+
+def read_box(path: str | os.PathLike[str]) -> Box | None:
+    """Read the box of a calibration file, mm; None where it has none, or is another program's.
+
+    Raises
+    ------
+    InputError
+        If it is missing, no TOML, or the corners are those of no box.
+    """
+    table = read_toml(path, "file; expected a calibration")
+    if table.get("format") != FORMAT or "box" not in table:
+        return None
+    corners = numbers(table["box"], (2, 3), f"{path}: box (lower and upper corner, mm)")
+    lower, upper = ((float(x), float(y), float(z)) for x, y, z in corners)
+    try:
+        return Box(lower, upper)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:

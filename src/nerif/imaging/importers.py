@@ -14,16 +14,16 @@ from pathlib import Path
 import torch
 
 from nerif.conventions import InputError
-from nerif.geometry import Lens, Plane
+from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
-from nerif.imaging.cameras_file import CalibratedCamera, checked
+from nerif.imaging.cameras_file import CalibratedCamera, checked, read_box
 from nerif.imaging.matlab import read_matlab
 from nerif.imaging.nerfstudio import read_transforms
 from nerif.imaging.opencv import ENDINGS as OPENCV
 from nerif.imaging.opencv import read_opencv, read_opencv_folder
 from nerif.imaging.tables import read_csv, read_tables
 
-__all__ = ["ImportSettings", "import_cameras", "is_calibration"]
+__all__ = ["ImportSettings", "import_box", "import_cameras", "is_calibration"]
 
 READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms, **dict.fromkeys(OPENCV, read_opencv)}
 ENDINGS = (*READERS, ".mat")
@@ -39,7 +39,7 @@ class ImportSettings:
     """Number of the target picture that is the world frame, where a file of MATLAB's keeps a pose for each picture."""
     background_distance: float | None = None
     """Where planes are not known: background across the optical axis, this far behind the origin, mm; from target
-    pictures too."""
+    pictures too, and with --simple, of which the origin is on the axis of the flow."""
     image_size: tuple[int, int] | None = None
     """Height and width of the pictures where the file does not say, px."""
     aperture_diameter: float | None = None
@@ -49,9 +49,10 @@ class ImportSettings:
     """Where the lenses are focused, mm along the optical axis; default: on the background."""
     pose_sigma_mm: float | None = None
     """How far a camera may stand from where its calibration has it, mm (standard deviation; reconstruct --refine goes
-    by it); of target pictures beside their noise, 0.05 by default."""
+    by it); of target pictures beside their noise, 0.05 by default; 1 with --simple."""
     pose_sigma_deg: float | None = None
-    """How far a camera may be turned from how its calibration has it, degrees; of target pictures 0.005 by default."""
+    """How far a camera may be turned from how its calibration has it, degrees; of target pictures 0.005 by default;
+    0.5 with --simple."""
 
     def __post_init__(self) -> None:
         if self.focus_distance is not None and self.aperture_diameter is None:
@@ -123,6 +124,21 @@ def import_cameras(
         if name not in [c.name for c in cameras]:
             raise InputError(f"views: expected some of {', '.join(c.name for c in cameras)}, got '{name}'")
     return tuple(checked(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
+
+
+def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box | None:
+    """Read the box of a calibration, mm; None if it holds none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    box = read_box(path) if Path(path).suffix == ".toml" else None
+    if box is None or settings.scale_mm == 1:
+        return box
+    (a, b, c), (d, e, f) = (torch.tensor([box.lower, box.upper], dtype=torch.float64) * settings.scale_mm).tolist()
+    return Box((a, b, c), (d, e, f))
 
 
 def _scaled(lens: Lens | None, scale: float) -> Lens | None:

@@ -1,0 +1,198 @@
+"""One camera from what a ruler tells."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from imaging_files import write_images
+from nerif.conventions import InputError
+from nerif.geometry import Box, Lens
+from nerif.imaging.cameras_file import read_box, read_cameras, write_cameras
+from nerif.imaging.importers import ImportSettings, import_box, import_cameras
+from nerif.imaging.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
+
+SIZE = (320, 240)
+BEHIND = ImportSettings(background_distance=300.0)
+RULED = SimpleRig(distance=700.0, mm_per_px=0.1)
+AXES = [
+    ((119.5, 319.0), (119.5, 0.0)),
+    ((90.0, 310.0), (150.0, 20.0)),
+    ((150.0, 15.0), (80.0, 300.0)),
+    ((10.0, 170.0), (230.0, 150.0)),
+    ((230.0, 100.0), (10.0, 100.0)),
+]
+
+
+def points(*rows: tuple[float, float, float]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("middle", [None, (100.0, 200.0)])
+def test_the_axis_is_seen_where_it_was_drawn(axis, middle):
+    rig = dataclasses.replace(RULED, axis_from=axis[0], axis_to=axis[1], principal_point=middle)
+    camera = simple_camera(rig, SIZE, BEHIND).camera()
+    first, last = (np.array(end) for end in axis)
+    foot = camera.project(points((0, 0, 0)))[0].numpy()
+    along = (last - first) / np.linalg.norm(last - first)
+    assert abs((np.array(middle or (119.5, 159.5)) - foot) @ along) < 1e-9  # nearest the principal point
+    heights = [0.1 * float((end - foot) @ along) for end in (first, last)]
+    assert heights[1] - heights[0] == pytest.approx(0.1 * math.dist(*axis))
+    seen = camera.project(points(*((0, 0, z) for z in heights))).numpy()
+    assert np.abs(seen - [first, last]).max() < 1e-6
+    assert torch.det(camera.rotation) == pytest.approx(1)
+
+
+def test_scale_sides_and_background_of_an_upright_axis():
+    camera = simple_camera(RULED, SIZE, BEHIND, "jet").camera()
+    assert camera.name == "jet"
+    assert torch.allclose(camera.centre, points((0, -700, 0))[0])
+    assert float(camera.pixel_size(points((0, 0, 5)))) == pytest.approx(0.1)
+    middle, right, up, away = camera.project(points((0, 0, 0), (3, 0, 0), (0, 0, 3), (0, 3, 0))).numpy()
+    assert middle == pytest.approx([119.5, 159.5])
+    assert right - middle == pytest.approx([30, 0])
+    assert up - middle == pytest.approx([0, -30])
+    assert away == pytest.approx(middle)
+    rays = camera.rays(torch.tensor([[0.0, 0.0], [239.0, 319.0]], dtype=torch.float64))
+    assert rays.end_points[:, 1].tolist() == pytest.approx([300, 300])
+    assert camera.depth(camera.plane) == pytest.approx(1000)
+    assert camera.pose_sigma is not None
+    assert camera.pose_sigma.tolist() == pytest.approx([math.radians(0.5)] * 3 + [1.0] * 3)
+    assert camera.lens is None
+
+
+def test_a_focal_length_tells_the_same_as_a_ruler():
+    lens = SimpleRig(distance=700.0, focal_length=50.0, pixel_pitch_um=1000 * 0.1 * 50 / 700, f_number=8.0)
+    by_lens, by_ruler = (simple_camera(rig, SIZE, BEHIND) for rig in (lens, RULED))
+    assert torch.allclose(by_lens.intrinsics, by_ruler.intrinsics)
+    assert torch.allclose(by_lens.translation, by_ruler.translation)
+    assert by_lens.lens == Lens(6.25)
+    known = dataclasses.replace(BEHIND, aperture_diameter=5.0, focus_distance=900.0, pose_sigma_mm=3.0,
+                                pose_sigma_deg=0.2)  # fmt: skip
+    camera = simple_camera(RULED, SIZE, known)
+    assert camera.lens == Lens(5.0, 900.0)
+    assert camera.pose_sigma is not None
+    assert float(camera.pose_sigma[5]) == 3
+
+
+@pytest.mark.parametrize("axis", [None, *AXES])
+def test_the_box_is_seen_whole_and_touches_the_edges(axis):
+    rig = RULED if axis is None else dataclasses.replace(RULED, axis_from=axis[0], axis_to=axis[1])
+    calibrated = simple_camera(rig, SIZE, BEHIND)
+    box, camera = box_about_axis(calibrated), calibrated.camera()
+    assert box.lower[0] == box.lower[1] == -box.upper[0] == -box.upper[1]
+    corners = points(*((x, 0, z) for x in (box.lower[0], box.upper[0]) for z in (box.lower[2], box.upper[2])))
+    room = np.array([240, 320]) - 0.5 - camera.project(corners).numpy()
+    slack = np.minimum(room, np.array([240, 320]) - room)
+    assert slack.min() > -1e-6
+    assert slack.min(axis=0).max() < 0.02 * 320  # rounding
+
+
+def test_boxes_of_an_upright_axis():
+    assert box_about_axis(simple_camera(RULED, SIZE, BEHIND)) == Box((-12, -12, -16), (12, 12, 16))
+    aside = dataclasses.replace(RULED, axis_from=(59.5, 300.0), axis_to=(59.5, 100.0))
+    assert box_about_axis(simple_camera(aside, SIZE, BEHIND)) == Box((-6, -6, -16), (6, 6, 16))
+    near = ImportSettings(background_distance=5.0)
+    assert box_about_axis(simple_camera(RULED, SIZE, near)) == Box((-5, -5, -16), (5, 5, 16))
+    coarse = dataclasses.replace(RULED, mm_per_px=1.2345)
+    assert box_about_axis(simple_camera(coarse, SIZE, BEHIND)) == Box((-148, -148, -197), (148, 148, 197))
+
+
+def test_an_axis_beside_the_picture_has_no_box():
+    for column in (239.5, 300.0, -10.0):
+        rig = dataclasses.replace(RULED, axis_from=(column, 300.0), axis_to=(column, 100.0))
+        with pytest.raises(InputError, match=r"axis inside the picture of 240 x 320 px .*--lower and --upper"):
+            box_about_axis(simple_camera(rig, SIZE, BEHIND))
+
+
+def test_the_box_goes_with_the_calibration(tmp_path):
+    path, camera, box = tmp_path / "c.toml", simple_camera(RULED, SIZE, BEHIND), Box((-1, -2, -3), (4, 5.5, 6))
+    write_cameras(path, [camera], {"source": "here"}, box)
+    assert read_box(path) == import_box(path) == box
+    assert import_box(path, ImportSettings(scale_mm=10.0)) == Box((-10, -20, -30), (40, 55, 60))
+    (read,) = read_cameras(path)
+    assert torch.equal(read.rotation, camera.rotation)
+    assert import_cameras(path)[0].image_size == SIZE
+    write_cameras(path, [camera])
+    assert read_box(path) is None
+    other = tmp_path / "other.toml"
+    other.write_text("[box]\nK = 1\n")
+    assert import_box(other) is None
+    assert import_box(tmp_path / "c.csv") is None
+
+
+@pytest.mark.parametrize(
+    ("box", "words"),
+    [
+        ("[[0, 0, 0], [1, -1, 1]]", "expected lower < upper"),
+        ("[0, 0, 0]", r"box \(lower and upper corner, mm\): expected 2 x 3 numbers, got 3"),
+        ("'all'", "expected 2 x 3 numbers"),
+    ],
+)
+def test_a_box_that_cannot_be_one_is_refused(tmp_path, box, words):
+    path = tmp_path / "c.toml"
+    path.write_text(f'format = "nerif-calibration-1"\nbox = {box}\n')
+    with pytest.raises(InputError, match=words) as refused:
+        read_box(path)
+    assert str(path) in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"distance": -1.0}, "distance: expected a positive number, got -1"),
+        ({"mm_per_px": math.nan}, "mm_per_px: expected a positive number"),
+        ({"axis_from": (1.0, 2.0)}, "axis_from, axis_to: expected two points of the axis or neither"),
+        ({"axis_from": (1.0, 2.0), "axis_to": (1.0, 2.5)}, "far from one another"),
+        ({"principal_point": (math.inf, 2.0)}, "principal_point: expected column and row"),
+        ({"mm_per_px": 0.1, "pixel_pitch_um": 5.0}, "leave out the pitch"),
+        ({"mm_per_px": 0.1, "f_number": 8.0}, "f_number: expected together with focal_length.*--aperture-diameter"),
+    ],
+)
+def test_rigs_that_cannot_be(wrong, words):
+    with pytest.raises(InputError, match=words):
+        SimpleRig(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("rig", "given", "words"),
+    [
+        (SimpleRig(mm_per_px=0.1), BEHIND, "distance: expected mm .* measure it"),
+        (SimpleRig(distance=700.0, focal_length=50.0), BEHIND, "mm_per_px: expected the scale"),
+        (RULED, ImportSettings(), "background_distance: expected a positive .* got None"),
+        (RULED, ImportSettings(background_distance=-5.0), "background_distance: .* got -5"),
+        (dataclasses.replace(RULED, focal_length=50.0, f_number=8.0),
+         dataclasses.replace(BEHIND, aperture_diameter=5.0), "f_number, aperture_diameter: expected one"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_is_named(rig, given, words):
+    with pytest.raises(InputError, match=words):
+        simple_camera(rig, SIZE, given)
+
+
+def test_the_one_view_is_found(tmp_path):
+    pictures = np.random.default_rng(0).integers(0, 255, (2, 12, 20), dtype=np.uint8)
+    for name in ("cam1", "cam2"):
+        (tmp_path / "both" / name).mkdir(parents=True)
+        write_images(tmp_path / "both" / name / "reference", pictures)
+    with pytest.raises(InputError, match="found cam1, cam2; choose with --views NAME"):
+        find_picture(tmp_path / "both")
+    with pytest.raises(InputError, match="expected one view for a simple rig, got cam1, cam2"):
+        find_picture(tmp_path / "both", ("cam1", "cam2"))
+    assert find_picture(tmp_path / "both", ("cam2",)) == ("cam2", (12, 20))
+    assert find_picture(tmp_path / "both", ("cam2",), (9, 8)) == ("cam2", (9, 8))
+    picture = tmp_path / "both" / "cam1" / "reference" / "ref_000.png"
+    assert find_picture(picture) == ("camera", (12, 20))
+    assert find_picture(picture, ("jet",)) == ("jet", (12, 20))
+    with pytest.raises(InputError, match=r"none\.png"):
+        find_picture(tmp_path / "none.png")
+    shutil.rmtree(tmp_path / "both" / "cam2")
+    left = '[views.left]\nreference = "cam1/reference"\nwidth = 7\nrotate = 90\n'
+    (tmp_path / "both" / "views.toml").write_text(left)
+    assert find_picture(tmp_path / "both") == ("left", (7, 12))
