@@ -16,18 +16,21 @@ SMALLEST = {
     "ensemble": "--members 2 --steps 5 --phantoms gaussians --noise 0.05 --leave-one-out no",
     "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 5 --voxels 12",
     "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",
+    "one_camera": "--phantom gaussian-jet --noise 0.1 --half-angle 5 --pixels 16 --seeds 1 --only peers",
     "particles": "--per-pixel 0.05 --pixels 48 --depth 12 --displacement 1 --window 12 --seeds 1",
     "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5 --joint 5",
     "verdicts": "--cases 1 --method tv",
     "voxel_cost": "--voxels 8 --basis linear --iterations 1 --pixels 12",
     "warm_start": "--pixels 12 --seconds 8 --voxels 12 --fit-steps 5",
 }
-SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in ("bench", "spoiling"))
+SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in ("abel_peers", "bench", "spoiling"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_script(name, tmp_path):
+    if name == "one_camera":
+        pytest.importorskip("abel", reason="pip install 'nerif[benchmarks]'")
     table = tmp_path / "results" / "table.md"
     words = [*SMALLEST[name].split(), "--write", str(table)] if name in SMALLEST else ["--help"]
     command = [sys.executable, str(FOLDER / f"{name}.py"), *words]

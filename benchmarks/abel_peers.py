@@ -1,0 +1,264 @@
+"""What others do with one camera: inverse Abel transforms of a displacement map, by PyAbel and by a quadrature.
+
+Rays are taken for parallel, as these methods have it: row by row, with F the index excess integrated along a ray at the
+distance y from the axis and L the distance of the background from it,
+
+    u = -(L m / n_ambient) dF/dy,      n(r) - n_ambient = -(1 / pi) integral_r^inf dF/dy / sqrt(y^2 - r^2) dy
+
+with m px per mm on the background; mm on the axis per px are another number where the camera sees perspectively. In the
+form "projection" u is integrated to F, which is transformed; in the form "derivative" dF/dy is used as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.ndimage import gaussian_filter
+
+from nerif.conventions import InputError
+from nerif.geometry import Camera, Grid
+
+__all__ = ["ORDERS", "PEERS", "SMOOTHING", "HalfView", "ParallelView", "Peer", "Revolution", "attempts", "pyabel"]
+
+Array = np.ndarray
+
+SMOOTHING = (0.0, 0.5, 1.0, 2.0, 4.0)
+"""Standard deviations of the Gaussian that a displacement map is smoothed by along rows and columns, px."""
+
+ORDERS = {1: "linear", 3: "cubic"}
+"""How a map is read between pixels."""
+
+
+def pyabel() -> Any:
+    """Return the package PyAbel.
+
+    Raises
+    ------
+    InputError
+        If it is not installed.
+    """
+    try:
+        import abel
+    except ImportError:
+        raise InputError("PyAbel is not installed; pip install -c constraints.txt -e '.[benchmarks]'") from None
+    return abel
+
+
+@dataclass(frozen=True)
+class ParallelView:
+    """How a camera shows a flow around a vertical axis, its rays taken for parallel.
+
+    Parameters
+    ----------
+    axis : column of the axis, px
+    horizon : row of the height 0 (of the centre), px
+    pixel : mm per px on the axis
+    lever : L, axis to background, mm
+    scale : m, px per mm on the background
+    centre : a point of the axis (x, y, z), mm
+    """
+
+    axis: float
+    horizon: float
+    pixel: float
+    lever: float
+    scale: float
+    centre: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, camera: Camera, centre: tuple[float, float, float]) -> ParallelView:
+        """Return the view of an upright camera that looks at the centre."""
+        point = torch.tensor(centre, dtype=torch.float64)
+        column, row = camera.project(point).tolist()
+        depth, behind = float(camera.local(point)[2]), camera.depth(camera.plane)
+        there = camera.centre + behind * camera.rotation[2]
+        scale = 1 / float(camera.pixel_size(there))
+        return cls(column, row, float(camera.pixel_size(point)), behind - depth, scale, centre)
+
+    def heights(self, rows: int) -> Float[Array, " row"]:
+        """Return z of every row, mm."""
+        return self.centre[2] + (self.horizon - np.arange(rows)) * self.pixel
+
+
+class HalfView:
+    """F and dF/dy of every row, the two halves as one, by cubic splines between pixels.
+
+    Parameters
+    ----------
+    displacement : (row, column, 2), px
+    view : ParallelView
+    n_ambient : 1
+    smoothing : standard deviation of a Gaussian along rows and columns, px
+    """
+
+    def __init__(
+        self, displacement: Float[Array, "row column 2"], view: ParallelView, n_ambient: float, smoothing: float = 0.0
+    ) -> None:
+        u = np.nan_to_num(displacement[..., 0].astype(np.float64))
+        if smoothing:
+            u = gaussian_filter(u, smoothing, mode="nearest")
+        columns = u.shape[1]
+        self.view, self.count = view, math.floor(min(view.axis, columns - 1 - view.axis)) + 1
+        slope = -n_ambient / (view.lever * view.scale) * u
+        self.spline = CubicSpline(np.arange(columns), slope, axis=1)
+        self.integral = self.spline.antiderivative()
+
+    def slope(self, offset: float = 0.0) -> Float[Array, "row n"]:
+        """Return dF/dy (1) at y = offset, offset + 1, ... px."""
+        y = np.arange(self.count - math.ceil(offset)) + offset
+        return 0.5 * (self.spline(self.view.axis + y) - self.spline(self.view.axis - y))
+
+    def projection(self) -> Float[Array, "row n"]:
+        """Return F (mm) at y = 0, 1, ... px; 0 at the last."""
+        y, axis = np.arange(self.count), self.view.axis
+        both = self.integral(axis + y) + self.integral(axis - y)
+        return 0.5 * self.view.pixel * (both - both[:, -1:])
+
+
+def three_point(half: HalfView, _: float) -> Float[Array, "row n"]:
+    """Dasch, Appl. Opt. 31 (1992) 1146."""
+    return pyabel().dasch.three_point_transform(half.projection(), basis_dir=None, dr=half.view.pixel)
+
+
+def onion_peeling(half: HalfView, _: float) -> Float[Array, "row n"]:
+    """Dasch, Appl. Opt. 31 (1992) 1146."""
+    return pyabel().dasch.onion_peeling_transform(half.projection(), basis_dir=None, dr=half.view.pixel)
+
+
+def hansen_law(half: HalfView, order: float) -> Float[Array, "row n"]:
+    """Hansen & Law, J. Opt. Soc. Am. A 2 (1985) 510."""
+    return pyabel().hansenlaw.hansenlaw_transform(half.projection(), dr=half.view.pixel, hold_order=int(order))
+
+
+def basex(half: HalfView, strength: float) -> Float[Array, "row n"]:
+    """Dribinski et al., Rev. Sci. Instrum. 73 (2002) 2634."""
+    return pyabel().basex.basex_transform(
+        half.projection(), reg=strength, basis_dir=None, dr=half.view.pixel, verbose=False
+    )
+
+
+def daun(half: HalfView, strength: float) -> Float[Array, "row n"]:
+    """Daun et al., Appl. Opt. 45 (2006) 4638."""
+    return pyabel().daun.daun_transform(half.projection(), reg=strength, degree=1, dr=half.view.pixel, verbose=False)
+
+
+def quadrature(half: HalfView, _: float) -> Float[Array, "row n"]:
+    """The integral of dF/dy, linear between pixels; Kolhe & Agrawal, Appl. Opt. 48 (2009) 3894."""
+    slope = half.slope()
+    n = np.zeros_like(slope)
+    for i in range(slope.shape[1] - 1):
+        y = np.arange(i, slope.shape[1], dtype=np.float64)
+        root = np.sqrt(y**2 - i**2)
+        logarithm = np.log(np.maximum(y + root, 1))  # on the axis dF/dy is 0, and so is what stands before it
+        rise = np.diff(slope[:, i:])
+        n[:, i] = rise @ np.diff(root) + (slope[:, i:-1] - rise * y[:-1]) @ np.diff(logarithm)
+    return -n / math.pi
+
+
+def daun_of_slope(half: HalfView, strength: float) -> Float[Array, "row n"]:
+    """The least squares of Daun et al., the data being dF/dy between the nodes."""
+    slope = half.slope(0.5)
+    nodes = slope.shape[1] + 1
+    forward = pyabel().daun.daun_transform(np.eye(nodes), degree=1, direction="forward", verbose=False)
+    matrix = np.diff(forward, axis=1)  # pixels cancel: F has one of y, dF/dy divides by one
+    roughness = np.diff(np.eye(nodes), axis=0)
+    ends = np.zeros((1, nodes))
+    ends[0, -1] = 1.0  # ambient at the last
+    system = np.concatenate([matrix.T, math.sqrt(strength) * roughness, ends])
+    data = np.concatenate([slope.T, np.zeros((nodes, len(slope)))])
+    return np.linalg.lstsq(system, data, rcond=None)[0].T
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A method in one of the two forms.
+
+    Parameters
+    ----------
+    name : of the method
+    form : projection or derivative
+    invert : from a half view and a parameter to the index excess at r = 0, 1, ... px
+    parameter : what the parameter is called; empty for none
+    values : of the parameter, that are tried
+    """
+
+    name: str
+    form: str
+    invert: Callable[[HalfView, float], Float[Array, "row n"]]
+    parameter: str = ""
+    values: tuple[float, ...] = (0.0,)
+
+    @property
+    def title(self) -> str:
+        """Name and form."""
+        return f"{self.name}, {self.form}"
+
+
+STRENGTHS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+
+PEERS = (
+    Peer("three-point", "projection", three_point),
+    Peer("onion peeling", "projection", onion_peeling),
+    Peer("Hansen-Law", "projection", hansen_law, "hold order", (0.0, 1.0)),
+    Peer("BASEX", "projection", basex, "reg", STRENGTHS),
+    Peer("Daun", "projection", daun, "reg", STRENGTHS),
+    Peer("quadrature", "derivative", quadrature),
+    Peer("Daun", "derivative", daun_of_slope, "reg", STRENGTHS),
+)
+
+
+def attempts(
+    peer: Peer, displacement: Float[Array, "row column 2"], view: ParallelView, n_ambient: float
+) -> Iterator[tuple[str, Float[Array, "row n"]]]:
+    """Yield what a method finds with each of its options: the options in words, and the index excess.
+
+    Parameters
+    ----------
+    displacement : (row, column, 2), px
+    view : ParallelView
+    """
+    for smoothing in SMOOTHING:
+        half = HalfView(displacement, view, n_ambient, smoothing)
+        for value in peer.values:
+            words = f"smoothed by {smoothing:g} px" + (f", {peer.parameter} {value:g}" if peer.parameter else "")
+            yield words, peer.invert(half, value)
+
+
+class Revolution:
+    """A map over rows and radii, turned around the axis onto a grid; ambient beyond the last pixel.
+
+    Parameters
+    ----------
+    view : ParallelView
+    shape : rows and radii of the map, px
+    grid : Grid
+    order : 1 for linear interpolation between pixels, 3 for cubic splines
+    """
+
+    def __init__(self, view: ParallelView, shape: tuple[int, ...], grid: Grid, order: int = 1) -> None:
+        rows, radii = shape
+        x, y, z = (grid.axis(name).numpy().astype(np.float64) for name in "xyz")
+        squares = (y[:, None] - view.centre[1]) ** 2 + (x - view.centre[0]) ** 2
+        unique, self.places = np.unique(squares.round(9), return_inverse=True)
+        self.shape = (len(z), len(y), len(x))
+        self.outward = _interpolation(radii, np.sqrt(unique) / view.pixel, order)
+        self.upward = _interpolation(rows, view.horizon - (z - view.centre[2]) / view.pixel, order)
+
+    def __call__(self, found: Float[Array, "row n"]) -> Float[Array, "z y x"]:
+        """Return the volume of a map."""
+        values = self.upward @ found @ self.outward.T
+        return values[:, self.places.ravel()].reshape(self.shape)
+
+
+def _interpolation(nodes: int, at: Float[Array, " m"], order: int) -> Float[Array, "m n"]:
+    """The matrix of interpolation between the nodes 0, 1, 2, ...; rows of 0 beyond them."""
+    matrix = make_interp_spline(np.arange(nodes), np.eye(nodes), k=order)(at)
+    matrix[(at < 0) | (at > nodes - 1)] = 0.0
+    return matrix
