@@ -37,7 +37,7 @@ CHECKED += (
     "sequence",
 )
 # what Numba compiles stays as it is written; budget and watch hold no array, and are asked many times a step
-UNCHECKED = ("kernels_numba", "fused", "budget", "watch")
+UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "budget", "watch")
 SOLVERS = Path(__file__).parents[1] / "src" / "nerif" / "reconstruction"
 CHECKED += tuple(f"reconstruction.{p.stem}" for p in SOLVERS.glob("[!_]*.py") if p.stem not in UNCHECKED)
 # shapes in annotations are checked on every call; the hook must be there before nerif is imported

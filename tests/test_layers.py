@@ -26,7 +26,10 @@ LAYERS = (
     ("experiment", "particles"),
     ("reconstruction",),
     ("result", "monitor"),
-    ("prediction", "evaluation", "consistency", "rig_check", "mistakes", "quick_views", "symptoms", "gains", "verdict"),
+    (
+        "prediction", "halves", "evaluation", "consistency", "rig_check", "mistakes", "quick_views", "symptoms",
+        "gains", "verdict",
+    ),
     ("kept_run", "members", "first_look"),
     ("report", "sequence"),
     ("workflow",),

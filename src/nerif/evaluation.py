@@ -19,6 +19,7 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.gains import gains_of, with_gains
 from nerif.geometry import Box
+from nerif.halves import kept_half
 from nerif.measurement import Measurement
 from nerif.metrics import coverage, slice_metrics, view_metrics, volume_metrics
 from nerif.notebook import number
@@ -89,7 +90,9 @@ def evaluate(
         metrics["truth"] = str(Path(truth).resolve())
     if data is not None:
         asked = directory.settings()
-        held_out = _held_out(hold_out, asked, data)
+        axis = directory.metrics().get("axis") if directory.has(METRICS) else None
+        data, unseen = kept_half(data, asked.get("hold_out", ()) if hold_out is None else hold_out, axis)
+        held_out = _held_out(None if hold_out is None else unseen, {**asked, "hold_out": unseen}, data)
         aperture = "off" if asked.get("aperture", "off") == "off" else "auto"
         data = with_gains(seen_through(data, aperture), gains_of(asked))
         if directory.has(METRICS):

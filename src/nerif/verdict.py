@@ -30,6 +30,7 @@ USE, NOT = 0.035, 0.12  # of the variation: below it is to be used, above not
 DOUBT, GRAVE = (1.7, 0.005), (2.2, 0.02)  # grain of a view's residual, and what is alike over what is predicted
 FEW = 4  # views
 STANDS = 1.5  # times what is alike in the median view
+ODD, ALIEN = 0.25, 0.4  # what is odd about the axis, over what was measured, of a flow taken as axisymmetric
 UNEVEN = 1.35  # residual of the worst view over that of the median one, each over what is predicted
 FLOW = 0.02  # share of the largest value above which a voxel counts as flow
 
@@ -67,14 +68,17 @@ def verdict(result: Result) -> Verdict:
     seen = [v for v in views if not v["held_out"]]
     error, by = _error(result, views, seen)
     doubt, grave = _contradicted(seen)
+    if any(d["departure"] > ODD for d in metrics.get("departures") or []):
+        doubt, grave = _asymmetric(metrics["departures"])
     if grave:
         return Verdict("do not use", None, doubt)
     if error is not None and error > NOT:
-        return Verdict("do not use", error, by)
+        return Verdict("do not use", error, "; ".join(filter(None, (by, doubt))))
     if error is None:
         why = "no view was kept out, and there are no standard deviations (--uncertainty fast)"
         return Verdict("use with care" if doubt else "cannot tell", None, doubt or why)
-    if len(seen) < FEW:  # what they do not show is in no figure
+    alike = (metrics.get("axis") or {}).get("symmetry")  # one view of an axisymmetric flow shows it from everywhere
+    if len(seen) < FEW and not alike:  # what they do not show is in no figure
         doubt = "; ".join(filter(None, (doubt, f"{len(seen)} views leave much open")))
     doubts = [by, *([doubt] if doubt else []), *(["the run was interrupted"] if outcome == "interrupted" else [])]
     if len(doubts) > 1 or error > USE:
@@ -159,6 +163,15 @@ def _contradicted(seen: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         if middle > 0 and shares[worst] > UNEVEN * middle:
             return f"view {worst} is met {shares[worst] / middle:.1f} times worse than others", False
     return "", False
+
+
+def _asymmetric(departures: Sequence[dict[str, Any]]) -> tuple[str, bool]:
+    """How far what was measured is from that of an axisymmetric flow, in words, and whether it is none."""
+    worst = max(departures, key=lambda d: d["departure"])
+    cc, odd = min(worst["cc"].values()), worst["departure"]
+    halves = f"the halves of {worst['name']} correlate by {cc:.2f}, and {odd:.0%} of it is odd about the axis"
+    alien = odd > ALIEN
+    return (f"the flow is {'not' if alien else 'only roughly'} axisymmetric: {halves}"), alien
 
 
 def _alike(view: dict[str, Any]) -> float:

@@ -13,6 +13,7 @@ from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
 from nerif.first_look import AUTO, FEWEST, FirstLook, kept_out
 from nerif.gains import fit_gains, with_gains
+from nerif.halves import HALVES, departure_sentence, departures, halved, kept_half
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
@@ -31,6 +32,8 @@ from nerif.reconstruction.refined_rig import moved_lines, with_corrections
 from nerif.reconstruction.refit import refit
 from nerif.reconstruction.repetition import Repetitions
 from nerif.reconstruction.rig_posterior import with_posterior
+from nerif.reconstruction.shared_settings import SharedSettings
+from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.trials import Trials
@@ -59,8 +62,8 @@ class Run:
     """What is asked of a reconstruction into a directory, beside the settings of the method."""
 
     hold_out: tuple[str, ...] = AUTO
-    """Views kept out of the reconstruction and re-projected from it; auto: one is kept out of a short run first, from
-    which the run with all goes on; none."""
+    """Views kept out of the reconstruction and re-projected from it, or left or right, a half of each picture of an
+    axisymmetric flow; auto: one is kept out of a short run first, from which the run with all goes on; none."""
     start_from: Path | None = None
     """Result directory of another reconstruction in the same box, of any method, to start from."""
     fit_gains: bool = False
@@ -125,7 +128,8 @@ def reconstruct_into(
         voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
     if voxels < 1:
         raise InputError(f"voxels: expected at least 1, got {voxels}")
-    unseen = kept_out(run.hold_out, measurement.names)
+    whole = measurement
+    measurement, reconstructor, unseen = _kept_apart(run, whole, reconstructor)
     training = measurement.without(unseen)
     gains = fit_gains(training) if run.fit_gains else {}
     if gains:
@@ -165,6 +169,7 @@ def reconstruct_into(
     begin(None)
     scores = {} if look is None else look.scores()
     _write(out, measurement, result, run, settings, gains, voxels, monitor, {"first_look": scores} if scores else {})
+    _tell_axis(out, result, whole, monitor)
     try:
         if repetitions is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
@@ -273,6 +278,30 @@ def _write(
     )
 
 
+def _tell_axis(out: ResultDirectory, result: Reconstruction, whole: Measurement, monitor: Monitor) -> None:
+    """Keep and say where the axis of a symmetric flow was found, and how far the measurement departs from it."""
+    if result.axis is None:
+        return
+    apart = departures(whole, result.axis.symmetry) if result.axis.symmetry.axial else []
+    out.add_metrics({"axis": result.axis.record, "departures": apart})
+    for line in (*result.axis.sentences, *(departure_sentence(d) for d in apart)):
+        monitor.say(line)
+
+
+def _kept_apart(
+    run: Run, measurement: Measurement, reconstructor: Reconstructor
+) -> tuple[Measurement, Reconstructor, tuple[str, ...]]:
+    """The measurement, in halves if one of them is to be kept out, what reconstructs it, and the views kept out."""
+    axis = None
+    if run.hold_out in [(half,) for half in HALVES] and isinstance(reconstructor, SharedSettings):
+        axis = axis_of(reconstructor, measurement)  # by both halves: one does not tell
+    parts, names = kept_half(measurement, run.hold_out, None if axis is None else axis.symmetry)
+    if axis is not None and parts is not measurement:
+        assert isinstance(reconstructor, SharedSettings)
+        reconstructor = with_axis(reconstructor, axis)
+    return parts, reconstructor, kept_out(names, parts.names)
+
+
 def _repetitions(run: Run, training: Measurement) -> Repetitions | None:
     """What is repeated to tell how far off the result may be, if anything; a wrong wish is refused before the work."""
     trials = Trials(run.uncertainty)
@@ -294,8 +323,14 @@ def _first_look(
     """The short run without a view, unless other runs without one are asked for, or the start has seen them all."""
     if run.hold_out != AUTO or AUTO[0] in training.names or run.start_from is not None:
         return None
-    if len(training.cameras) < FEWEST or Ranks.from_environment().size > 1:
+    if Ranks.from_environment().size > 1:
         return None
+    if len(training.cameras) < FEWEST:
+        axis = axis_of(reconstructor, training) if isinstance(reconstructor, SharedSettings) else None
+        if axis is None or not axis.symmetry.axial:
+            return None
+        assert isinstance(reconstructor, SharedSettings)
+        reconstructor, training = with_axis(reconstructor, axis), halved(training, axis.symmetry)
     if repetitions is not None and repetitions.without_views:
         return None
     return FirstLook(out, reconstructor, training, run.checkpoint_every, monitor, afresh)

@@ -46,7 +46,7 @@ def test_written_out_gradient_is_that_of_autograd(shape, activation):
     assert float(expected.abs().max()) > 0
     assert torch.allclose(gradient, expected, atol=1e-12)
     if heads is not None:
-        assert torch.equal(heads, net._gradient_heads(net._trunk(p, [])[0]))
+        assert torch.equal(heads, net._gradient_heads(p, net._trunk(p, [])[0]))
 
 
 @pytest.mark.parametrize("activation", [a for a in ACTIVATIONS if a != "relu"])

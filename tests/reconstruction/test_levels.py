@@ -13,6 +13,7 @@ from nerif.geometry import Box, Grid, Ring, paper_rig
 from nerif.measurement import Measurement
 from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.landweber import Landweber
+from nerif.reconstruction.layout import InSpace
 from nerif.reconstruction.levels import Level, levels, pixels_in_a_voxel
 from nerif.reconstruction.problem import Iterate
 from nerif.reconstruction.tikhonov import Tikhonov
@@ -27,6 +28,11 @@ def flame() -> Measurement:
     return simulate(make_phantom("flame", box, 0), cameras[::3], box, 1.00027, 0.05, 0, steps=20)
 
 
+def _levels(measurement, voxels, coarse_to_fine):
+    layout = InSpace(measurement.box, (), "cubic")
+    return levels(measurement, layout.grids(voxels, coarse_to_fine), coarse_to_fine)
+
+
 def test_pixels_in_a_voxel_are_those_of_the_lens(flame):
     """Focal length in pixels over the distance from the lens."""
     grid = Grid.of_resolution(flame.box, 24)
@@ -37,13 +43,13 @@ def test_pixels_in_a_voxel_are_those_of_the_lens(flame):
 
 
 def test_bins_are_a_voxel_wide_before_the_end_and_small_at_the_end(flame):
-    found = levels(flame, 48, 3, coarse_to_fine=True)
+    found = _levels(flame, 48, coarse_to_fine=True)
     assert [max(level.grid.shape) for level in found] == [12, 24, 48, 48]
     wide = [level.edge / pixels_in_a_voxel(flame, level.grid) for level in found[:-1]]
     assert all(0.5 < w < 1.3 for w in wide), wide
     assert found[-1].edge == 1
-    assert levels(flame, 48, 3, coarse_to_fine=False) == [Level(found[-1].grid, 1)]
-    assert levels(flame, 4, 3, coarse_to_fine=True)[-1].edge > 1  # single pixels would change nothing
+    assert _levels(flame, 48, coarse_to_fine=False) == [Level(found[-1].grid, 1)]
+    assert _levels(flame, 4, coarse_to_fine=True)[-1].edge > 1  # single pixels would change nothing
 
 
 def test_a_camera_in_the_middle_of_the_box_has_bins_of_some_size(flame):

@@ -7,6 +7,7 @@ Source: Unser, Splines: a perfect fit for signal and image processing, IEEE Sign
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -98,9 +99,11 @@ class Boundary:
     Parameters
     ----------
     ambient_faces : names such as "x-"
+    around : whether what lies beyond one face along y is what lies within the other, as of an angle
     """
 
     ambient_faces: tuple[str, ...] = ()
+    around: bool = False
 
     def __post_init__(self) -> None:
         parse_faces(self.ambient_faces)
@@ -108,22 +111,33 @@ class Boundary:
     def _sign(self, axis: int, side: str) -> float:
         return -1.0 if "zyx"[axis] + side in self.ambient_faces else 1.0
 
-    def extend(self, values: Float[Tensor, "z y x"], layers: int) -> Float[Tensor, "zp yp xp"]:
-        """Return the values with `layers` more beyond each face."""
-        if min(values.shape) < layers:
+    def extend(
+        self, values: Float[Tensor, "z y x"], layers: int, axes: Sequence[int] = (0, 1, 2)
+    ) -> Float[Tensor, "zp yp xp"]:
+        """Return the values with `layers` more beyond each face, or those across some of the axes z, y, x."""
+        if min(values.shape[axis] for axis in axes) < layers:
             raise InputError(f"grid: expected at least {layers} voxels along each edge, got {tuple(values.shape)}")
-        for axis in range(3):
+        for axis in axes:
             first, last = values.narrow(axis, 0, layers), values.narrow(axis, values.shape[axis] - layers, layers)
+            if self.around and axis == 1:
+                values = torch.cat([last, values, first], dim=axis)
+                continue
             before, after = first.flip(axis) * self._sign(axis, "-"), last.flip(axis) * self._sign(axis, "+")
             values = torch.cat([before, values, after], dim=axis)
         return values
 
-    def fold(self, extended: Float[Tensor, "zp yp xp"], layers: int) -> Float[Tensor, "z y x"]:
+    def fold(
+        self, extended: Float[Tensor, "zp yp xp"], layers: int, axes: Sequence[int] = (0, 1, 2)
+    ) -> Float[Tensor, "z y x"]:
         """Return the adjoint of `extend`: what lies beyond a face is added to the voxel it mirrors."""
-        for axis in range(3):
+        for axis in axes:
             n = extended.shape[axis] - 2 * layers
             before, after = extended.narrow(axis, 0, layers), extended.narrow(axis, n + layers, layers)
             extended = extended.narrow(axis, layers, n).clone()
+            if self.around and axis == 1:
+                extended.narrow(axis, n - layers, layers).add_(before)
+                extended.narrow(axis, 0, layers).add_(after)
+                continue
             extended.narrow(axis, 0, layers).add_(before.flip(axis), alpha=self._sign(axis, "-"))
             extended.narrow(axis, n - layers, layers).add_(after.flip(axis), alpha=self._sign(axis, "+"))
         return extended

@@ -11,7 +11,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -119,6 +119,8 @@ class Network(nn.Module):
     bounds : lowest and highest value of the n head
     """
 
+    layered: ClassVar[bool] = True
+    """Whether the n head is one of the last layer alone."""
     gains: Tensor
     bounds: Tensor
     waves: Tensor
@@ -151,9 +153,8 @@ class Network(nn.Module):
 
     def forward(self, p: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
         """Return the scaled index excess."""
-        activate = ACTIVATIONS[self.shape.activation]
         h, _ = self._trunk(p, [])
-        return self.bounded(self._head(0, h, activate)[0])[0]
+        return self.bounded(self._value(p, h)[0])[0]
 
     def value_and_gradient(
         self, p: Float[Tensor, "n k"], heads: bool = False
@@ -161,7 +162,7 @@ class Network(nn.Module):
         """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
         slopes: list[Tensor] = []
         h, encoded = self._trunk(p, slopes)
-        value, cotangent = self._head(0, h, ACTIVATIONS[self.shape.activation])
+        value, cotangent, beside = self._value(p, h)
         value, slope = self.bounded(value)
         cotangent = cotangent if slope is None else cotangent * slope[:, None]
         # from here on the reverse pass: cotangent is d value / d (output of the layer)
@@ -173,7 +174,10 @@ class Network(nn.Module):
             cotangent = (cotangent * slopes[i - 1]) @ _linear(self.layers[i - 1]).weight
         if to_encoding is not None:
             cotangent = cotangent + to_encoding
-        return value, self.pull_back(encoded, cotangent), self._gradient_heads(h) if heads else None
+        gradient = self.pull_back(p, encoded, cotangent)
+        if beside is not None:
+            gradient = gradient + (beside if slope is None else beside * slope[:, None])
+        return value, gradient, self._gradient_heads(p, h) if heads else None
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
         """Weights without gains are of networks whose octaves count alike but for octave_decay."""
@@ -201,8 +205,8 @@ class Network(nn.Module):
         """Return what the first layer is given of points."""
         return encode(p, self.waves, self.gains[self.octave].to(p))
 
-    def pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
-        """Return the slope along x, y, z of that along what the first layer is given."""
+    def pull_back(self, p: Tensor, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
+        """Return the slope along x, y, z, at points, of that along what the first layer is given."""
         return encode_pullback(encoded, cotangent, self.waves)
 
     def _trunk(self, p: Tensor, slopes: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -216,6 +220,10 @@ class Network(nn.Module):
                 h = torch.cat([h, encoded], dim=1)
         return h, encoded
 
+    def _value(self, p: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Output v of the n head, its derivative with respect to h, and its slope in p beside that by way of h."""
+        return *self._head(0, h, ACTIVATIONS[self.shape.activation]), None
+
     def _head(
         self, index: int, h: Tensor, activate: Callable[[Tensor], tuple[Tensor, Tensor]]
     ) -> tuple[Tensor, Tensor]:
@@ -227,7 +235,7 @@ class Network(nn.Module):
         inner, slope = activate(head(h))
         return output(inner)[:, 0], (slope * output.weight) @ head.weight
 
-    def _gradient_heads(self, h: Tensor) -> Tensor:
+    def _gradient_heads(self, p: Tensor, h: Tensor) -> Tensor:
         if not self.shape.gradient_head:
             raise InputError("gradient_head: this network was made without gradient heads, so they cannot be asked")
         activate = ACTIVATIONS[self.shape.activation]

@@ -48,7 +48,7 @@ class SpaceTimeNetwork(Network):
             [encode(place, waves, gains), encode(carried, waves, gains), tau, angle.sin(), angle.cos()], dim=1
         )
 
-    def pull_back(self, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
+    def pull_back(self, p: Tensor, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
         e = encoded_width(self.shape.octaves, self.shape.directions)
         still = encode_pullback(encoded[:, :e], cotangent[:, :e], self.waves)
         return still + encode_pullback(encoded[:, e : 2 * e], cotangent[:, e : 2 * e], self.waves)

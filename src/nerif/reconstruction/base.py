@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
+from nerif.geometry.axis import Axis
 from nerif.measurement import Measurement
 from nerif.volume import Volume, describe
 
@@ -113,6 +114,7 @@ class Reconstruction:
     device : where it ran
     state : to resume from, or None
     rig : what was refined of each view (refinement.py)
+    axis : of a symmetric flow, as it was found (axis.py); None where no symmetry was asked for
     """
 
     field: Field
@@ -127,6 +129,7 @@ class Reconstruction:
     state: State | None = dataclasses.field(default=None, repr=False)
     quantity: str = "index_excess"
     rig: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    axis: Axis | None = None
 
     @property
     def model(self) -> str:

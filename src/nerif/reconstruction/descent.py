@@ -22,7 +22,6 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
 from nerif.reconstruction.aperture import seen_through
@@ -30,13 +29,14 @@ from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, St
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
 from nerif.reconstruction.fingerprint import check_fingerprint, fingerprint
-from nerif.reconstruction.gauge import ambient_faces, check_gauge, visual_hull
+from nerif.reconstruction.gauge import ambient_faces, check_gauge
+from nerif.reconstruction.layout import layout_of
 from nerif.reconstruction.levels import Level, coarser, levels
-from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.refinement import MOMENTUM, Refinement, drawn
 from nerif.reconstruction.some_pixels import some_pixels
 from nerif.reconstruction.sources import of_source
+from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.weight import FIRST, choose_weight
 
@@ -78,7 +78,11 @@ class Descent:
         self.device = resolve_device(settings.device)
         self.faces = ambient_faces(measurement, settings.ambient_faces)
         check_gauge(measurement, self.faces, settings.hull)
-        self.levels = levels(measurement, settings.voxels, DEGREES[settings.basis], settings.coarse_to_fine)
+        self.axis = axis_of(settings, measurement)
+        symmetry = None if self.axis is None else self.axis.symmetry
+        self.layout = layout_of(symmetry, measurement.box, self.faces, settings.basis)
+        grids = self.layout.grids(settings.voxels, settings.coarse_to_fine)
+        self.levels = levels(measurement, grids, settings.coarse_to_fine)
         finest = self.levels[-1].grid
         needed = settings.memory_bytes(measurement, finest, self.device.type)
         there = available_memory(self.device)
@@ -89,7 +93,7 @@ class Descent:
                 f"give fewer --voxels than {settings.voxels}"
             )
         masked = settings.hull and measurement.flow_mask is not None
-        self.free = visual_hull(measurement, finest) if masked else None
+        self.free = self.layout.free(measurement, finest) if masked else None
         bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.bounds = bounds if math.isfinite(bounds[0]) or math.isfinite(bounds[1]) else None
         self.last = self._target(self.levels[-1].edge)
@@ -185,14 +189,14 @@ class Descent:
             field = self.field_before
         else:
             return self.settings.begin(problem, problem.zero())
-        values = field.sample(problem.operator.grid, self.device).to(problem.operator.device, problem.operator.dtype)
+        values = self.layout.sample(field, problem.operator.grid, self.device)
+        values = values.to(problem.operator.device, problem.operator.dtype)
         return self.settings.begin(problem, values / self.scale)
 
-    def _field(self, level: Level) -> VoxelField:
+    def _field(self, level: Level) -> Field:
         """The field of the present solution, which is on that level's grid."""
         assert self.x is not None
-        boundary = Boundary(self.faces)
-        return VoxelField.of(self.x * self.scale, level.grid, DEGREES[self.settings.basis], boundary)
+        return self.layout.field(self.x * self.scale, level.grid)
 
     def _target(self, edge: int, measurement: Measurement | None = None) -> Target:
         """What bins of so many pixels along an edge measured; of a measurement, or of all."""
@@ -211,12 +215,12 @@ class Descent:
         return self._problem(level, target), None if level.edge == 1 else self._problem(level, self.judges)
 
     def _problem(self, level: Level, target: Target) -> Problem:
-        settings, boundary, grid = self.settings, Boundary(self.faces), level.grid
+        settings, grid = self.settings, level.grid
         dtype = getattr(torch, settings.precision)
         if self.rig is not None:
             target = replace(target, parts=tuple(self.rig.of(part) for part in target.parts))
         operators = [
-            VoxelOperator(part.rays, grid, part.model, settings.basis, boundary, settings.step, self.device, dtype)
+            self.layout.operator(part.rays, grid, part.model, settings.step, self.device, dtype)
             for part in target.parts
         ]
         return Problem(operators, target, None if self.free is None else coarser(self.free, grid), self.bounds)
@@ -349,6 +353,7 @@ class Descent:
             state=self._capture(),
             quantity=self.measurement.quantity,
             rig=[] if self.rig is None else self.rig.table(),
+            axis=self.axis,
         )
 
 

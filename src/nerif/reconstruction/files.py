@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.geometry import Box, Grid
+from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
 from nerif.volume import INDEX
 
@@ -34,10 +37,18 @@ def write_field(directory: Path, result: Reconstruction) -> None:
         box = field.grid.box
         about |= {"kind": "voxels", "shape": field.grid.shape, "degree": field.degree}
         tensors = {"coefficients": field.coefficients.cpu().contiguous()}
+    elif isinstance(field, SymmetricVoxels):
+        box, grid = result.box, field.parts[0].grid
+        reduced = [grid.box.lower, grid.box.upper]
+        about |= {"kind": "symmetric voxels", "shape": grid.shape, "degree": field.parts[0].degree}
+        about |= {"reduced_box": reduced, "symmetry": asdict(field.symmetry)}
+        tensors = {"coefficients": torch.stack([part.coefficients.cpu() for part in field.parts])}
     else:
         assert isinstance(field, NeuralField)
         box = field.box
         about |= {"kind": "neural", "network": vars(field.network.shape)}
+        if isinstance(field.network, SymmetricNetwork):
+            about["symmetry"] = asdict(field.network.symmetry)
         about |= {"index_scale": field.scale, "offset": field.offset}
         tensors = {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}
     _save(directory / FIELD, tensors, {**about, "box": [box.lower, box.upper]})
@@ -62,7 +73,14 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         if about["kind"] == "voxels":
             grid = Grid(box, tuple(about["shape"]))
             return VoxelField(tensors["coefficients"], grid, int(about["degree"])), box, n_ambient
-        network = Network(NetworkShape.of(about["network"]))
+        if about["kind"] == "symmetric voxels":
+            lower, upper = about["reduced_box"]
+            grid = Grid(Box(tuple(lower), tuple(upper)), tuple(about["shape"]))
+            parts = [VoxelField(own, grid, int(about["degree"])) for own in tensors["coefficients"]]
+            return SymmetricVoxels(parts, Symmetry.kept(about["symmetry"])), box, n_ambient
+        shape = NetworkShape.of(about["network"])
+        kept = about.get("symmetry")
+        network = Network(shape) if kept is None else SymmetricNetwork(shape, Symmetry.kept(kept))
         network.load_state_dict(tensors)
         network.eval().requires_grad_(False)
         return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient

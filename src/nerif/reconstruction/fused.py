@@ -61,7 +61,7 @@ def value_and_gradient(network: Network, p: Float[Tensor, "n k"]) -> tuple[Float
     weights = [z for layer in network.layers for z in (layer.weight, layer.bias)]
     value, slope = _Layers.apply(encoded, output.weight, output.bias, *weights)
     value, bend = network.bounded(value)
-    return value, network.pull_back(encoded, slope if bend is None else slope * bend[:, None])
+    return value, network.pull_back(p, encoded, slope if bend is None else slope * bend[:, None])
 
 
 class _Layers(torch.autograd.Function):

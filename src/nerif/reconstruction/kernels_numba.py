@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit, prange
 from numba.extending import overload
 
-__all__ = ["integrate", "spread"]
+__all__ = ["CUBIC", "FASTMATH", "GRADIENT", "LINEAR", "VALUE", "integrate", "profile_at", "spread", "weights_at"]
 
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}  # no promise of finite numbers: a NaN stays a NaN
 LINEAR, CUBIC = (0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
@@ -52,12 +52,12 @@ def _cubic(t: Any, spline: Any) -> Any:
     return weights, slopes
 
 
-def _weights(t: Any, spline: Any) -> Any:
+def weights_at(t: Any, spline: Any) -> Any:
     """Weights of the neighbours, and their slopes, as fields.grid.spline_weights has them."""
     return _linear(t, spline) if len(spline) == 2 else _cubic(t, spline)
 
 
-@overload(_weights, jit_options={"fastmath": FASTMATH})
+@overload(weights_at, jit_options={"fastmath": FASTMATH})
 def _compiled_weights(t: Any, spline: Any) -> Any:
     return _linear if len(spline) == 2 else _cubic  # by the type of `spline`, so that no branch is left
 
@@ -70,12 +70,12 @@ def _listed_weight(profile, m):
     return profile[m, 0]
 
 
-def _profile(profile, m):
+def profile_at(profile, m):
     """Weight of a sample: the profile of a ray is (2,), first value and increment, or (m, 1), sample by sample."""
     raise NotImplementedError("compiled only")
 
 
-@overload(_profile, jit_options={"fastmath": FASTMATH})
+@overload(profile_at, jit_options={"fastmath": FASTMATH})
 def _compiled_profile(profile, m):
     return _even_weight if profile.ndim == 1 else _listed_weight
 
@@ -83,7 +83,7 @@ def _compiled_profile(profile, m):
 @njit(fastmath=FASTMATH)
 def _weight(profile, lost, m, count):
     # without a branch, which would halve the speed of the loops
-    return _profile(profile, m) * (1.0 - (m == 0) * lost[0] - (m == count - 1) * lost[1])
+    return profile_at(profile, m) * (1.0 - (m == 0) * lost[0] - (m == count - 1) * lost[1])
 
 
 @njit(fastmath=FASTMATH)
@@ -95,8 +95,8 @@ def _along(value, slope, start, stride, profile, lost, first, count, spline, par
         u, v = start[0] + m * stride[0], start[1] + m * stride[1]
         cu = min(max(np.floor(u), 0.0), float(value.shape[2] - neighbours))
         cv = min(max(np.floor(v), 0.0), float(value.shape[1] - neighbours))
-        bu, su = _weights(u - cu, spline)
-        bv, sv = _weights(v - cv, spline)
+        bu, su = weights_at(u - cu, spline)
+        bv, sv = weights_at(v - cv, spline)
         k, iv, iu = np.uint64(first + m), np.uint64(cv), np.uint64(cu)
         gu = gv = ga = 0.0
         for j in range(neighbours):
@@ -136,8 +136,8 @@ def _back(value, slope, start, stride, profile, lost, first, count, low, high, q
         u, v = start[0] + m * stride[0], start[1] + m * stride[1]
         cu = min(max(np.floor(u), 0.0), float(value.shape[2] - neighbours))
         cv = min(max(np.floor(v), 0.0), float(value.shape[1] - neighbours))
-        bu, su = _weights(u - cu, spline)
-        bv, sv = _weights(v - cv, spline)
+        bu, su = weights_at(u - cu, spline)
+        bv, sv = weights_at(v - cv, spline)
         k, iv, iu = np.uint64(first + m), np.uint64(cv), np.uint64(cu)
         w = _weight(profile, lost, m, count)
         for j in range(neighbours):

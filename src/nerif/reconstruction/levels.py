@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,12 +10,11 @@ import torch.nn.functional as functional
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerif.geometry import Box, Grid
+from nerif.geometry import Grid
 from nerif.measurement import Measurement
 
 __all__ = ["Level", "bins_at_last", "bins_of", "coarser", "levels", "pixels_in_a_voxel"]
 
-COARSEST = 12  # voxels along the longest edge of the first grid, at least
 WHILE_COARSE = 1.25  # voxels: edge of bins from which a method goes on to finer ones
 AT_LAST = 0.25  # voxels: bins this small change nothing that the grid can hold
 
@@ -27,31 +27,19 @@ class Level:
     edge: int
 
 
-def levels(measurement: Measurement, voxels: int, degree: int, coarse_to_fine: bool) -> list[Level]:
+def levels(measurement: Measurement, grids: Sequence[Grid], coarse_to_fine: bool) -> list[Level]:
     """Return what to solve on.
 
     Parameters
     ----------
-    voxels : of the last grid, along the longest edge of the box
-    degree : of the spline, which asks for some along each edge
-    coarse_to_fine : whether there are coarser ones before it, each of voxels twice as large
+    grids : from coarse to fine (layout.py)
+    coarse_to_fine : whether to begin with larger bins of pixels
     """
-    grids = _grids(measurement.box, voxels, degree, coarse_to_fine)
     last = Level(grids[-1], bins_at_last(measurement, grids[-1]))
     if not coarse_to_fine:
         return [last]
     before = [Level(grid, _bins(measurement, grid, WHILE_COARSE)) for grid in grids]
     return [*before[:-1], last] if before[-1] == last else [*before, last]
-
-
-def _grids(box: Box, voxels: int, degree: int, coarse_to_fine: bool) -> list[Grid]:
-    least = (degree + 1) // 2  # of a slice too
-    shape = [max(least, n) for n in Grid.of_resolution(box, voxels).shape]
-    grids = [Grid(box, (shape[0], shape[1], shape[2]))]
-    while coarse_to_fine and max(shape) >= 2 * COARSEST:
-        shape = [min(n, max(4, n // 2)) for n in shape]
-        grids.insert(0, Grid(box, (shape[0], shape[1], shape[2])))
-    return grids
 
 
 def bins_at_last(measurement: Measurement, grid: Grid) -> int:
@@ -72,7 +60,7 @@ def _bins(measurement: Measurement, grid: Grid, share: float) -> int:
 
 def pixels_in_a_voxel(measurement: Measurement, grid: Grid) -> float:
     """Return how many pixels the shortest edge of a voxel in the middle of the box spans, in the view of fewest."""
-    middle = torch.tensor(grid.box.centre, dtype=torch.float64)
+    middle = torch.tensor(measurement.box.centre, dtype=torch.float64)
     ends = middle + torch.diag(torch.full((3,), min(grid.spacing), dtype=torch.float64))
     seen = []
     for camera in measurement.cameras:

@@ -17,7 +17,7 @@ from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.planes import Bundle
 from nerif.techniques.base import ForwardModel
 
-__all__ = ["STEPS", "VoxelOperator", "check_step", "operator_norm", "rays_through"]
+__all__ = ["STEPS", "VoxelOperator", "check_step", "made_of", "operator_norm", "rays_through"]
 
 STEPS = {"linear": 0.5, "cubic": 1.0}
 """Voxels between planes, at most: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
@@ -55,6 +55,9 @@ class VoxelOperator:
     interpolation in planes; Lacroute & Levoy, SIGGRAPH (1994), for the resampling along the axis.
     """
 
+    padded_axes: tuple[int, ...] = (0, 1, 2)
+    """Of z, y, x, across which coefficients go on beyond the box."""
+
     def __init__(
         self,
         rays: Rays,
@@ -87,13 +90,17 @@ class VoxelOperator:
             each = rays_through(rays, min(grid.spacing))
             rays = rays.spread(each)
             self.shares = rays.shares(each).reshape(-1, each, 1).to(self.device, dtype)
-        if min(grid.shape) < self.layers:
+        if min(grid.shape[axis] for axis in self.padded_axes) < self.layers:
             raise InputError(
                 f"voxels: expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}"
             )
         self.step = step
-        bundles = Bundle.all_of(rays, grid, self.degree, math.ceil(1 / step), model)
-        self.bundles = [bundle.to(self.device, self.inner, dtype) for bundle in bundles]
+        self._follow(rays, model)
+
+    def _follow(self, rays: Rays, model: ForwardModel) -> None:
+        """Find where rays are sampled."""
+        bundles = Bundle.all_of(rays, self.grid, self.degree, math.ceil(1 / self.step), model)
+        self.bundles = [bundle.to(self.device, self.inner, self.dtype) for bundle in bundles]
 
     @property
     def samples(self) -> int:
@@ -110,38 +117,47 @@ class VoxelOperator:
         """Return what every ray sees."""
         if tuple(coefficients.shape) != self.domain_shape:
             raise InputError(f"coefficients: expected {self.domain_shape}, got {tuple(coefficients.shape)}")
-        return self.through(self.boundary.extend(coefficients.to(self.device, self.dtype), self.layers))
+        return self.through(
+            self.boundary.extend(coefficients.to(self.device, self.dtype), self.layers, self.padded_axes)
+        )
 
     def through(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n c"]:
         """Return what every ray sees of coefficients that go on beyond the box already."""
         padded = padded.to(self.device, self.dtype)
         seen = self._of_rays(None)
-        integrate, _ = self._kernels()
-        for bundle in self.bundles:
-            value, slope = bundle.planes.cut(padded, self.inner)
-            own = torch.zeros_like(seen[: len(bundle.index)])
-            if bundle.gradient is not None:
-                own += _made(bundle.gradient, integrate(self.degree, value, slope, bundle.path))
-            if bundle.value is not None:
-                own += _made(bundle.value, integrate(self.degree, value, None, bundle.path))
-            seen[bundle.index] = own
+        self._integrate(padded, seen)
         return seen if self.shares is None else (seen.reshape(*self.shares.shape[:2], -1) * self.shares).sum(dim=1)
 
     def T(self, seen: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
         """Return the adjoint of the operator, applied to what rays see."""
         if tuple(seen.shape) != self.range_shape:
             raise InputError(f"seen: expected {self.range_shape}, got {tuple(seen.shape)}")
-        shape = tuple(n + 2 * self.layers for n in self.domain_shape)
+        shape = [n + 2 * self.layers * (axis in self.padded_axes) for axis, n in enumerate(self.domain_shape)]
         padded = torch.zeros(shape, dtype=self.dtype, device=self.device)
-        seen = self._of_rays(seen.to(self.device, self.dtype))
+        self._spread(self._of_rays(seen.to(self.device, self.dtype)), padded)
+        return self.boundary.fold(padded, self.layers, self.padded_axes)
+
+    def _integrate(self, padded: Float[Tensor, "zp yp xp"], seen: Float[Tensor, "m c"]) -> None:
+        """Set what thin rays see."""
+        integrate, _ = self._kernels()
+        for bundle in self.bundles:
+            value, slope = bundle.planes.cut(padded, self.inner)
+            own = torch.zeros_like(seen[: len(bundle.index)])
+            if bundle.gradient is not None:
+                own += made_of(bundle.gradient, integrate(self.degree, value, slope, bundle.path))
+            if bundle.value is not None:
+                own += made_of(bundle.value, integrate(self.degree, value, None, bundle.path))
+            seen[bundle.index] = own
+
+    def _spread(self, seen: Float[Tensor, "m c"], padded: Float[Tensor, "zp yp xp"]) -> None:
+        """Add what the adjoint makes of what thin rays see."""
         _, spread = self._kernels()
         for bundle in self.bundles:
             for matrix in (bundle.gradient, bundle.value):
                 if matrix is not None:
                     q = torch.einsum("nij,ni->nj", matrix, seen[bundle.index]).to(self.inner).contiguous()
-                    value, *slope = spread(self.degree, q, bundle.path, bundle.planes.shape(shape))
+                    value, *slope = spread(self.degree, q, bundle.path, bundle.planes.shape(padded.shape))
                     bundle.planes.mend(value, slope[0] if slope else None, padded)
-        return self.boundary.fold(padded, self.layers)
 
     def _of_rays(self, seen: Float[Tensor, "n c"] | None) -> Float[Tensor, "m c"]:
         """Of what pixels see the part of each of their rays; 0 where nothing is given."""
@@ -204,7 +220,7 @@ def check_step(step: float, basis: str) -> None:
         raise InputError(f"step: expected above 0 and at most {STEPS[basis]:g} voxels (basis {basis}), got {step}")
 
 
-def _made(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:
+def made_of(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:
     """What the matrices make of integrals."""
     return torch.einsum("nij,nj->ni", matrix, integrals.to(matrix.dtype))
 

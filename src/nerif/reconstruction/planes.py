@@ -19,7 +19,7 @@ from nerif.fields.grid import spline_weights
 from nerif.geometry import Grid, Rays
 from nerif.techniques.base import ForwardModel
 
-__all__ = ["Bundle", "Planes"]
+__all__ = ["Bundle", "Planes", "is_even", "tabulated"]
 
 EVEN = 1e-9  # of the largest weight: how far one may be from the line between those at the ends of a ray
 PROBES = (0.0, 0.0931, 0.2718, 0.3819, 0.5, 0.6543, 0.8191, 0.9397, 1.0)  # shares of a ray; no profile repeats there
@@ -167,8 +167,8 @@ class Bundle:
         weights = model.weights(rays, at, apart.abs()[:, None].expand_as(at))
         begin, final = weights.profile.unbind(1)
         profile = torch.stack([begin, (final - begin) / (last - first).clamp_min(1)], dim=1)
-        if not _even(model, rays, s, apart, last - first):
-            profile = _tabulated(model, rays, s, apart, int((last - first).max()) + 1)
+        if not is_even(model, rays, s, apart, last - first):
+            profile = tabulated(model, rays, s, apart, int((last - first).max()) + 1)
         gradient = None if weights.slope is None else (weights.slope / spacing)[..., [*uv, axis]]
         value = None if weights.value is None else weights.value[..., None]
         for matrix in (gradient, value):
@@ -195,7 +195,7 @@ def _check_inside(ends: Float[Tensor, "n 2 3"], grid: Grid) -> None:
         raise InputError(f"rays: expected rays clipped to the box of the grid, {grid.box}, got longer ones")
 
 
-def _even(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tensor) -> bool:
+def is_even(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tensor) -> bool:
     """Whether the profile of every ray is a line from its first sample to its last, so many steps on."""
     shares = s.new_tensor(PROBES)
     for i in torch.arange(len(rays), device=s.device).split(CHUNK):
@@ -207,7 +207,7 @@ def _even(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tens
     return True
 
 
-def _tabulated(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, most: int) -> Float[Tensor, "n m 1"]:
+def tabulated(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, most: int) -> Float[Tensor, "n m 1"]:
     """The profile of a model at every sample of every ray."""
     m = torch.arange(most, dtype=s.dtype, device=s.device)
     parts = []

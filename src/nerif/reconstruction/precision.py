@@ -60,5 +60,5 @@ class MixedPrecision:
 def _is_plain(network: Network) -> bool:
     """Whether it is of layers alone, in the precision and with the activation that fused.py has."""
     shape, dtype = network.shape, network.outputs[0].weight.dtype
-    alone = not (shape.skip or shape.head_width or shape.gradient_head)
+    alone = network.layered and not (shape.skip or shape.head_width or shape.gradient_head)
     return alone and shape.activation == "silu" and dtype == torch.float32

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nerif.conventions import InputError, parse_faces
+from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
 from nerif.reconstruction.aperture import check_aperture
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
@@ -29,6 +30,18 @@ class SharedSettings(Reconstructor):
     """Standard deviation of how a camera is turned, degrees; else the pose_sigma of the measurement, or 0.02."""
     shift_sigma_px: float = 0.05
     """Standard deviation of the shift of a picture; of turn and zoom of it, at its edge, a fifth."""
+    symmetry: str = NO_SYMMETRY
+    """Of the flow: none, axis (alike all around it, so that one view is enough), axis+N (with N harmonics of the angle
+    around it, for several views), or planar (alike along a line, as between windows)."""
+    axis_point: tuple[float, float, float] | None = None
+    """A point (x y z) of the axis, mm; else the middle of the box."""
+    axis_direction: tuple[float, float, float] | None = None
+    """Direction (x y z) of the axis, else z; or of the line of a planar flow, else the way the cameras look, along the
+    box."""
+    axis_sigma_mm: float | None = None
+    """Standard deviation of where the axis is, mm, by which it is found; 0 for certain; else 3 % of the box."""
+    axis_sigma_deg: float = 2.0
+    """Standard deviation of how the axis leans, degrees; 0 for certain."""
     time_limit: float = 0.0
     """Stop after so many seconds; 0 for no limit."""
     lower: float | None = None
@@ -47,6 +60,10 @@ class SharedSettings(Reconstructor):
             raise InputError(f"time_limit: expected 0 or more, got {self.time_limit}")
         check_aperture(self.aperture)
         check_refined(self.refine, self.pose_sigma_mm, self.pose_sigma_deg, self.shift_sigma_px)
+        parse_symmetry(self.symmetry)
+        for name in ("axis_sigma_mm", "axis_sigma_deg"):
+            if not (getattr(self, name) or 0) >= 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")

@@ -385,4 +385,5 @@ class Training:
             state=state,
             quantity=self.data.quantity,
             rig=[] if self.data.refinement is None else self.data.refinement.table(),
+            axis=self.data.axis,
         )

@@ -15,7 +15,9 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box
+from nerif.geometry.axis import Axis
 from nerif.measurement import Measurement
 from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.bins import coarsest_edge
@@ -27,6 +29,7 @@ from nerif.reconstruction.refinement import Refinement, drawn
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.sources import of_source, stages
+from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
 from nerif.techniques.base import ForwardModel
 
@@ -69,6 +72,8 @@ class TrainingData(ABC):
     stage: int = 0
     """Part of the run that the data are given for."""
 
+    axis: Axis | None = None
+    """Of a symmetric flow."""
     refinement: Refinement | None = None
     """Of the rig, or None where it is as calibrated."""
     sigma_known: bool = False
@@ -158,6 +163,7 @@ class FrameData(TrainingData):
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
+        self.axis = axis_of(settings, measurement)
         self.lens_rays = lens_rays(measurement, settings.lens_rays)
         if settings.refine:
             self.refinement = Refinement.asked(
@@ -246,8 +252,13 @@ class FrameData(TrainingData):
         return [None]
 
     def untrained(self, shape: NetworkShape) -> NeuralField:
-        network = Network(shape, bounds=in_units(self.bounds, self.target.scale)).to(self.device)
-        return NeuralField(network, self.box, self.target.scale)
+        bounds = in_units(self.bounds, self.target.scale)
+        if self.axis is None:
+            network = Network(shape, bounds=bounds)
+        else:
+            own = self.axis.symmetry.in_units(self.box.centre, max(self.box.edges) / 2)
+            network = SymmetricNetwork(shape, own, bounds)
+        return NeuralField(network.to(self.device), self.box, self.target.scale)
 
 
 def _settling(target: Target) -> list[ForwardModel]:

@@ -19,6 +19,7 @@ from nerif.conventions import InputError
 from nerif.fields.mlp import UNBOUNDED, NetworkShape
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Rays
+from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.measurement import Measurement
 from nerif.reconstruction.bounds import in_units
 from nerif.reconstruction.device import resolve_device
@@ -48,12 +49,17 @@ class ChunkData(TrainingData):
     Raises
     ------
     InputError
-        If no frame has all the views that the others have.
+        If no frame has all the views that the others have, or a symmetry is asked for.
     """
 
     def __init__(
         self, settings: TrainingSettings, frames: Sequence[FrameData], tau: Float[Tensor, " f"], time_octaves: int
     ) -> None:
+        if settings.symmetry != NO_SYMMETRY:
+            raise InputError(
+                f"symmetry: expected {NO_SYMMETRY} for frames trained together, got '{settings.symmetry}'; reconstruct "
+                "frame by frame"
+            )
         parts = {name: digest(f.fingerprint[name] for f in frames) for name in frames[0].fingerprint}
         parts["settings"] = digest([settings, tau, time_octaves])
         like = frames[0]

@@ -1,0 +1,233 @@
+"""Fields that are alike around an axis or along a line: which places have the same value.
+
+With w = F (x - p), F the frame (rows e1, e2, e3) and p a point,
+
+    axis      (r, h) = (sqrt(w1^2 + w2^2 + d^2), w3)     e3 along the axis through p, d a length that rounds it
+    planar    (r, h) = (w1, w3)                           e2 along the line on which nothing changes
+
+A nearly axisymmetric field has N harmonics of the angle around the axis beside: with u = (w1 + i w2) / r,
+
+    f(x) = sum_k D_k(u) f_k(r, h),     D_k = (1 + 2 sum_m Re(u^m exp(-i m a_k))) / K,    a_k = 2 pi k / K,   K = 2 N + 1
+
+so that f_k is the field at the angle a_k, and nothing but its mean is left on the axis.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.conventions import FACES, InputError, Points, Vectors
+from nerif.geometry.grid import Box
+
+__all__ = ["NO_SYMMETRY", "Symmetry", "parse_symmetry"]
+
+NO_SYMMETRY = "none"
+MOST_HARMONICS = 8
+ALONG = math.cos(math.radians(45))  # of a face's normal and a direction, from which the face lies across it
+
+
+def parse_symmetry(text: str) -> tuple[str, int] | None:
+    """Return the kind of a symmetry and its harmonics; None for none.
+
+    Raises
+    ------
+    InputError
+        If it is not none, axis, axis+N or planar.
+    """
+    if text == NO_SYMMETRY:
+        return None
+    found = re.fullmatch(r"(planar)|axis(?:\+(\d+))?", text)
+    if not found or int(found[2] or 0) > MOST_HARMONICS:
+        raise InputError(
+            f"symmetry: expected {NO_SYMMETRY}, axis, axis+N (N harmonics of the angle, at most {MOST_HARMONICS}) or "
+            f"planar, got '{text}'"
+        )
+    return found[1] or "axis", int(found[2] or 0)
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """Which places have the same value.
+
+    Parameters
+    ----------
+    kind : axis, or planar
+    point : of the axis, mm; of a planar field any
+    frame : (e1, e2, e3), unit vectors at right angles; e3 along the axis, or e2 along the line
+    rounding : d, mm, at least a millionth of what is looked at
+    harmonics : N, of the angle around an axis
+    """
+
+    kind: str
+    point: tuple[float, float, float]
+    frame: tuple[tuple[float, float, float], ...]
+    rounding: float
+    harmonics: int = 0
+
+    @classmethod
+    def about(
+        cls, text: str, point: tuple[float, float, float], direction: tuple[float, float, float], rounding: float
+    ) -> Symmetry | None:
+        """Return the symmetry of a name about a line through a point (mm) in a direction of any length."""
+        parsed = parse_symmetry(text)
+        if parsed is None:
+            return None
+        kind, harmonics = parsed
+        line = torch.tensor(direction, dtype=torch.float64)
+        if not float(line.norm()) > 0:
+            raise InputError(f"axis_direction: expected a direction (x, y, z), got {direction}")
+        line = line / line.norm()
+        # e1 as near as may be to the first coordinate that is not along the line
+        first = torch.eye(3, dtype=torch.float64)[1 if abs(float(line[0])) > ALONG else 0]
+        e1 = first - (first @ line) * line
+        e1 = e1 / e1.norm()
+        rows = (e1, torch.linalg.cross(line, e1), line)
+        if kind == "planar":
+            rows = (e1, line, torch.linalg.cross(e1, line))
+        frame = tuple((float(a), float(b), float(c)) for a, b, c in (row.tolist() for row in rows))
+        return cls(kind, point, frame, rounding, harmonics)
+
+    @classmethod
+    def kept(cls, plain: Mapping[str, Any]) -> Symmetry:
+        """Return what a file keeps of one (dataclasses.asdict)."""
+        x, y, z = plain["point"]
+        frame = tuple((a, b, c) for a, b, c in plain["frame"])
+        return cls(plain["kind"], (x, y, z), frame, float(plain["rounding"]), int(plain["harmonics"]))
+
+    @property
+    def axial(self) -> bool:
+        """Whether it is about an axis."""
+        return self.kind == "axis"
+
+    @property
+    def angles(self) -> int:
+        """K, numbers that the field has at a place (r, h)."""
+        return 2 * self.harmonics + 1
+
+    @property
+    def direction(self) -> tuple[float, float, float]:
+        """Unit vector along the axis, or along the line on which nothing changes."""
+        return self.frame[2 if self.axial else 1]
+
+    @cached_property
+    def matrix(self) -> Float[Tensor, "3 3"]:
+        """The frame F."""
+        return torch.tensor(self.frame, dtype=torch.float64)
+
+    def local(self, points: Points) -> Points:
+        """Return w of points, mm."""
+        away = points - points.new_tensor(self.point)
+        # written out, since a matrix product may be of reduced precision
+        return torch.stack([(away * row).sum(-1) for row in self.matrix.to(points)], dim=-1)
+
+    def reduced(self, points: Points) -> Points:
+        """Return (r, 0, h) of points, mm."""
+        return self.of_local(self.local(points))
+
+    def of_local(self, w: Points) -> Points:
+        """Return (r, 0, h) of places in the frame."""
+        x, y, h = w.unbind(-1)
+        r = (x * x + y * y + self.rounding**2).sqrt() if self.axial else x
+        return torch.stack([r, torch.zeros_like(r), h], dim=-1)
+
+    def turned_back(self, w: Points, slope: Vectors) -> Vectors:
+        """Return the gradient in space of a field whose slopes along (r, -, h) are given, at places in the frame."""
+        if self.axial:
+            r = (w[..., 0].square() + w[..., 1].square() + self.rounding**2).sqrt()
+            along = torch.stack([slope[..., 0] * w[..., 0] / r, slope[..., 0] * w[..., 1] / r, slope[..., 2]], dim=-1)
+        else:
+            along = torch.stack([slope[..., 0], torch.zeros_like(slope[..., 0]), slope[..., 2]], dim=-1)
+        return self._in_space(along)
+
+    def shares(self, w: Points) -> tuple[Float[Tensor, "*n k"], Float[Tensor, "*n k 3"]]:
+        """Return D_k at places in the frame, and its gradient in space, 1/mm."""
+        count = self.angles
+        share = torch.ones(*w.shape[:-1], count, dtype=w.dtype, device=w.device)
+        slope = torch.zeros(*share.shape, 3, dtype=w.dtype, device=w.device)
+        x, y = w[..., 0], w[..., 1]
+        r = (x * x + y * y + self.rounding**2).sqrt()
+        u = torch.complex(x, y) / r
+        toward = torch.stack([x, y], dim=-1) / r[..., None]  # of r
+        one = torch.tensor([1, 1j], dtype=u.dtype, device=w.device)
+        turn = (one - u[..., None] * toward) / r[..., None]  # of u
+        angle = 2 * math.pi * torch.arange(count, dtype=w.dtype, device=w.device) / count
+        power = torch.ones_like(u)
+        for m in range(1, self.harmonics + 1):
+            phase = torch.polar(torch.ones_like(angle), -m * angle)
+            rise = (m * power)[..., None] * turn
+            slope[..., :2] += 2 * (rise[..., None, :] * phase[:, None]).real
+            power = power * u
+            share = share + 2 * (power[..., None] * phase).real
+        return share / count, self._in_space(slope / count)
+
+    def _in_space(self, along: Vectors) -> Vectors:
+        """Components along x, y, z of vectors given along e1, e2, e3."""
+        return torch.stack([(along * column).sum(-1) for column in self.matrix.to(along).T], dim=-1)
+
+    def places(self, r: Tensor, angle: Tensor, h: Tensor) -> Points:
+        """Return points (mm) at (r, h) and an angle around the axis, rad; on the plane through p where it is planar."""
+        w = torch.stack([r * angle.cos(), r * angle.sin(), h], dim=-1)
+        if not self.axial:
+            w = torch.stack([r, torch.zeros_like(r), h], dim=-1)
+        return w.new_tensor(self.point) + self._in_space(w)
+
+    def moved(self, shift: tuple[float, float], turn: tuple[float, float]) -> Symmetry:
+        """Return it shifted along e1 and e2 (mm) and leant towards them (rad)."""
+        frame = self.matrix
+        e3 = frame[2] + turn[0] * frame[0] + turn[1] * frame[1]
+        e3 = e3 / e3.norm()
+        e1 = frame[0] - (frame[0] @ e3) * e3
+        e1 = e1 / e1.norm()
+        rows = torch.stack([e1, torch.linalg.cross(e3, e1), e3]).tolist()
+        point = torch.tensor(self.point, dtype=torch.float64) + shift[0] * frame[0] + shift[1] * frame[1]
+        x, y, z = point.tolist()
+        return replace(self, point=(x, y, z), frame=tuple((a, b, c) for a, b, c in rows))
+
+    def in_units(self, centre: tuple[float, float, float], unit: float) -> Symmetry:
+        """Return it in coordinates (x - centre) / unit."""
+        x, y, z = ((p - c) / unit for p, c in zip(self.point, centre, strict=True))
+        return replace(self, point=(x, y, z), rounding=self.rounding / unit)
+
+    def faces(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the faces of (r, -, h) that faces of a box stand for: x+ for those around an axis, z- and z+."""
+        found = []
+        for name in names:
+            normal = self.matrix[:, FACES.index(name) // 2] * (1 if name[1] == "+" else -1)
+            if self.axial:
+                found.append("x+" if abs(normal[2]) < ALONG else f"z{'+' if normal[2] > 0 else '-'}")
+            elif abs(normal[1]) < ALONG:
+                row = 0 if abs(normal[0]) >= ALONG else 2
+                found.append("xyz"[row] + ("+" if normal[row] > 0 else "-"))
+        return tuple(dict.fromkeys(found))
+
+    def reduced_box(self, box: Box, ambient: tuple[str, ...]) -> Box:
+        """Return the box of (r, -, h) that a box in space fills; about an axis no wider than to an ambient face.
+
+        Parameters
+        ----------
+        box : Box, mm
+        ambient : its faces on which the field is ambient, beyond which nothing is looked for
+        """
+        unit = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=torch.float64)] * 3)
+        w = self.local(torch.tensor(box.lower, dtype=torch.float64) + unit * torch.tensor(box.edges))
+        low, high = w.amin(dim=0).tolist(), w.amax(dim=0).tolist()
+        if self.axial:
+            low[0], high[0] = 0.0, float(w[:, :2].norm(dim=1).max())
+            for name in ambient:
+                axis, sign = FACES.index(name) // 2, 1 if name[1] == "+" else -1
+                if abs(float(self.matrix[2, axis])) < ALONG:
+                    face = box.upper[axis] if sign > 0 else box.lower[axis]
+                    high[0] = min(high[0], sign * (face - self.point[axis]))
+            if not high[0] > 0:
+                raise InputError(f"axis_point: expected the axis within the box, got {self.point} mm")
+        width = (high[0] - low[0]) / 2
+        return Box((low[0], -width, low[2]), (high[0], width, high[2]))

@@ -1,0 +1,67 @@
+"""The symmetry that a reconstruction is asked for, about the axis that is named or found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from nerif.geometry.axis import Axis
+from nerif.geometry.symmetry import Symmetry, parse_symmetry
+from nerif.measurement import Measurement
+from nerif.reconstruction.axis_search import find_axis
+from nerif.reconstruction.gauge import ambient_faces
+from nerif.reconstruction.shared_settings import SharedSettings
+from nerif.reconstruction.sources import of_source
+
+__all__ = ["axis_of", "symmetry_asked", "with_axis"]
+
+PLACE = 0.03  # of the longest edge of the box: standard deviation of where an axis is, if nothing is said
+ROUNDING = 0.002  # of the longest edge of the box: within this of the axis a field is round
+
+
+def symmetry_asked(settings: SharedSettings, measurement: Measurement) -> Symmetry | None:
+    """Return the symmetry about the axis as it is named."""
+    parsed = parse_symmetry(settings.symmetry)
+    if parsed is None:
+        return None
+    box = measurement.box
+    direction = settings.axis_direction
+    if direction is None:
+        direction = (0.0, 0.0, 1.0) if parsed[0] == "axis" else _looked_along(measurement)
+    point = box.centre if settings.axis_point is None else settings.axis_point
+    return Symmetry.about(settings.symmetry, point, direction, ROUNDING * max(box.edges))
+
+
+def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:
+    """Return the symmetry about the axis as it is found near the one named; None where none is asked for.
+
+    A planar flow's line, and an axis whose standard deviations are 0, are as they are named.
+    """
+    symmetry = symmetry_asked(settings, measurement)
+    if symmetry is None:
+        return None
+    mm = settings.axis_sigma_mm
+    mm = PLACE * max(measurement.box.edges) if mm is None else mm
+    sigma = (mm, math.radians(settings.axis_sigma_deg))
+    if not symmetry.axial or not any(sigma):
+        return Axis(symmetry, (0.0,) * 4, (0.0,) * 4, (0.0,) * 4, math.nan)
+    seen = of_source(measurement, "auto", preferred="displacements")
+    faces = ambient_faces(measurement, settings.ambient_faces)
+    return find_axis(seen, symmetry, sigma, faces, settings.open_faces)
+
+
+def with_axis(settings: SharedSettings, axis: Axis) -> SharedSettings:
+    """Return settings that take the axis that was found as given."""
+    symmetry = axis.symmetry
+    return replace(
+        settings, axis_point=symmetry.point, axis_direction=symmetry.direction, axis_sigma_mm=0.0, axis_sigma_deg=0.0
+    )
+
+
+def _looked_along(measurement: Measurement) -> tuple[float, float, float]:
+    """The edge of the box along which the cameras look most."""
+    looks = torch.stack([camera.rotation[2].double() for camera in measurement.cameras])
+    x, y, z = torch.eye(3)[int(looks.square().sum(dim=0).argmax())].tolist()
+    return x, y, z

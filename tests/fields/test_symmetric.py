@@ -1,0 +1,93 @@
+"""Fields of (r, h): alike around their axis, exact gradients, and what a file keeps of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerif.conventions import InputError
+from nerif.fields.grid import Boundary, VoxelField
+from nerif.fields.mlp import NetworkShape, NeuralField
+from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
+from nerif.geometry import Box, Grid
+from nerif.geometry.symmetry import Symmetry
+from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.reconstruction.files import read_field, write_field
+from nerif.reconstruction.fused import value_and_gradient
+
+BOX = Box.cube(40.0)
+KINDS = ["axis", "planar", "axis+2"]
+
+
+def about(text):
+    direction = (0.1, 1.0, 0.03) if text == "planar" else (0.1, 0.05, 1.0)
+    found = Symmetry.about(text, (1.0, 2.0, 0.0), direction, 0.3)
+    assert found is not None
+    return found
+
+
+def network(text, **shape):
+    torch.manual_seed(0)
+    net = SymmetricNetwork(NetworkShape(depth=2, width=16, **shape), about(text).in_units(BOX.centre, 20.0))
+    return NeuralField(net.double().requires_grad_(False), BOX, 1e-4)
+
+
+def voxels(text):
+    symmetry, random = about(text), torch.Generator().manual_seed(0)
+    grid = Grid(symmetry.reduced_box(BOX, ()), (14, 2, 9))
+    parts = []
+    for _ in range(symmetry.angles):
+        c = torch.randn(14, 1, 9, dtype=torch.float64, generator=random).expand(14, 2, 9)
+        parts.append(VoxelField.of(c, grid, 3, Boundary()))
+    return SymmetricVoxels(parts, symmetry)
+
+
+@pytest.mark.parametrize("text", KINDS)
+@pytest.mark.parametrize("make", [network, voxels])
+def test_gradient_is_that_of_differences_on_the_axis_too(text, make):
+    field, points = make(text), 30 * torch.rand(100, 3, dtype=torch.float64) - 15
+    points[0] = torch.tensor([1.0, 2.0, 0.0])
+    step = 1e-5 * torch.eye(3, dtype=torch.float64)
+    expected = torch.stack([(field(points + e) - field(points - e)) / 2e-5 for e in step], dim=-1)
+    torch.testing.assert_close(field.gradient(points), expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("make", [network, voxels])
+def test_values_around_the_axis_are_the_same(make):
+    field, symmetry = make("axis"), about("axis")
+    r, h = torch.tensor(6.0, dtype=torch.float64), torch.tensor(3.0, dtype=torch.float64)
+    angles = torch.linspace(0, 6, 9, dtype=torch.float64)
+    around = field(symmetry.places(r.expand(9), angles, h.expand(9)))
+    assert float(around.std()) < 1e-12 * float(around.abs().mean()) + 1e-16
+
+
+def test_harmonics_change_around_the_axis_and_not_on_it():
+    field, symmetry = voxels("axis+2"), about("axis+2")
+    angles, zero = torch.linspace(0, 6, 40, dtype=torch.float64), torch.zeros(40, dtype=torch.float64)
+    assert float(field(symmetry.places(zero + 9, angles, zero)).std()) > 0.05
+    assert float(field(symmetry.places(zero, angles, zero)).std()) < 1e-12
+
+
+def test_layers_in_one_function_give_the_same():
+    net = SymmetricNetwork(NetworkShape(depth=2, width=16), about("axis").in_units(BOX.centre, 20.0))
+    p = 2 * torch.rand(50, 3) - 1
+    expected, found = net.value_and_gradient(p), value_and_gradient(net, p)
+    torch.testing.assert_close(found[0], expected[0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found[1], expected[1], rtol=1e-3, atol=1e-3)
+
+
+def test_gradient_heads_go_with_no_harmonics():
+    with pytest.raises(InputError, match="gradient_head"):
+        network("axis+1", gradient_head=True)
+
+
+@pytest.mark.parametrize("text", KINDS)
+@pytest.mark.parametrize("make", [network, voxels])
+def test_a_file_keeps_the_field(tmp_path, text, make):
+    field = make(text)
+    write_field(tmp_path, Reconstruction(field, BOX, 1.00027, [], Outcome("steps", ""), {"model": "auto"}))
+    again, box, _ = read_field(tmp_path)
+    points = (30 * torch.rand(20, 3) - 15).double()
+    again = again if isinstance(again, SymmetricVoxels) else NeuralField(again.network.double(), box, again.scale)
+    torch.testing.assert_close(again(points), field(points), rtol=1e-5, atol=1e-9)
+    assert box == BOX

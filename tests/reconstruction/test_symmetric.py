@@ -1,0 +1,225 @@
+"""Symmetric flows from one view and from several: the operator, the axis, the methods, harmonics, planar flows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerif.conventions import InputError, Points
+from nerif.fields.base import Field
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Grid, Lens, paper_rig
+from nerif.geometry.symmetry import Symmetry
+from nerif.physics.path_integral import PathIntegral
+from nerif.reconstruction.axis_search import find_axis
+from nerif.reconstruction.landweber import Landweber
+from nerif.reconstruction.layout import Symmetric
+from nerif.reconstruction.multiplicative import MLEM
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.operator import rays_through
+from nerif.reconstruction.symmetric_operator import SymmetricOperator
+from nerif.reconstruction.symmetry import symmetry_asked
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.total_variation import TotalVariation
+from nerif.simulation import simulate
+from nerif.techniques.base import midpoints
+from nerif.techniques.emission import Emission
+from nerif.techniques.registry import forward_models
+
+SIDES = ("x-", "x+", "y-", "y+")
+
+
+@pytest.fixture(scope="module")
+def jet():
+    cameras, box = paper_rig(40)
+    return simulate(make_phantom("gaussian-jet", box, 0), cameras[:2], box, 1.00027, 0.03, 0)
+
+
+def one_view(measurement):
+    return measurement.select(measurement.names[:1])
+
+
+def error(result, box, phantom="gaussian-jet"):
+    grid = Grid.of_resolution(box, 32)
+    truth = make_phantom(phantom, box, 0).sample(grid)
+    return float((result.field.sample(grid) - truth).norm() / truth.norm())
+
+
+@pytest.mark.parametrize("text", ["axis", "planar", "axis+2"])
+@pytest.mark.parametrize("basis", ["cubic", "linear"])
+def test_the_operator_is_the_path_integral_of_its_field_and_has_its_adjoint(jet, text, basis):
+    direction = (0.1, 1.0, 0.03) if text == "planar" else (0.1, 0.05, 1.0)
+    symmetry = Symmetry.about(text, (1.0, 2.0, 0.0), direction, 0.2)
+    layout = Symmetric(jet.box, SIDES, basis, symmetry)
+    grid = layout.grid(24)
+    rays = jet.rays()[0][::13].to(dtype=torch.float64)
+    (model,) = forward_models(jet.techniques, jet, "auto", True)
+    operator = layout.operator(rays, grid, model, None, torch.device("cpu"), torch.float64)
+    random = torch.Generator().manual_seed(0)
+    c = torch.randn(grid.shape, dtype=torch.float64, generator=random)
+    y = operator(c)
+    z = torch.randn(y.shape, dtype=torch.float64, generator=random)
+    assert float((y * z).sum()) == pytest.approx(float((c * operator.T(z)).sum()), rel=1e-11)
+    torch.testing.assert_close((operator.matrix() @ c.flatten()), y, rtol=0, atol=1e-11 * float(y.abs().max()))
+    field, index = layout.field(c, grid), operator.curves.index
+    for i in range(0, len(index), 41):
+        ray, n = rays[index[i : i + 1]], int(operator.curves.path[3][i])
+        step = (ray.far - ray.near) / n
+        s = ray.near + (torch.arange(n) + 0.5) * step
+        seen = PathIntegral(model).along(field, ray, s[None], step.expand(1, n))
+        assert float((seen[0] - y[index[i]]).abs().max()) < 1e-6 * float(y.abs().max())
+
+
+@pytest.mark.parametrize(
+    ("method", "most"),
+    [(Tikhonov(voxels=40), 0.03), (TotalVariation(voxels=40), 0.03), (Landweber(voxels=40), 0.06),
+     (NeRIF(max_steps=120), 0.03)],
+)  # fmt: skip
+def test_one_view_is_enough(jet, method, most):
+    result = replace(method, symmetry="axis")(one_view(jet))
+    assert error(result, jet.box) < most
+    assert result.axis.told == (True, False, True, False)
+
+
+def test_emission_from_one_view():
+    cameras, box = paper_rig(40)
+    cameras = [camera.without_background for camera in cameras[:1]]
+    phantom = make_phantom("gaussian-jet", box, 0)
+
+    class Light(Field):
+        def value_and_gradient(self, points: Points):
+            value, slope = phantom.value_and_gradient(points)
+            return value.abs(), slope * value.sign()[..., None]
+
+    measured = simulate(Light(), cameras, box, 1.0, 0.02, 0, techniques=(Emission,))
+    found = MLEM(symmetry="axis", voxels=32)(measured)
+    grid = Grid.of_resolution(box, 32)
+    truth = Light().sample(grid)
+    assert float((found.field.sample(grid) - truth).norm() / truth.norm()) < 0.08
+
+
+@pytest.mark.parametrize("shift", [(1.0, -0.7, 0.0), (-1.5, 0.4, 2.0)])
+def test_the_axis_is_found_in_the_picture_and_left_where_it_cannot_be_seen(jet, shift):
+    symmetry = Symmetry.about("axis", shift, (0.03, -0.02, 1.0), 0.1)
+    one, both = (
+        find_axis(m, symmetry, (2.0, math.radians(3.0)), SIDES) for m in (one_view(jet), jet)
+    )
+    look = one_view(jet).cameras[0].rotation[2].double()
+    e1 = torch.tensor(one.symmetry.frame[0], dtype=torch.float64)
+    assert abs(float(e1 @ look)) < 0.1
+    place = torch.tensor(one.symmetry.point, dtype=torch.float64)
+    across = place - (place @ look) * look
+    lean = torch.tensor(one.symmetry.direction, dtype=torch.float64)
+    beside = across - across[2] / lean[2] * lean  # where it crosses z = 0
+    assert abs(float(beside @ e1)) < 0.05
+    assert abs(float(lean @ torch.linalg.cross(look, torch.tensor([0.0, 0.0, 1.0]).double()))) < 0.003
+    assert one.told == (True, False, True, False)
+    assert one.sigma_after[1] == one.sigma[1]
+    assert all(abs(p) < 6 * s + 0.02 for p, s in zip(both.symmetry.point[:2], both.sigma_after, strict=False)) or (
+        not all(both.told)
+    )
+
+
+def test_two_views_apart_tell_the_axis_whole():
+    cameras, box = paper_rig(40)
+    measured = simulate(make_phantom("gaussian-jet", box, 0), [cameras[0], cameras[4]], box, 1.00027, 0.03, 0)
+    found = find_axis(measured, Symmetry.about("axis", (1.0, -0.7, 0.0), (0.03, -0.02, 1.0), 0.1), (2.0, 0.05), SIDES)
+    assert all(found.told)
+    x, y, z = found.symmetry.point
+    along = found.symmetry.direction
+    assert math.hypot(x - z * along[0] / along[2], y - z * along[1] / along[2]) < 0.1
+    assert math.hypot(*along[:2]) < 0.005
+
+
+def test_the_axis_can_be_held(jet):
+    held = replace(Tikhonov(voxels=16, symmetry="axis"), axis_sigma_mm=0.0, axis_sigma_deg=0.0)
+    assert held(one_view(jet)).axis.symmetry == symmetry_asked(held, one_view(jet))
+
+
+class Bent(Field):
+    """A column whose middle is off the axis: 1 + a cos(angle) of the radius."""
+
+    def value_and_gradient(self, points: Points):
+        centre = points.new_tensor([1.0, 0.0, 0.0])
+        off = (points - centre) * points.new_tensor([1.0, 1.0, 0.0])
+        value = -2e-4 * torch.exp(-off.square().sum(-1) / 50)
+        return value, -2 / 50 * value[..., None] * off
+
+
+@pytest.mark.parametrize("method", [Tikhonov(voxels=20), NeRIF(max_steps=100)])
+def test_harmonics_take_up_what_is_not_alike_around_the_axis(method):
+    box = Box.cube(50.0)
+    cameras = paper_rig(24)[0][::4]
+    measured = simulate(Bent(), cameras, box, 1.00027, 0.02, 0)
+    held = {"axis_sigma_mm": 0.0, "axis_sigma_deg": 0.0}
+    grid = Grid.of_resolution(box, 24)
+    truth = Bent().sample(grid)
+
+    def off(text):
+        found = replace(method, symmetry=text, **held)(measured).field.sample(grid)
+        return float((found - truth).norm() / truth.norm())
+
+    none, two = off("axis"), off("axis+2")
+    assert none > 0.1
+    assert two < 0.4 * none
+
+
+class Sheet(Field):
+    """A flow between windows, alike along y."""
+
+    def value_and_gradient(self, points: Points):
+        off = points * points.new_tensor([1.0, 0.0, 0.3])
+        value = -2e-4 * torch.exp(-(points[..., 0].square() + 0.3 * points[..., 2].square()) / 40)
+        return value, -2 / 40 * value[..., None] * off
+
+
+@pytest.mark.parametrize("method", [Tikhonov(voxels=32), NeRIF(max_steps=100)])
+def test_a_planar_flow_from_the_view_along_it(method):
+    box = Box.around_origin((50.0, 20.0, 50.0))
+    camera = paper_rig(32)[0][4:5]  # the one that looks along y
+    measured = simulate(Sheet(), camera, box, 1.00027, 0.02, 0)
+    result = replace(method, symmetry="planar")(replace(measured, ambient_faces=("x-", "x+")))
+    assert abs(result.axis.symmetry.direction[1]) > 0.99
+    grid = Grid.of_resolution(box, 24)
+    truth = Sheet().sample(grid)
+    assert float((result.field.sample(grid) - truth).norm() / truth.norm()) < 0.05
+
+
+def test_what_cannot_be_is_refused(jet):
+    for wrong in ({"symmetry": "round"}, {"axis_sigma_mm": -1.0}, {"axis_sigma_deg": -1.0}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            Tikhonov(**wrong)
+    with pytest.raises(InputError, match="axis_point"):
+        Tikhonov(symmetry="axis", axis_point=(99.0, 0.0, 0.0), voxels=16)(one_view(jet))
+
+
+def test_a_run_resumes_as_if_it_had_not_stopped(jet):
+    whole = NeRIF(symmetry="axis", max_steps=40)
+    half = replace(whole, max_steps=40)
+    kept = []
+    half(one_view(jet), on_step=lambda step: kept.append(step.capture()) is None and step.step == 20)
+    again = half(one_view(jet), resume=kept[-1])
+    points = 20 * torch.rand(50, 3) - 10
+    assert torch.equal(again.field(points), whole(one_view(jet)).field(points))
+
+
+def test_rays_through_a_lens(jet):
+    """The mean over the lens, by the operator as by the path integral."""
+    wide = replace(jet.cameras[0], lens=Lens(10.0))
+    rays = wide.rays(wide.pixel_grid().reshape(-1, 2)).clip(jet.box).to(dtype=torch.float64)[:400:7]
+    symmetry = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)
+    layout = Symmetric(jet.box, SIDES, "cubic", symmetry)
+    grid = layout.grid(24)
+    (model,) = forward_models(jet.techniques, jet, "auto", True)
+    operator = SymmetricOperator(symmetry, rays, grid, model, "cubic", layout.boundary, dtype=torch.float64)
+    c = layout.sample(make_phantom("gaussian-jet", jet.box, 0), grid, torch.device("cpu")).double()
+    each = rays_through(rays, min(grid.spacing))
+    spread = rays.spread(each)
+    s, step = midpoints(spread, 300)
+    through = spread.mean_of(each, PathIntegral(model).along(layout.field(c, grid), spread, s, step))
+    seen, crosses = operator(c), rays.crosses
+    assert each > 2
+    assert float((seen - through)[crosses].norm() / through[crosses].norm()) < 0.005
