@@ -18,7 +18,7 @@ LAYERS = (
     ("drawing",),
     ("notebook",),
     ("observation", "measurement_file", "measurement_summary", "measurement", "measurement_sequence"),
-    ("volume", "volume_file", "volume_sequence", "vti", "exports", "reprojection"),
+    ("meridian", "volume", "volume_file", "volume_sequence", "vti", "exports", "reprojection"),
     ("imaging",),
     ("fields",),
     ("physics",),

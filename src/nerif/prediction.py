@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,13 +12,15 @@ from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.base import Field
-from nerif.fields.grid import DEGREES, VoxelField
+from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import NeuralField
+from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.measurement import Measurement, measurement_of
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, Projector, project
 from nerif.physics.ray_tracing import CurvedRays
-from nerif.reconstruction.operator import VoxelOperator, rays_through
+from nerif.reconstruction.operator import rays_through
+from nerif.reconstruction.symmetric_operator import seen_of
 from nerif.reprojection import Accuracy, Reprojection
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
@@ -27,9 +30,11 @@ VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame
 EXACT_WORK = {"cpu": 2.5e11, "cuda": 2.5e13}  # multiplications: ten seconds on two cores
 VOXELS, BEYOND = 100, 3  # along the longest edge of the box, and beyond each face
+SYMMETRIC_VOXELS = 400  # the same, of (r, h) alone
 COMPARED = 1024  # pixels
 AT_ONCE = 1 << 21  # thin rays through voxels
 
+Splines = (VoxelField, SymmetricVoxels)
 __all__ = ["TRACED", "SampledViews", "check_sees", "predict", "predict_view", "reproject"]
 
 TRACED = "traced"
@@ -58,7 +63,7 @@ def predict_view(
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
     if not rays.crosses.any():
         return torch.zeros(*camera.image_size, projector.channels)
-    if isinstance(field, VoxelField) and isinstance(projector, PathIntegral) and projector.model.linear:
+    if isinstance(field, Splines) and isinstance(projector, PathIntegral) and projector.model.linear:
         seen = _through_voxels(field, rays, projector.model, device)
     else:
         seen = project(projector, field, rays, device)
@@ -66,16 +71,16 @@ def predict_view(
 
 
 def _through_voxels(
-    field: VoxelField, rays: Rays, model: ForwardModel, device: torch.device | str
+    field: VoxelField | SymmetricVoxels, rays: Rays, model: ForwardModel, device: torch.device | str
 ) -> Float[Tensor, "n c"]:
     """What `project` gives, by the compiled operator: tens of times faster."""
-    basis = next(name for name, degree in DEGREES.items() if degree == field.degree)
+    flat = field if isinstance(field, VoxelField) else field.parts[0]
+    step = VOXEL_STEP["linear" if flat.degree == 1 else "cubic"]
     each, seen = rays_through(rays, min(field.grid.spacing)), []
     for index in torch.arange(len(rays)).split(max(1, AT_ONCE // each)):
         part = rays[index]
         if bool(part.crosses.any()):
-            operator = VoxelOperator(part, field.grid, model, basis, step=VOXEL_STEP[basis], device=device)
-            seen.append(operator.through(field.coefficients).cpu())
+            seen.append(seen_of(field, part, model, step, device).cpu())
         else:
             seen.append(torch.zeros(len(part), len(model.channels)))
     return torch.cat(seen)
@@ -199,14 +204,27 @@ def _work(field: Field, cameras: Sequence[Camera]) -> float:
     return float(weights) * sum(n * m for n, m in zip(samples, pixels, strict=True))
 
 
-def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> VoxelField:
-    """Return the cubic spline through a field's values on voxels that go on beyond the box: right up to its faces."""
-    inner = Grid.of_resolution(box, VOXELS)
-    lower = tuple(a - BEYOND * h for a, h in zip(box.lower, inner.spacing, strict=True))
-    upper = tuple(b + BEYOND * h for b, h in zip(box.upper, inner.spacing, strict=True))
-    nz, ny, nx = (n + 2 * BEYOND for n in inner.shape)
-    grid = Grid(Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])), (nz, ny, nx))
+def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> VoxelField | SymmetricVoxels:
+    """Return the cubic splines through a field's values on voxels that go on beyond the box: right up to its faces."""
+    symmetry = symmetry_of_field(field)
+    if symmetry is not None:
+        reduced, size = symmetry.reduced_box(box, ()), max(box.edges) / SYMMETRIC_VOXELS
+        left = -reduced.upper[0] if symmetry.axial else reduced.lower[0]
+        whole = Box((left, *reduced.lower[1:]), reduced.upper)
+        shape = (math.ceil(whole.edges[2] / size), 2, math.ceil(whole.edges[0] / size))
+        return SymmetricVoxels.through(field, symmetry, _beyond(Grid(whole, shape), (0, 2)), device)
+    grid = _beyond(Grid.of_resolution(box, VOXELS), (0, 1, 2))
     return VoxelField.through(field.sample(grid, device), grid)
+
+
+def _beyond(grid: Grid, axes: Sequence[int]) -> Grid:
+    """The grid with BEYOND voxels more beyond its faces across some of x, y, z."""
+    lower, upper, shape = list(grid.box.lower), list(grid.box.upper), list(grid.shape)
+    for axis in axes:
+        lower[axis] -= BEYOND * grid.spacing[axis]
+        upper[axis] += BEYOND * grid.spacing[axis]
+        shape[2 - axis] += 2 * BEYOND
+    return Grid(Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])), (shape[0], shape[1], shape[2]))
 
 
 @dataclass(frozen=True)
@@ -227,26 +245,30 @@ class SampledViews:
     """
 
     field: Field
-    voxels: VoxelField
+    voxels: VoxelField | SymmetricVoxels
     box: Box
     projector: PathIntegral
     device: torch.device | str = "cpu"
 
     def __call__(self, camera: Camera) -> Float[Tensor, "row column c"]:
         """Return what a camera would see; of no meaning where a ray misses the box."""
-        step = max(1, min(camera.image_size) // (2 * VOXELS))
+        step = max(1, min(camera.image_size) // (2 * self.resolution))
         view = _interpolated(camera, self.box, step, self._straight)
         if not self.projector.model.straight:
             view = view + _interpolated(camera, self.box, 8 * step, self._bending)
         return view
 
     @property
+    def resolution(self) -> int:
+        """Voxels along the longest edge of the box."""
+        return VOXELS if isinstance(self.voxels, VoxelField) else SYMMETRIC_VOXELS
+
+    @property
     def _straight_model(self) -> ForwardModel:
         return self.projector.model.linear_twin
 
     def _straight(self, rays: Rays) -> Float[Tensor, "n c"]:
-        operator = VoxelOperator(rays, self.voxels.grid, self._straight_model, "cubic")
-        return operator.through(self.voxels.coefficients)
+        return seen_of(self.voxels, rays, self._straight_model)
 
     def _bending(self, rays: Rays) -> Float[Tensor, "n c"]:
         """What bent rays see more than straight ones."""
@@ -267,7 +289,8 @@ class SampledViews:
             exact = project(self.projector, self.field, rays, self.device)
             apart.append((view[pixels[:, 1], pixels[:, 0]] - exact)[rays.crosses])
         difference = torch.cat(apart)
-        how = f"a cubic spline through the network's values on {VOXELS} voxels along the longest edge of the box"
+        voxels = f"{self.resolution} voxels along the longest edge of the box"
+        how = f"a cubic spline through the network's values on {voxels}"
         return Accuracy(kind, how, float(difference.square().mean().sqrt()), len(difference))
 
 

@@ -19,8 +19,10 @@ from nerif.conventions import InputError
 from nerif.exports import export
 from nerif.fields.base import Field
 from nerif.geometry import Box
+from nerif.geometry.symmetry import Symmetry
 from nerif.json_file import write_json
 from nerif.measurement import Measurement
+from nerif.meridian import Meridian
 from nerif.reconstruction import files as kept
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
@@ -35,8 +37,9 @@ __all__ = [
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
+MERIDIAN = "meridian.nc", "meridian.csv"
 ENSEMBLE, FIRST_LOOK, FIGURES, CALIBRATION = "ensemble", "first_look", "figures", "calibration.toml"
-FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
+FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION, *MERIDIAN)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
 
@@ -92,6 +95,12 @@ class Result:
     def field(self) -> Volume | None:
         """The reconstructed field, from which the other volumes follow."""
         return self.volumes.get(field_of(self.volumes) or "")
+
+    @property
+    def meridian(self) -> Meridian | None:
+        """The quantities over (r, h) of a symmetric flow; None of any other."""
+        axis = self.metrics.get("axis")
+        return Meridian.of(self.volumes, Symmetry.kept(axis["symmetry"])) if axis and self.volumes else None
 
     @property
     def method(self) -> str:
@@ -188,6 +197,11 @@ class ResultDirectory:
         """Write volume.nc and volume.vti."""
         for name in (VOLUME, VOLUME_VTI):
             export(self.path / name, volumes)
+
+    def write_meridian(self, meridian: Meridian) -> None:
+        """Write meridian.nc and meridian.csv."""
+        meridian.write(self.path / MERIDIAN[0])
+        meridian.write_csv(self.path / MERIDIAN[1])
 
     def write_reprojection(self, reprojection: Reprojection) -> None:
         """Write measured and predicted views."""

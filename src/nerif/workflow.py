@@ -179,7 +179,10 @@ def reconstruct_into(
             )
             members.add_to(result, run.gas, voxels)
     finally:  # the verdict and the page of the main result, whatever becomes of the members
-        judged = verdict(out.read())
+        made = out.read()
+        if (meridian := made.meridian) is not None:
+            out.write_meridian(meridian)
+        judged = verdict(made)
         out.add_metrics({"verdict": asdict(judged)})
         if run.report:
             write_report(out.path, monitor=monitor)

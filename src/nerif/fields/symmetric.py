@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -9,13 +10,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerif.conventions import InputError, Points, Values, Vectors
-from nerif.fields.base import Field
+from nerif.fields.base import Field, in_chunks
 from nerif.fields.encoding import encode, encode_pullback
 from nerif.fields.grid import VoxelField
-from nerif.fields.mlp import ACTIVATIONS, UNBOUNDED, Network, NetworkShape
+from nerif.fields.mlp import ACTIVATIONS, UNBOUNDED, Network, NetworkShape, NeuralField
+from nerif.geometry import Grid
 from nerif.geometry.symmetry import Symmetry
 
-__all__ = ["SymmetricNetwork", "SymmetricVoxels"]
+__all__ = ["SymmetricNetwork", "SymmetricVoxels", "symmetry_of_field"]
 
 
 class SymmetricNetwork(Network):
@@ -65,6 +67,17 @@ class SymmetricNetwork(Network):
         return self.symmetry.turned_back(self.symmetry.local(p).to(slope), slope)
 
 
+def symmetry_of_field(field: Field) -> Symmetry | None:
+    """Return the symmetry that a field is made with, mm; None where it has none."""
+    if isinstance(field, SymmetricVoxels):
+        return field.symmetry
+    if isinstance(field, NeuralField) and isinstance(field.network, SymmetricNetwork):
+        unit = field.half_edge
+        x, y, z = field.box.centre
+        return field.network.symmetry.in_units((-x / unit, -y / unit, -z / unit), 1 / unit)
+    return None
+
+
 class SymmetricVoxels(Field):
     """B-splines of (r, h): f(x) = sum_k D_k(x) f_k(r, h).
 
@@ -78,6 +91,37 @@ class SymmetricVoxels(Field):
         if len(parts) != symmetry.angles:
             raise InputError(f"parts: expected {symmetry.angles} of the symmetry, got {len(parts)}")
         self.parts, self.symmetry = tuple(parts), symmetry
+
+    @classmethod
+    def through(
+        cls, field: Field, symmetry: Symmetry, grid: Grid, device: torch.device | str = "cpu"
+    ) -> SymmetricVoxels:
+        """Return the splines through a symmetric field's values on a grid of (r, -, h), on both sides of an axis.
+
+        Parameters
+        ----------
+        grid : of (r, -, h), with two voxels across; about an axis r begins as far below 0 as it ends above
+        """
+        h, r = torch.meshgrid(grid.axis("z"), grid.axis("x"), indexing="ij")
+        field, parts = field.to(device), []
+        for k in range(symmetry.angles):
+            angle = torch.full_like(r, 2 * math.pi * k / symmetry.angles)
+            points = symmetry.places(r, angle, h).float().reshape(-1, 3)
+            values = torch.cat([field(p.to(device)).detach().cpu().float() for p in in_chunks(points)])
+            flat = values.reshape(len(h), 1, -1).expand(*grid.shape)
+            parts.append(VoxelField.through(flat, grid))
+        return cls(parts, symmetry)
+
+    @property
+    def grid(self) -> Grid:
+        """Of (r, k, h)."""
+        flat = self.parts[0].grid
+        return Grid(flat.box, (flat.shape[0], len(self.parts), flat.shape[2]))
+
+    @property
+    def padded(self) -> Float[Tensor, "z k x"]:
+        """Coefficients (h, k, r), with those beyond the grid across h and r."""
+        return torch.stack([part.coefficients[:, part.layers] for part in self.parts], dim=1)
 
     def to(self, device: torch.device | str) -> SymmetricVoxels:
         """Return the same field with its coefficients on another device."""

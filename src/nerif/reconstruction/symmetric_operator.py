@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.fields.grid import Boundary
+from nerif.fields.grid import DEGREES, Boundary, VoxelField
+from nerif.fields.symmetric import SymmetricVoxels
 from nerif.geometry import Grid, Rays
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.device import share_threads
@@ -18,7 +19,7 @@ from nerif.reconstruction.operator import VoxelOperator, made_of
 from nerif.reconstruction.planes import is_even, tabulated
 from nerif.techniques.base import ForwardModel
 
-__all__ = ["SymmetricOperator"]
+__all__ = ["SymmetricOperator", "seen_of"]
 
 SAMPLES = 2  # in a voxel, at least
 
@@ -132,3 +133,15 @@ class SymmetricOperator(VoxelOperator):
         if self.shares is None:
             return rows
         return (rows.reshape(*self.shares.shape[:2], channels, -1) * self.shares[..., None]).sum(dim=1)
+
+
+def seen_of(
+    field: VoxelField | SymmetricVoxels, rays: Rays, model: ForwardModel, step: float | None = None,
+    device: torch.device | str = "cpu",
+) -> Float[Tensor, "n c"]:  # fmt: skip
+    """Return what rays that are clipped to the box see of splines, by the operator that goes with them."""
+    degree = field.degree if isinstance(field, VoxelField) else field.parts[0].degree
+    basis = next(name for name, d in DEGREES.items() if d == degree)
+    if isinstance(field, VoxelField):
+        return VoxelOperator(rays, field.grid, model, basis, step=step, device=device).through(field.coefficients)
+    return SymmetricOperator(field.symmetry, rays, field.grid, model, basis, step=step).through(field.padded)

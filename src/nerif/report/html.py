@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from functools import cache, partial
@@ -12,8 +13,10 @@ from nerif import __version__
 from nerif.atomic import atomic
 from nerif.drawing import drawn_of, map_colours
 from nerif.evaluation import rms_text
+from nerif.meridian import Meridian
 from nerif.notebook import number, picture
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
+from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.moves_figure import draw_moved_rig, draw_moves
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
@@ -50,6 +53,7 @@ def render(result: Result) -> str:
     metrics = result.metrics.get("views")
     metrics = metrics if isinstance(metrics, list) else []
     views, scales = ([], []) if result.reprojection is None else view_images(result.reprojection, metrics)
+    meridian = result.meridian
     first = next((v.name for v in views if v.held_out), views[0].name if views else "")
     return render_page(
         kind=_kind(result),
@@ -71,6 +75,8 @@ def render(result: Result) -> str:
         scores=metrics,
         left_out=repeated(result).get("left_out") or [],
         kept_out=looked(result),
+        plane=_plane(meridian),
+        plane_title="Around the axis" if meridian is None or meridian.axial else "In the plane of the flow",
         curves=_curves(result),
         assumptions=[
             (name_of(q).capitalize(), result.volumes[q].notes)
@@ -110,6 +116,19 @@ def _template() -> jinja2.Template:
     environment.filters["ends"] = _ends
     environment.filters["rms"] = partial(rms_text, digits=3)
     return environment.get_template("report.html.j2")
+
+
+def _plane(meridian: Meridian | None) -> list[tuple[str, str]]:
+    """Titles and pictures of what a symmetric flow is over (r, h)."""
+    if meridian is None:
+        return []
+    plane = "in a plane through the axis" if meridian.axial else "in the plane across"
+    beside, along = ("across the axis", "on the axis") if meridian.axial else ("along r", "along h")
+    ways = (plane, draw_section), (beside, draw_profiles), (along, draw_centre_line)
+    return [
+        (f"{name_of(quantity).capitalize()} {where}", svg(partial(draw, meridian=meridian, quantity=quantity)))
+        for quantity, (where, draw) in itertools.product(drawn_of(meridian.quantities), ways)
+    ]
 
 
 def _curves(result: Result) -> list[tuple[str, str]]:

@@ -29,6 +29,7 @@ from nerif.drawing import (
 from nerif.observation import Observation
 from nerif.report.figures import draw_history, draw_line, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
+from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.moves_figure import draw_moves
 from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import lattice_step
@@ -77,6 +78,12 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         yield "comparison", comparison(result.field, error, double)
     for quantity in quantities if result.field is None or min(result.field.grid.shape) > 1 else ():
         yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
+    if (meridian := result.meridian) is not None:
+        ways = ("section", draw_section), ("profiles", draw_profiles), ("centre_line", draw_centre_line)
+        for quantity, (name, draw) in itertools.product(drawn_of(meridian.quantities), ways):
+            figure = _page(single, 0.9 if name == "section" else 0.7)
+            draw(figure.subplots(), meridian, quantity)
+            yield f"{name}_{quantity}", figure
     if result.reprojection is not None:
         taken: set[str] = set()
         for i, name in enumerate(result.reprojection.measurement.names):
