@@ -42,7 +42,6 @@ ENSEMBLE, FIRST_LOOK, FIGURES, CALIBRATION = "ensemble", "first_look", "figures"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION, *MERIDIAN)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
-
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError)
 
 T = TypeVar("T")
@@ -99,8 +98,8 @@ class Result:
     @property
     def meridian(self) -> Meridian | None:
         """The quantities over (r, h) of a symmetric flow; None of any other."""
-        axis = self.metrics.get("axis")
-        return Meridian.of(self.volumes, Symmetry.kept(axis["symmetry"])) if axis and self.volumes else None
+        axis = self.metrics.get("axis") if self.volumes else None
+        return Meridian.of(self.volumes, Symmetry.kept(axis["symmetry"])) if axis else None
 
     @property
     def method(self) -> str:
@@ -200,8 +199,8 @@ class ResultDirectory:
 
     def write_meridian(self, meridian: Meridian) -> None:
         """Write meridian.nc and meridian.csv."""
-        meridian.write(self.path / MERIDIAN[0])
-        meridian.write_csv(self.path / MERIDIAN[1])
+        for name, write in zip(MERIDIAN, (meridian.write, meridian.write_csv), strict=True):
+            write(self.path / name)
 
     def write_reprojection(self, reprojection: Reprojection) -> None:
         """Write measured and predicted views."""
