@@ -130,8 +130,8 @@ def draw(out: Path) -> Path:
     usable = half.measurement.usable_for(half.measurement.observations[0])
     limit = float(measured[usable].abs().quantile(0.995)) if int(usable.sum()) < 1e7 else 1.0
     with style(8):
-        figure = Figure(figsize=(9.0, 5.6), layout="constrained")
-        left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.25))
+        figure = Figure(figsize=(8.0, 5.6), layout="constrained")
+        left, right = figure.subfigures(1, 2, width_ratios=(1.15, 1.0))
         grid = left.subplots(2, 2, sharex=True, sharey=True)
         for c, line in enumerate(grid):
             predicted = half.maps["deflection"][0, ..., c]
@@ -141,7 +141,7 @@ def draw(out: Path) -> Path:
                 axes.set_title(f"{'uv'[c]} {title}")
                 axes.label_outer()
         grid[1, 1].set_xlabel("right half not seen")
-        section, line = right.subplots(1, 2, width_ratios=(1.3, 1.0))
+        section, line = right.subplots(2, 1, height_ratios=(1.9, 1.0))
         meridian = whole.meridian
         assert meridian is not None
         draw_section(section, meridian, "n")
