@@ -51,14 +51,21 @@ def spread(
 
 
 @njit(fastmath=FASTMATH)
-def _place(x, y, h, plane):
-    """r and h in voxels, from the first coefficient that the cell before needs, and the direction of r."""
+def _sample(start, stride, m, plane, spline):
+    """Where a sample is: whether on the plane, r and its direction, the first coefficients that count, their weights."""
+    x, y, h = start[0] + m * stride[0], start[1] + m * stride[1], start[2] + m * stride[2]
     if plane[6] >= 0:
         r = np.sqrt(x * x + y * y + plane[6] * plane[6])
         along, aside = x / r, y / r
     else:
         r, along, aside = x, 1.0, 0.0
-    return r, (r - plane[0]) / plane[2] - 0.5, (h - plane[1]) / plane[3] - 0.5, along, aside
+    pr, ph = (r - plane[0]) / plane[2] - 0.5, (h - plane[1]) / plane[3] - 0.5
+    cr = min(max(np.floor(pr), -1.0), plane[4] - 1)
+    ch = min(max(np.floor(ph), -1.0), plane[5] - 1)
+    first = plane[7] - len(spline) // 2 + 1
+    inside = -0.5 <= pr <= plane[4] - 0.5
+    weights_r, weights_h = weights_at(pr - cr, spline), weights_at(ph - ch, spline)
+    return inside, r, along, aside, int(cr + first), int(ch + first), weights_r, weights_h
 
 
 @njit(fastmath=FASTMATH)
@@ -79,22 +86,15 @@ def _angles(r, along, aside, share, rise):
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
 def _integrate(padded, start, stride, profile, count, plane, seen, spline, part):
-    neighbours, layers = len(spline), plane[7]
+    neighbours = len(spline)
     for n in prange(len(start)):
         angles = padded.shape[1]
         share, rise = np.ones(angles), np.zeros((angles, 2))
         q1 = q2 = q3 = 0.0
         for m in range(count[n]):
-            x, y = start[n, 0] + m * stride[n, 0], start[n, 1] + m * stride[n, 1]
-            r, pr, ph, along, aside = _place(x, y, start[n, 2] + m * stride[n, 2], plane)
-            if pr > plane[4] - 0.5 or pr < -0.5:
+            inside, r, along, aside, ir, ih, (br, sr), (bh, sh) = _sample(start[n], stride[n], m, plane, spline)
+            if not inside:
                 continue
-            cr = min(max(np.floor(pr), -1.0), plane[4] - 1)
-            ch = min(max(np.floor(ph), -1.0), plane[5] - 1)
-            br, sr = weights_at(pr - cr, spline)
-            bh, sh = weights_at(ph - ch, spline)
-            first = layers - neighbours // 2 + 1
-            ir, ih = int(cr + first), int(ch + first)
             if angles > 1:
                 _angles(r, along, aside, share, rise)
             w = profile_at(profile[n], m)
@@ -123,22 +123,15 @@ def _integrate(padded, start, stride, profile, count, plane, seen, spline, part)
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
 def _spread(each, start, stride, profile, count, plane, seen, spline, part):
-    neighbours, layers, angles, rays = len(spline), plane[7], each.shape[2], len(start)
+    neighbours, angles, rays = len(spline), each.shape[2], len(start)
     for chunk in prange(len(each)):
         padded = each[chunk]
         share, rise = np.ones(angles), np.zeros((angles, 2))
         for n in range(chunk * rays // len(each), (chunk + 1) * rays // len(each)):
             for m in range(count[n]):
-                x, y = start[n, 0] + m * stride[n, 0], start[n, 1] + m * stride[n, 1]
-                r, pr, ph, along, aside = _place(x, y, start[n, 2] + m * stride[n, 2], plane)
-                if pr > plane[4] - 0.5 or pr < -0.5:
+                inside, r, along, aside, ir, ih, (br, sr), (bh, sh) = _sample(start[n], stride[n], m, plane, spline)
+                if not inside:
                     continue
-                cr = min(max(np.floor(pr), -1.0), plane[4] - 1)
-                ch = min(max(np.floor(ph), -1.0), plane[5] - 1)
-                br, sr = weights_at(pr - cr, spline)
-                bh, sh = weights_at(ph - ch, spline)
-                first = layers - neighbours // 2 + 1
-                ir, ih = int(cr + first), int(ch + first)
                 if angles > 1:
                     _angles(r, along, aside, share, rise)
                 w = profile_at(profile[n], m)
