@@ -52,7 +52,7 @@ def spread(
 
 @njit(fastmath=FASTMATH)
 def _sample(start, stride, m, plane, spline):
-    """Where a sample is: whether on the plane, r and its direction, the first coefficients that count, their weights."""
+    """Whether a sample is on the plane, r and its direction, the first coefficients that count, their weights."""
     x, y, h = start[0] + m * stride[0], start[1] + m * stride[1], start[2] + m * stride[2]
     if plane[6] >= 0:
         r = np.sqrt(x * x + y * y + plane[6] * plane[6])
