@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from nerif.geometry import Grid
@@ -98,6 +99,34 @@ def test_axis_of_a_spray_by_refinement(name):
     assert -0.36 < found < -0.24
 
 
+JET = Path(__file__).parents[2] / "shared" / "data" / "bos_pairs"
+
+
+def test_shock_cells_are_as_long_as_they_were_made():
+    jet = runpy.run_path(str(EXAMPLES / "jet.py"))
+    h, random = np.linspace(0, 73, 400), np.random.default_rng(0)
+    signal = np.cos(2 * np.pi * h / 24.4) + 0.3 * np.sin(4 * np.pi * h / 24.4) + 0.01 * h
+    found = jet["spacing"](h, signal + 0.2 * random.standard_normal(400), 10.0, 40.0)
+    assert abs(found.length - 24.4) < 4 * found.sigma
+    assert 0.01 < found.sigma < 0.5
+    assert found.explained > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not JET.is_dir(), reason=f"{JET.name}: the pictures are not there")
+def test_jet(tmp_path):
+    """The half that was not seen is predicted, and the shock cells are those of the displacement."""
+    pair = [str(JET / "jet_reference.tif"), str(JET / "jet_flow.tif")]
+    script = [sys.executable, str(EXAMPLES / "jet.py"), *pair, "--out", str(tmp_path / "jet"), "--seconds", "60"]
+    done = subprocess.run(script, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    u, v = map(float, re.findall(r"right: predicted .* u ([\d.]+), v ([\d.]+)", done.stdout)[0])
+    assert min(u, v) > 0.93
+    lengths = [float(x) for x in re.findall(r"shock cells by .*?: ([\d.]+) \+-", done.stdout)]
+    assert max(lengths) - min(lengths) < 1.0
+    assert (tmp_path / "jet" / "jet.png").is_file()
+
+
 def test_examples_are_all_tested():
-    tested = {"own_data.py", "from_images.py", "knocked_camera.py", "particles.py", "spray.py"}
+    tested = {"own_data.py", "from_images.py", "knocked_camera.py", "particles.py", "spray.py", "jet.py"}
     assert {p.name for p in EXAMPLES.glob("*.py")} == tested

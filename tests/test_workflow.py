@@ -14,7 +14,7 @@ from nerif.monitor import Monitor
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.result import CALIBRATION, FILES, REPORT, ResultDirectory
+from nerif.result import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
 from nerif.workflow import Run, reconstruct_into
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")
@@ -31,7 +31,7 @@ def made(measurement, tmp_path_factory: pytest.TempPathFactory) -> tuple[ResultD
 def test_python_writes_the_whole_directory(made, measurement, capsys):
     out, result = made
     assert capsys.readouterr().out == ""
-    assert {p.name for p in out.path.iterdir()} == set(FILES) - {REPORT, CALIBRATION}
+    assert {p.name for p in out.path.iterdir()} == set(FILES) - {REPORT, CALIBRATION, *MERIDIAN}
     found = out.read()
     assert not found.missing
     assert [v["name"] for v in found.metrics["views"] if v["held_out"]] == ["144deg"]

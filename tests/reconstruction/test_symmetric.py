@@ -149,7 +149,7 @@ class Bent(Field):
         return value, -2 / 50 * value[..., None] * off
 
 
-@pytest.mark.parametrize("method", [Tikhonov(voxels=20), NeRIF(max_steps=100)])
+@pytest.mark.parametrize("method", [Tikhonov(voxels=20), pytest.param(NeRIF(max_steps=100), marks=pytest.mark.slow)])
 def test_harmonics_take_up_what_is_not_alike_around_the_axis(method):
     box = Box.cube(50.0)
     cameras = paper_rig(24)[0][::4]
