@@ -177,7 +177,9 @@ def _of_view(
     if o.sigma is not None:
         noise = float(o.sigma[view, :height, :width].double().reshape(len(pixels), -1)[both].square().mean())
         odd, size = max(odd - noise, 0.0), max(size - noise, 0.0)
-    return {"cc": cc, "departure": math.sqrt(odd / size) if size > 0 else 1.0}
+    if not size > 0:
+        return None  # there is nothing but noise, which has no symmetry to depart from
+    return {"cc": cc, "departure": math.sqrt(odd / size)}
 
 
 def _read(known: Float[Tensor, "row column c"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:

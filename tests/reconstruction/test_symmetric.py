@@ -104,9 +104,7 @@ def test_emission_from_one_view():
 @pytest.mark.parametrize("shift", [(1.0, -0.7, 0.0), (-1.5, 0.4, 2.0)])
 def test_the_axis_is_found_in_the_picture_and_left_where_it_cannot_be_seen(jet, shift):
     symmetry = Symmetry.about("axis", shift, (0.03, -0.02, 1.0), 0.1)
-    one, both = (
-        find_axis(m, symmetry, (2.0, math.radians(3.0)), SIDES) for m in (one_view(jet), jet)
-    )
+    one = find_axis(one_view(jet), symmetry, (2.0, math.radians(3.0)), SIDES)
     look = one_view(jet).cameras[0].rotation[2].double()
     e1 = torch.tensor(one.symmetry.frame[0], dtype=torch.float64)
     assert abs(float(e1 @ look)) < 0.1
@@ -118,9 +116,6 @@ def test_the_axis_is_found_in_the_picture_and_left_where_it_cannot_be_seen(jet, 
     assert abs(float(lean @ torch.linalg.cross(look, torch.tensor([0.0, 0.0, 1.0]).double()))) < 0.003
     assert one.told == (True, False, True, False)
     assert one.sigma_after[1] == one.sigma[1]
-    assert all(abs(p) < 6 * s + 0.02 for p, s in zip(both.symmetry.point[:2], both.sigma_after, strict=False)) or (
-        not all(both.told)
-    )
 
 
 def test_two_views_apart_tell_the_axis_whole():
