@@ -30,10 +30,11 @@ LAYERS = (
         "prediction", "halves", "evaluation", "consistency", "rig_check", "mistakes", "quick_views", "symptoms",
         "gains", "verdict",
     ),
-    ("kept_run", "members", "first_look"),
+    ("kept_run", "members", "first_look", "live"),
     ("report", "sequence"),
     ("workflow",),
     ("commands",),
+    ("app",),
     ("cli", "__main__"),
 )
 """Bottom first; a module may import from its own layer and from those below (docs/architecture.md)."""

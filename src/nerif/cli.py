@@ -26,9 +26,14 @@ VERBS = {
     "report": "write a page that shows a result and says whether it can be trusted",
     "figures": "write every figure of a result as PDF and PNG at journal widths",
     "export": "write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid",
+    "app": "the whole road in a browser, on this machine: design, pictures, calibration, runs, results",
     "info": "print what a measurement, volume or result holds",
     "demo": "simulate, reconstruct and evaluate a small flame",
 }
+
+
+ELSEWHERE = {"app": "nerif.app.command"}
+"""Modules of verbs that are no file of nerif.commands."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -67,7 +72,7 @@ def _run(words: list[str]) -> int:
     from nerif.conventions import InputError
 
     try:
-        command = importlib.import_module(f"nerif.commands.{verb}")
+        command = importlib.import_module(ELSEWHERE.get(verb, f"nerif.commands.{verb}"))
         importlib.import_module("nerif.reconstruction.device").keep_freed_memory()
         command.main(words[1:])
     except InputError as error:

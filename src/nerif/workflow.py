@@ -15,6 +15,7 @@ from nerif.first_look import AUTO, FEWEST, FirstLook, kept_out
 from nerif.gains import fit_gains, with_gains
 from nerif.halves import HALVES, departure_sentence, departures, halved, kept_half
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
+from nerif.live import Live
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
@@ -95,6 +96,7 @@ def reconstruct_into(
     keep: Mapping[str, Any] | None = None,
     on_step: OnStep | None = None,
     monitor: Monitor = QUIET,
+    live: bool = False,
 ) -> Reconstruction:
     """Reconstruct, and write the result directory that docs/formats.md lists.
 
@@ -113,6 +115,7 @@ def reconstruct_into(
     keep : further entries of run.toml
     on_step : told every step of the main reconstruction, and may stop it
     monitor : told how the work goes
+    live : write live.json and live.npz meanwhile, for whoever looks on (live.py)
 
     Raises
     ------
@@ -157,13 +160,18 @@ def reconstruct_into(
     if "density" not in quantities_of(measurement.quantity):
         del settings["gas"]
     run, begin = replace(run, hold_out=unseen), _begin(out, settings, resume)
+    data = measurement if look is None else look.data
+    seen = Live(out.path, data, reconstructor, *unseen[:1]) if live else None
+    if seen is not None and look is not None:
+        look = replace(look, monitor=seen.watching(monitor, held_out=True))
+    watched = monitor if seen is None else seen.watching(monitor, held_out=bool(unseen))
     first, method, origin = look(begin) if look is not None and state is None else None, reconstructor, start
     if first is not None:
         origin, method = first.field, reconstructor.in_two()[1]
     if look is not None and first is not None and first.outcome.reason == "interrupted":
         result, run = replace(first, state=None), replace(run, hold_out=(*unseen, look.view))
     else:
-        with monitor.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
+        with watched.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
             callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
             result = method(training, compose(*callbacks), state, origin if state is None else None)
     begin(None)
@@ -174,8 +182,9 @@ def reconstruct_into(
         if repetitions is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
             known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
+            watched = monitor if seen is None else seen.watching(monitor, held_out=False, looks=False)
             members = Members(
-                out, repetitions, reconstructor, known, start, made_of, run.checkpoint_every, monitor
+                out, repetitions, reconstructor, known, start, made_of, run.checkpoint_every, watched
             )
             members.add_to(result, run.gas, voxels)
     finally:  # the verdict and the page of the main result, whatever becomes of the members

@@ -24,7 +24,7 @@ from nerif.techniques.registry import TECHNIQUES
 from nerif.volume import INDEX, Volume, name_of
 from nerif.volume_file import read_volume
 
-__all__ = ["Info", "main", "run"]
+__all__ = ["Info", "is_measurement", "main", "run"]
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,14 @@ def run(settings: Info) -> None:
     path = settings.path
     if path.is_dir():
         _result(path)
-    elif path.suffix == ".vti" or (path.suffix == ".nc" and path.is_file() and not _is_measurement(path)):
+    elif path.suffix == ".vti" or (path.suffix == ".nc" and path.is_file() and not is_measurement(path)):
         _volume(path, read_volume(path))
     else:
         _measurement(path, Measurement.read(path))
 
 
-def _is_measurement(path: Path) -> bool:
-    """A volume says CF, a measurement BOST; what says nothing is left to the stricter reader."""
+def is_measurement(path: Path) -> bool:
+    """Return whether a NetCDF file is a measurement: that says BOST, a volume CF; what says nothing counts as one."""
     try:
         with opened(path, "a measurement or a volume") as dataset:
             said = known_conventions(dataset.attrs.get("Conventions"))

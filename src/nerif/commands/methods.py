@@ -36,6 +36,8 @@ class Reconstruct(Settings):
     """Go on with an interrupted run in --out; limits such as --epochs or --iterations may be raised."""
     tensorboard: bool = False
     """Write TensorBoard scalars to OUT/tensorboard."""
+    live: bool = False
+    """Write OUT/live.json and OUT/live.npz while it goes on, to be looked at (nerif app)."""
     run: Annotated[Run, Flat] = field(default_factory=Run)
     reconstructor: Annotated[Reconstructor, tyro.conf.Suppress] = field(default_factory=NeRIF)
 

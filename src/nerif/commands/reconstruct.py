@@ -27,7 +27,7 @@ def run(settings: Reconstruct) -> Reconstruction:
         return reconstruct_into(
             settings.out, settings.measurement, settings.reconstructor, settings.run,
             voxels=settings.volume_voxels, resume=settings.resume, force=settings.force, keep=settings.kept,
-            on_step=scalars, monitor=MONITOR,
+            on_step=scalars, monitor=MONITOR, live=settings.live,
         )  # fmt: skip
 
 

@@ -71,6 +71,7 @@ class Step:
     losses : the terms by name
     rays_per_second : 1/s
     capture : gives the State to resume from
+    field : gives the Field as it is now, to be looked at before the method goes on
     """
 
     step: int
@@ -80,6 +81,7 @@ class Step:
     losses: dict[str, float]
     rays_per_second: float
     capture: Callable[[], State]
+    field: Callable[[], Field]
 
 
 OnStep = Callable[[Step], bool | None]

@@ -269,7 +269,10 @@ class Descent:
         losses = {k: v for k, v in record.items() if k in ("voxels", "weight", "residual", "residual_over_sigma")}
         speed = len(problem.target) * self.total / max(self.seconds, 1e-9)
         limit = self.settings.time_limit
-        step = Step(self.total, float(self.total), self.seconds, self._progress(), losses, speed, self._capture)
+        step = Step(
+            self.total, float(self.total), self.seconds, self._progress(), losses, speed, self._capture,
+            lambda: self._field(self.here),
+        )  # fmt: skip
         if self.on_step is not None and self.on_step(step):
             raise _Stop("interrupted", f"stopped on request at {voxels:.0f} voxels; --resume goes on from here")
         if limit and self.seconds >= limit:

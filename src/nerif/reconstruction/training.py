@@ -314,7 +314,8 @@ class Training:
     def _tell(self, values: dict[str, float], speed: float, over: bool = False) -> Step:
         budget = self.budget
         progress = 1.0 if over else min(budget.share, 1.0)
-        return Step(budget.step, budget.epoch, budget.seconds, progress, values, speed, self._capture)
+        capture = self._capture
+        return Step(budget.step, budget.epoch, budget.seconds, progress, values, speed, capture, lambda: self.field)
 
     def _capture(self) -> State:
         tensors = {f"network.{k}": v for k, v in self._weights().items()}

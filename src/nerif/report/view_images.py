@@ -17,7 +17,7 @@ from nerif.measurement import Measurement
 from nerif.observation import Observation
 from nerif.reprojection import Reprojection
 
-__all__ = ["Scale", "ViewImages", "colour_table", "lattice_step", "view_images"]
+__all__ = ["Scale", "ViewImages", "colour_table", "lattice_step", "picture_address", "view_images"]
 
 LARGEST = 320  # px along an edge of a picture in the page
 ALL_PICTURES = 4_000_000  # px of all pictures of a page: 5 MB of it
@@ -102,7 +102,7 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
             for c, component in enumerate(o.components):
                 images = (measured[..., c], seen[..., c], seen[..., c] - measured[..., c])
                 ends = (scale.limits, scale.limits, scale.apart)
-                first, second, third = (_picture(_shrink(x, shrinks[i]), e) for x, e in zip(images, ends, strict=True))
+                first, second, third = (picture_address(_shrink(x, shrinks[i]), e) for x, e in zip(images, ends, strict=True))
                 rows[i][component] = first, second, third
     found = [
         ViewImages(
@@ -141,8 +141,8 @@ def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Fl
     return image[:height, :width].reshape(height // down, down, width // across, across).mean(axis=(1, 3))
 
 
-def _picture(image: Float[np.ndarray, "row column"], limits: tuple[float, float]) -> str:
-    """A PNG of 255 colours between the limits, and grey where there is nothing."""
+def picture_address(image: Float[np.ndarray, "row column"], limits: tuple[float, float]) -> str:
+    """Return a PNG of 255 colours between the limits, grey where there is nothing, as a data address."""
     from PIL import Image
 
     low, high = limits
