@@ -7,12 +7,16 @@ The names in the file are those of the flags; a nested flag such as --network.wi
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
+import itertools
 import json
 import re
+import textwrap
 import typing
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +27,7 @@ import tyro
 from nerif.conventions import InputError
 from nerif.toml import check_known, read_toml
 
-__all__ = ["Flat", "Settings", "flag_value", "merge", "parse", "read_settings", "value_given"]
+__all__ = ["Flat", "Settings", "flag_value", "flat_names", "help_of", "merge", "parse", "read_settings", "value_given"]
 
 T = TypeVar("T")
 
@@ -183,3 +187,23 @@ def _one_line(box: str, prog: str) -> str:
     text = re.sub(r"\s+", " ", text)
     text = re.sub(r" Perhaps you meant: (--[\w.-]+|-\w, --[\w.-]+).*", r"; perhaps you meant \1", text)
     return f"{text}; see {prog} --help"
+
+
+def help_of(cls: type, name: str) -> str:
+    """Return the text below a field of a record, as its class or the one it has it from says it; empty if none does."""
+    for kind in cls.__mro__:
+        if name in vars(kind).get("__annotations__", {}):
+            return _texts(kind).get(name, "")
+    return ""
+
+
+@functools.cache
+def _texts(cls: type) -> dict[str, str]:
+    """The text below each field, by name."""
+    body = typing.cast(ast.ClassDef, ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]).body
+    return {
+        node.target.id: inspect.cleandoc(below.value.value)
+        for node, below in itertools.pairwise(body)
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+        and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) and isinstance(below.value.value, str)
+    }  # fmt: skip

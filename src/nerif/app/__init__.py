@@ -1,0 +1,1 @@
+"""The whole road in a browser, on the lab's own machine: `nerif app`."""

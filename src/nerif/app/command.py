@@ -1,0 +1,55 @@
+"""nerif app: the whole road in a browser, on this machine."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nerif.commands.settings import Settings, read_settings
+from nerif.conventions import InputError
+
+__all__ = ["App", "main", "run"]
+
+
+@dataclass(frozen=True)
+class App(Settings):
+    """Work on a folder in the browser: design, pictures, calibration, reconstruction, results.
+
+    Whatever is done there is a command line, which is shown; runs go on when page and server are closed.
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional] = Path(".")
+    """Folder of the project; nothing outside of it is read or written."""
+    port: int = 8620
+    """Port to listen on; the next free one if it is taken."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Any other than this machine's own needs --token: whoever reaches it and knows the token can
+    run nerif here and read and write the folder, and what goes to and fro is not encrypted."""
+    token: str | None = None
+    """Token in the address, of 16 letters or more; else a random one each time."""
+    browser: bool = True
+    """Open the browser."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.port <= 65535:
+            raise InputError(f"port: expected 1 to 65535, got {self.port}")
+        if self.token is not None and (len(self.token) < 16 or not self.token.isascii() or not self.token.isprintable()):
+            raise InputError(f"token: expected 16 plain letters or more, got {len(self.token)}")
+
+
+def run(settings: App) -> None:
+    """Serve until Ctrl-C."""
+    if importlib.util.find_spec("nicegui") is None:
+        raise InputError("app: expected NiceGUI, which is not installed; pip install 'nerif[app]'")
+    from nerif.app.server import Address, serve
+
+    serve(settings.folder, Address.of(settings.host, settings.port, settings.token), settings.browser)
+
+
+def main(arguments: list[str]) -> None:
+    """Parse and run."""
+    run(read_settings(App(), arguments, "app"))

@@ -1,0 +1,175 @@
+"""A form on a page: a control for each setting, with what it means below and what is wrong with it beside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from typing import Any, Generic, TypeVar
+
+from nicegui import ui
+
+from nerif.app.forms import Form, FormField
+
+__all__ = ["FormView"]
+
+T = TypeVar("T")
+
+
+class FormView(Generic[T]):
+    """Controls of a form, in the part of the page that is being built.
+
+    Parameters
+    ----------
+    form : Form
+    on_change : called after each change, whether the values can be right or not
+    values : to begin with
+    main : names of the fields that are seen at once; the others are behind "More settings"; all if empty
+    sliders : lowest and highest value, by name, of fields that have a slider beside the number
+    """
+
+    def __init__(
+        self,
+        form: Form[T],
+        on_change: Callable[[], None],
+        values: Mapping[str, Any] | None = None,
+        main: Sequence[str] = (),
+        sliders: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        self.form, self.on_change, self.sliders = form, on_change, dict(sliders or {})
+        self.values: dict[str, Any] = dict(values or {})
+        self.errors: dict[str, str] = {}
+        self._controls: dict[str, Any] = {}
+        self._said: dict[str, ui.html] = {}
+        names = [f.name for f in form.fields]
+        for name in main or names:
+            self._control(form.field(name))
+        rest = [name for name in names if main and name not in main]
+        if rest:
+            self._more(rest)
+        self.check()
+
+    # -- what it holds -------------------------------------------------------------------------------------------
+
+    @property
+    def arguments(self) -> list[str]:
+        """Arguments of nerif that do what the form says."""
+        return self.form.arguments(self.values)
+
+    @property
+    def right(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.errors
+
+    def made(self) -> T:
+        """The record; InputError if something is wrong."""
+        return self.form.made(self.values)
+
+    def set(self, name: str, value: Any) -> None:
+        """Set a value as if it were typed."""
+        if name in self._controls:
+            self._controls[name].set_value(_shown(self.form.field(name), value))
+        else:
+            self._changed(self.form.field(name), value)
+
+    def check(self) -> None:
+        """Say beside each field what is wrong with it."""
+        self.errors = self.form.errors(self.values)
+        for name, said in self._said.items():
+            error = self.errors.get(name, "")
+            said.set_content(f"<span role=alert>{escape(error)}</span>" if error else "")
+            self._controls[name].props(f'aria-invalid={"true" if error else "false"}')
+            self._controls[name].classes(**{"add" if error else "remove": "wrong"})
+
+    # -- how it is made ------------------------------------------------------------------------------------------
+
+    def _more(self, names: Sequence[str]) -> None:
+        with ui.expansion("More settings", icon="tune").classes("more") as more:
+            place = ui.element("div").classes("form")
+
+        def fill() -> None:
+            if more.value and not place.default_slot.children:
+                with place:
+                    for name in names:
+                        self._control(self.form.field(name))
+                self.check()
+
+        more.on_value_change(fill)
+
+    def _control(self, field: FormField) -> None:
+        value = self.values.get(field.name, field.default)
+        with ui.element("div").classes("field"):
+            control = self._made(field, _shown(field, value))
+            label = f"{field.label}{f' ({field.unit})' if field.unit else ''}"
+            control.props(f'name="{field.name}" aria-label="{escape(label)}"')
+            control.on_value_change(lambda event: self._changed(field, _meant(field, event.value)))
+            self._controls[field.name] = control
+            if field.name in self.sliders:
+                low, high = self.sliders[field.name]
+                slider = ui.slider(min=low, max=high, step=_step(field, low, high))
+                slider.props(f'aria-label="{escape(label)}" tabindex=0').bind_value(control)
+            self._said[field.name] = ui.html("", sanitize=False).classes("error")
+            if field.help:
+                ui.html(f"<p>{escape(field.help)}</p>", sanitize=False).classes("help")
+
+    def _made(self, field: FormField, value: Any) -> Any:
+        """The control itself, by the kind of the field."""
+        label = field.label
+        if field.kind == "switch":
+            return ui.switch(label, value=bool(value))
+        if field.kind == "choice":
+            return ui.select(list(field.choices), label=label, value=value).props("outlined dense options-dense")
+        if field.kind in ("number", "integer"):
+            control = ui.number(label, value=value, suffix=field.unit or None)
+            return control.props('outlined dense debounce=150 step="any"')
+        control = ui.input(label, value=value).props("outlined dense debounce=250")
+        return control.props(f'suffix="{field.unit}"') if field.unit else control
+
+    def _changed(self, field: FormField, value: Any) -> None:
+        if self.values.get(field.name, field.default) == value:
+            return
+        self.values[field.name] = value
+        self.check()
+        self.on_change()
+
+
+def _shown(field: FormField, value: Any) -> Any:
+    """A value as its control has it."""
+    if field.kind == "words":
+        return " ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value or ())
+    return ("" if value is None else str(value)) if field.kind == "text" else value
+
+
+def _meant(field: FormField, value: Any) -> Any:
+    """A value as the record has it, or as near as what is typed comes to it: the record says what is wrong."""
+    if field.kind == "integer" and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if field.kind == "number" and isinstance(value, int):
+        return float(value)
+    if field.kind == "words":
+        words = str(value or "").replace(",", " ").split()
+        return None if field.optional and not words else [_number(word, field) for word in words]
+    if field.kind == "text" and field.optional and not str(value or "").strip():
+        return None
+    return value
+
+
+def _number(word: str, field: FormField) -> Any:
+    """A number where the default has numbers, else the word."""
+    numeric = not field.default or all(isinstance(v, int | float) for v in field.default)
+    if not numeric:
+        return word
+    for kind in (int, float):
+        try:
+            number = kind(word)
+        except ValueError:
+            continue
+        whole = kind is int and any(isinstance(v, float) for v in field.default or ())
+        return float(number) if whole else number
+    return word
+
+
+def _step(field: FormField, low: float, high: float) -> float:
+    """Step of a slider: a five-hundredth of its way, in round numbers."""
+    if field.kind == "integer":
+        return 1
+    return float(f"{(high - low) / 500:.0e}")

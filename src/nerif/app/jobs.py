@@ -1,0 +1,300 @@
+"""Runs of `nerif ...`, one after the other: a queue on disk, which a server that is started again finds as it was.
+
+Each run has a folder of its own in FOLDER/.nerif/jobs with job.json (what is asked), log.txt, and what its process
+writes down: started.json and ended.json (runner.py). State is nowhere else.
+
+    queued ─▶ running ─▶ done | failed | stopped
+                 │
+                 └─▶ paused ─▶ queued ...          of nerif reconstruct: stopped, and gone on with by --resume
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from nerif.app.runner import ENDED, JOB, LOG, STARTED
+from nerif.conventions import InputError
+from nerif.json_file import write_json
+from nerif.result import RUN
+
+__all__ = ["Job", "Jobs", "command_line"]
+
+LAUNCHED = "launched"
+CLOCK = 1.5  # seconds by which two readings of when a process was started may differ
+RESUMABLE = "reconstruct"
+
+
+def command_line(arguments: Sequence[str]) -> str:
+    """Return the line that does the same in a shell, in the folder of the project."""
+    return shlex.join(["nerif", *arguments])
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run.
+
+    Parameters
+    ----------
+    id : name of its folder; sorts by time
+    title : what it is, for people
+    arguments : of nerif, the verb first
+    attempt : those of the present start: of a run that is gone on with, other ones
+    folder : where it runs
+    out : what it writes, relative to the folder; empty if that is no result directory
+    asked : "", "stop" or "pause"
+    place : in the queue
+    state : queued, running, paused, done, failed or stopped
+    pid : of its process while it runs
+    code : exit code once it has ended
+    started, ended : seconds since the epoch, 0 if not yet
+    """
+
+    id: str
+    title: str
+    arguments: tuple[str, ...]
+    attempt: tuple[str, ...]
+    folder: str
+    out: str = ""
+    asked: str = ""
+    place: float = 0.0
+    state: str = "queued"
+    pid: int = 0
+    code: int | None = None
+    started: float = 0.0
+    ended: float = 0.0
+
+    @property
+    def line(self) -> str:
+        """The command line of its present start."""
+        return command_line(self.attempt)
+
+    @property
+    def resumable(self) -> bool:
+        """Whether it can be paused: stopped, and gone on with later."""
+        return self.arguments[0] == RESUMABLE and bool(self.out)
+
+
+KEPT = ("id", "title", "arguments", "attempt", "folder", "out", "asked", "place")
+
+
+class Jobs:
+    """The runs of a project.
+
+    Parameters
+    ----------
+    folder : of the project
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.directory = folder, folder / ".nerif" / "jobs"
+        self._runners: list[subprocess.Popen[bytes]] = []
+
+    # -- what there is -------------------------------------------------------------------------------------------
+
+    def all(self) -> list[Job]:
+        """Return all runs: what waits and runs in the order of the queue, then what has ended, the last one first."""
+        found = [job for job in map(self._read, self._names()) if job is not None]
+        open_, over = ("running", "queued", "paused"), [j for j in found if j.state in ("done", "failed", "stopped")]
+        return sorted((j for j in found if j.state in open_), key=lambda j: (open_.index(j.state), j.place)) + sorted(
+            over, key=lambda j: j.ended, reverse=True
+        )
+
+    def get(self, id: str) -> Job:
+        """Return one run.
+
+        Raises
+        ------
+        InputError
+            If there is none of that name.
+        """
+        job = self._read(id) if id in self._names() else None
+        if job is None:
+            raise InputError(f"job: expected one of {', '.join(self._names()) or 'none'}, got '{id}'")
+        return job
+
+    def log(self, id: str, lines: int = 200) -> list[str]:
+        """Return the last lines that a run has printed."""
+        path = self._of(self.get(id)) / LOG
+        if not path.is_file():
+            return []
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - 200 * lines))
+            return file.read().decode("utf-8", "replace").splitlines()[-lines:]
+
+    def _names(self) -> list[str]:
+        if not self.directory.is_dir():
+            return []
+        return sorted(p.name for p in self.directory.iterdir() if (p / JOB).is_file())
+
+    def _of(self, job: Job) -> Path:
+        return self.directory / job.id
+
+    def _read(self, name: str) -> Job | None:
+        """A run and its state; None where its folder is damaged or just being removed."""
+        where = self.directory / name
+        kept, started, ended = (_json(where / file) for file in (JOB, STARTED, ENDED))
+        if set(kept) != set(KEPT):
+            return None
+        job = Job(**{**kept, "arguments": tuple(kept["arguments"]), "attempt": tuple(kept["attempt"])})
+        if ended:
+            job = replace(job, code=int(ended["code"]), started=started["time"], ended=ended["time"])
+            over = {"pause": "paused", "stop": "stopped"}.get(job.asked, "done")
+            return replace(job, state=over if not job.code else "stopped" if job.asked else "failed")
+        if started:
+            job = replace(job, started=started["time"], pid=int(started["pid"]))
+            if _alive(job.pid, started["began"]):
+                return replace(job, state="running")
+            return replace(job, state="stopped" if job.asked else "failed", ended=(where / STARTED).stat().st_mtime)
+        if job.asked:
+            return replace(job, state="stopped")
+        launched = _json(where / LAUNCHED)
+        if launched and not _alive(int(launched["pid"]), launched["began"]):
+            return replace(job, state="failed")
+        return replace(job, state="running" if launched else "queued")
+
+    # -- what is asked -------------------------------------------------------------------------------------------
+
+    def add(self, arguments: Sequence[str], title: str, out: str = "") -> Job:
+        """Put a run at the end of the queue.
+
+        Parameters
+        ----------
+        arguments : of nerif, the verb first; paths relative to the folder of the project
+        title : for people
+        out : result directory that it writes, relative to the folder
+        """
+        if not arguments:
+            raise InputError("arguments: expected a verb of nerif, got nothing")
+        name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
+        words = tuple(str(word) for word in arguments)
+        job = Job(name, title, words, words, str(self.folder), str(out), place=time.time())
+        self._of(job).mkdir(parents=True)
+        self._keep(job)
+        return job
+
+    def stop(self, id: str) -> None:
+        """Ask a run to end, with what it has; asked twice, it breaks off. One that waits does not begin."""
+        self._ask(id, "stop")
+
+    def pause(self, id: str) -> None:
+        """Ask a run to end, to be gone on with later.
+
+        Raises
+        ------
+        InputError
+            If it cannot be gone on with.
+        """
+        if not self.get(id).resumable:
+            raise InputError(f"job {id}: only nerif {RESUMABLE} can be paused; stop it and start it again")
+        self._ask(id, "pause")
+
+    def resume(self, id: str) -> None:
+        """Put a run that has been paused, stopped or broken off back into the queue: from its checkpoint, if it can."""
+        job = self.get(id)
+        if job.state in ("queued", "running"):
+            return
+        attempt = job.arguments
+        if job.resumable and (self.folder / job.out / RUN).is_file():
+            attempt = (RESUMABLE, "--resume", "--out", job.out, *(("--live",) if "--live" in attempt else ()))
+        for name in (STARTED, ENDED, LAUNCHED):
+            (self._of(job) / name).unlink(missing_ok=True)
+        self._keep(replace(job, attempt=attempt, asked="", place=time.time()))
+
+    def first(self, id: str) -> None:
+        """Let a waiting run be the next."""
+        job = self.get(id)
+        self._keep(replace(job, place=min((j.place for j in self.all()), default=0.0) - 1))
+
+    def remove(self, id: str) -> None:
+        """Forget a run that has ended or waits; what it wrote stays.
+
+        Raises
+        ------
+        InputError
+            If it runs.
+        """
+        job = self.get(id)
+        if job.state == "running":
+            raise InputError(f"job {id}: it runs; stop it first")
+        shutil.rmtree(self._of(job))
+
+    @property
+    def at_once(self) -> int:
+        """How many run at the same time."""
+        return int(_json(self.directory / "settings.json").get("at_once", 1))
+
+    @at_once.setter
+    def at_once(self, count: int) -> None:
+        if not 1 <= count <= 64:
+            raise InputError(f"at_once: expected 1 to 64 runs at the same time, got {count}")
+        self.directory.mkdir(parents=True, exist_ok=True)
+        write_json(self.directory / "settings.json", {"at_once": int(count)})
+
+    def _ask(self, id: str, what: str) -> None:
+        job = self.get(id)
+        if job.state not in ("queued", "running", "paused"):
+            return
+        self._keep(replace(job, asked=what))
+        if job.state == "running" and job.pid:
+            os.kill(job.pid, signal.SIGINT)
+
+    def _keep(self, job: Job) -> None:
+        write_json(self._of(job) / JOB, {k: v for k, v in asdict(job).items() if k in KEPT})
+
+    # -- the queue -----------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Start as many of the waiting runs as may run at the same time."""
+        self._runners = [runner for runner in self._runners if runner.poll() is None]
+        jobs = self.all()
+        free = self.at_once - sum(job.state == "running" for job in jobs)
+        for job in [job for job in jobs if job.state == "queued"][: max(free, 0)]:
+            self._launch(job)
+
+    def _launch(self, job: Job) -> None:
+        import psutil
+
+        where = self._of(job)
+        try:
+            claim = os.open(where / LAUNCHED, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+        except FileExistsError:  # another server of the same folder was faster
+            return
+        runner = subprocess.Popen(
+            [sys.executable, "-m", "nerif.app.runner", str(where)], stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+        self._runners.append(runner)
+        with os.fdopen(claim, "w") as file:
+            json.dump({"pid": runner.pid, "began": psutil.Process(runner.pid).create_time()}, file)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """The entries of a JSON file; none where it is missing or just being written."""
+    try:
+        found = json.loads(path.read_text())
+    except (FileNotFoundError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _alive(pid: int, began: float) -> bool:
+    """Whether the process that was started then is there: numbers are given again."""
+    import psutil
+
+    try:
+        process = psutil.Process(pid)
+        return abs(process.create_time() - began) < CLOCK and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False

@@ -1,0 +1,114 @@
+"""The runs of the project, on every page: what waits, goes on and has ended, and what can be done with each."""
+
+from __future__ import annotations
+
+import time
+from html import escape
+
+from nicegui import ui
+
+from nerif.app.jobs import Job
+from nerif.app.pieces import refusals
+from nerif.app.workspace import Workspace
+from nerif.live import read_live
+
+__all__ = ["JobsDrawer", "progress_of"]
+
+EVERY = 1.0  # seconds
+SHOWN = 30  # runs
+ACTIONS = {
+    "running": ("pause", "stop"),
+    "queued": ("first", "stop"),
+    "paused": ("resume", "stop", "remove"),
+    "done": ("remove",),
+    "failed": ("resume", "remove"),
+    "stopped": ("resume", "remove"),
+}
+NAMES = {"pause": "Pause", "stop": "Stop", "resume": "Go on", "remove": "Forget", "first": "Next"}
+
+
+def progress_of(work: Workspace, job: Job) -> tuple[float, str]:
+    """Return how far a run is, from 0 to 1, and what it is doing; of one that does not tell, 0 and nothing."""
+    live = read_live(work.project.path(job.out)) if job.out and job.state in ("running", "paused") else {}
+    if not live or live["written"] < job.started:
+        return 0.0, ""
+    return float(live["progress"] or 0.0), str(live["title"])
+
+
+class JobsDrawer:
+    """A button with the number of open runs, and the drawer that it opens."""
+
+    def __init__(self, work: Workspace) -> None:
+        self.work, self._shown = work, ""
+        self.button = ui.button("Runs", icon="playlist_play", on_click=self.toggle)
+        self.button.props('flat no-caps aria-label="Runs" aria-expanded=false')
+
+    def build(self) -> None:
+        """Build the drawer beside the page."""
+        with ui.right_drawer(value=False, bordered=True).props("width=380 overlay").classes("runs") as self.drawer:
+            ui.html("<h2>Runs</h2>", sanitize=False)
+            self._at_once = ui.number(
+                "At the same time", value=self.work.jobs.at_once, min=1, max=64, on_change=self._set
+            ).props("dense outlined")
+            self.place = ui.element("div").props('role="list" aria-label="Runs"')
+        self._refresh()
+        ui.timer(EVERY, self._refresh)
+
+    def toggle(self) -> None:
+        """Open or close it."""
+        self.drawer.toggle()
+        self.button.props(f"aria-expanded={'true' if self.drawer.value else 'false'}")
+
+    def _set(self) -> None:
+        with refusals():
+            self.work.jobs.at_once = int(self._at_once.value or 1)
+
+    async def _refresh(self) -> None:
+        jobs, progress = await self.work.beside(self._look)
+        open_ = sum(job.state in ("running", "queued", "paused") for job in jobs)
+        self.button.set_text(f"Runs ({open_})" if open_ else "Runs")
+        state = repr([(j.id, j.state, j.asked, j.place) for j in jobs]) + repr(progress)
+        if state == self._shown:
+            return
+        self._shown = state
+        self.place.clear()
+        with self.place:
+            for job in jobs[:SHOWN]:
+                self._row(job, *progress[job.id])
+            if not jobs:
+                ui.html("<p class=note>Nothing has been run from here yet.</p>", sanitize=False)
+
+    def _look(self) -> tuple[list[Job], dict[str, tuple[float, str]]]:
+        jobs = self.work.jobs.all()
+        return jobs, {job.id: progress_of(self.work, job) for job in jobs}
+
+    def _row(self, job: Job, share: float, title: str) -> None:
+        said = f"{job.state}, {job.asked} asked" if job.state == "running" and job.asked else job.state
+        with ui.element("div").classes(f"run {job.state}").props('role="listitem"'):
+            ui.html(
+                f"<b>{escape(job.title)}</b><span class=state>{escape(said)} {escape(title)}</span>"
+                f"<code>{escape(job.line)}</code>", sanitize=False,
+            )  # fmt: skip
+            if job.state == "running" and share:
+                ui.linear_progress(share, show_value=False).props(f'aria-label="{escape(job.title)}"')
+            with ui.row().classes("gap-1"):
+                for action in ACTIONS[job.state]:
+                    if action != "pause" or job.resumable:
+                        ui.button(NAMES[action], on_click=lambda a=action, i=job.id: self._do(a, i)).props(
+                            f'flat dense no-caps aria-label="{NAMES[action]}: {escape(job.title)}"'
+                        )
+                ui.button("Log", on_click=lambda i=job.id: self._log(i)).props("flat dense no-caps")
+
+    async def _do(self, action: str, id: str) -> None:
+        with refusals():
+            getattr(self.work.jobs, action)(id)
+        await self._refresh()
+
+    def _log(self, id: str) -> None:
+        with refusals(), ui.dialog(value=True) as dialog, ui.card().classes("log"):
+            job = self.work.jobs.get(id)
+            text = "\n".join(self.work.jobs.log(id)) or "Nothing printed yet."
+            began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(job.started)) if job.started else "not begun"
+            ui.html(f"<h2>{escape(job.title)}</h2><p class=note>{began}</p>", sanitize=False)
+            ui.html(f"<pre tabindex=0>{escape(text)}</pre>", sanitize=False)
+            ui.button("Close", on_click=dialog.close).props("flat no-caps")

@@ -1,0 +1,10 @@
+"""The pages, in the order of the work. A page is one file with `PAGE`; its line here puts it into the navigation."""
+
+from __future__ import annotations
+
+from nerif.app.pages import design, reconstruct
+from nerif.app.pages.page import Page
+
+__all__ = ["PAGES", "Page"]
+
+PAGES: tuple[Page, ...] = (design.PAGE, reconstruct.PAGE)

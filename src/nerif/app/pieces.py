@@ -1,0 +1,74 @@
+"""Pieces that pages are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from html import escape
+
+from nicegui import ui
+
+from nerif.app.jobs import command_line
+from nerif.conventions import InputError
+
+__all__ = ["CommandLine", "card", "figures", "refusals", "text_html"]
+
+
+@contextmanager
+def card(title: str, note: str = "") -> Iterator[ui.element]:
+    """A framed part of a page with a heading of the second rank."""
+    with ui.element("section").classes("card").props(f'aria-label="{escape(title)}"') as section:
+        ui.html(f"<h2>{escape(title)}</h2>" + (f"<p class=note>{escape(note)}</p>" if note else ""), sanitize=False)
+        yield section
+
+
+def text_html(text: str, tag: str = "p", classes: str = "") -> ui.html:
+    """Text as it is, whatever is in it: names of files are data."""
+    return ui.html(f'<{tag} class="{escape(classes)}">{escape(text)}</{tag}>', sanitize=False)
+
+
+def figures(rows: Sequence[tuple[str, str, str]]) -> str:
+    """A list of name, value and remark as HTML."""
+    lines = (f"<div><dt>{escape(a)}</dt><dd>{escape(b)}<small>{escape(c)}</small></dd></div>" for a, b, c in rows)
+    return f"<dl class=figures>{''.join(lines)}</dl>"
+
+
+class CommandLine:
+    """The command line that does what the page is set to, and a button that copies it."""
+
+    def __init__(self) -> None:
+        with ui.element("div").classes("command").props('role="group" aria-label="Command line"'):
+            self._text = ui.html("", sanitize=False).classes("line")
+            button = ui.button("Copy", icon="content_copy").props('flat no-caps dense aria-label="Copy the command line"')
+            button.on("click", js_handler=COPY)
+        self.line = ""
+
+    def show(self, arguments: Sequence[str]) -> None:
+        """Show the line of these arguments."""
+        self.line = command_line(arguments)
+        self._text.set_content(f"<code tabindex=0>{escape(self.line)}</code>")
+
+
+# without TLS and on another address than this machine's own a browser has no clipboard: then the old way
+COPY = """(event) => {
+  const text = event.currentTarget.closest('.command').querySelector('code').textContent;
+  const label = event.currentTarget.querySelector('.block') || event.currentTarget;
+  const old = () => { const a = document.createElement('textarea'); a.value = text; document.body.append(a); a.select();
+    document.execCommand('copy'); a.remove(); };
+  (navigator.clipboard ? navigator.clipboard.writeText(text).catch(old) : Promise.resolve(old())).then(() => {
+    const before = label.textContent; label.textContent = 'Copied'; setTimeout(() => { label.textContent = before }, 1500); });
+}"""
+
+
+@contextmanager
+def refusals(say: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Say what an InputError or a file that cannot be written has to say, instead of breaking the page."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error)
+    except OSError as error:
+        message = f"{error.filename or 'file'}: {error.strerror or error}"
+    else:
+        return
+    (say or (lambda text: ui.notify(text, type="negative", timeout=10_000, close_button="Close")))(message)

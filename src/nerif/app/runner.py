@@ -1,0 +1,42 @@
+"""One run as a process of its own, which goes on when the server ends: `python -m nerif.app.runner DIRECTORY`.
+
+It starts the command line of job.json, writes down who runs (process and when it was started), and how it ended.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from nerif.json_file import write_json
+
+__all__ = ["ENDED", "JOB", "LOG", "STARTED", "main"]
+
+JOB, STARTED, ENDED, LOG = "job.json", "started.json", "ended.json", "log.txt"
+
+
+def main(directory: Path) -> None:
+    """Run it and wait for its end."""
+    import psutil
+
+    job = json.loads((directory / JOB).read_text())
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell ignores in the background is no wish here
+    arguments = [sys.executable, "-m", "nerif", *job["attempt"]]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with (directory / LOG).open("ab") as log:
+        process = subprocess.Popen(
+            arguments, cwd=job["folder"], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
+        )
+        began = psutil.Process(process.pid).create_time()
+        write_json(directory / STARTED, {"pid": process.pid, "began": began, "time": time.time()})
+        code = process.wait()
+    write_json(directory / ENDED, {"code": code, "time": time.time()})
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

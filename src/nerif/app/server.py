@@ -1,0 +1,157 @@
+"""The server: where it listens, who may ask it, which pages it has, and that the queue of runs goes on."""
+
+from __future__ import annotations
+
+import ipaddress
+import secrets
+import socket
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlencode
+
+from nicegui import app, ui
+from starlette.responses import RedirectResponse
+
+from nerif.app.frame import frame
+from nerif.app.guard import Guard
+from nerif.app.pages import PAGES, Page
+from nerif.app.project import Project
+from nerif.app.workspace import Workspace
+from nerif.commands.output import say
+from nerif.conventions import InputError
+
+__all__ = ["Address", "serve"]
+
+TRIED = 20  # ports
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+QUEUE_EVERY = 0.5  # seconds
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the server listens, and what its addresses must hold.
+
+    Parameters
+    ----------
+    host : name or number to listen on
+    port : to listen on
+    token : of the address
+    """
+
+    host: str
+    port: int
+    token: str
+
+    @classmethod
+    def of(cls, host: str, port: int, token: str | None) -> Address:
+        """Return an address with a free port and, on this machine alone, a random token.
+
+        Raises
+        ------
+        InputError
+            If others can reach it and no token is given, or no port is free.
+        """
+        if not _is_local(host):
+            if token is None:
+                raise InputError(
+                    f"host: expected --token together with --host {host}, got none; others can reach that address, and "
+                    "whoever knows the token can run nerif here and read and write the folder"
+                )
+            say(f"note: others can reach {host}: who knows the token can run nerif here and read and write the folder;")
+            say("      nothing is encrypted on the way. Safer: ssh -L 8620:127.0.0.1:8620 THIS_MACHINE")
+        found = _free_port(host, port)
+        if found != port:
+            say(f"port {port} is taken; {found} is used")
+        return cls(host, found, token or secrets.token_urlsafe(24))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What browsers may call this server."""
+        if _is_local(self.host):
+            return LOCAL
+        own = {self.host, socket.gethostname(), socket.getfqdn()}
+        if self.host in ("0.0.0.0", "::"):
+            own |= {str(found[4][0]) for found in socket.getaddrinfo(socket.gethostname(), None)}
+        return (*LOCAL, *sorted(f"[{name}]" if ":" in name else name for name in own))
+
+    @property
+    def link(self) -> str:
+        """The address to open."""
+        host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(self.host, self.host)
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/?{urlencode({'token': self.token})}"
+
+
+def serve(folder: Path, address: Address, browser: bool = True) -> None:
+    """Serve the pages of a project until Ctrl-C; runs go on after that.
+
+    Raises
+    ------
+    InputError
+        If the folder is none.
+    """
+    work = Workspace(Project(folder))
+    app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
+    app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
+    for page in PAGES:
+        ui.page(page.path, response_timeout=30)(_built(work, page))
+
+    def begun() -> None:
+        say(f"{work.project.folder}: {address.link}")
+        say("Ctrl-C ends the server; what runs goes on.")
+        if browser:
+            webbrowser.open(address.link)
+
+    app.on_startup(begun)
+    app.timer(QUEUE_EVERY, work.jobs.advance)
+    try:
+        ui.run(
+            host=address.host, port=address.port, title="nerif", show=False, reload=False, dark=None, language="en-US",
+            tailwind=False, show_welcome_message=False, reconnect_timeout=30.0, favicon=FAVICON, access_log=False,
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        say("")
+    say("The server has ended; nerif app goes on with the same runs.")
+
+
+FAVICON = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><rect width="32" height="32" rx="6" fill="#0b5a9c"/>'
+    '<path d="M6 22c5-12 8 6 13-6 2-4 4-6 7-6" fill="none" stroke="#fff" stroke-width="3" stroke-linecap="round"/></svg>'
+)
+
+
+def _built(work: Workspace, page: Page) -> Callable[[], None]:
+    """The function that builds a page for a browser that asks for it."""
+
+    def build() -> None:
+        with frame(work, page, PAGES):
+            page.build(work)
+
+    return build
+
+
+def _is_local(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name
+        return False
+
+
+def _free_port(host: str, port: int) -> int:
+    """The first port from `port` on that nobody listens on."""
+    reason = "every one of them is taken"
+    for number in range(port, min(port + TRIED, 65536)):
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, number))
+                return number
+            except PermissionError:
+                reason = "ports below 1024 are for the system"
+            except socket.gaierror:
+                raise InputError(f"host: expected an address of this machine, got '{host}'") from None
+            except OSError as error:
+                reason = error.strerror or reason
+    raise InputError(f"port: expected a free one from {port} on, got none: {reason}; give another --port")

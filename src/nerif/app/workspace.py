@@ -1,0 +1,57 @@
+"""What every page is given: the project, its runs, what was typed and not yet used, and a way to work beside the page."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from nerif.app.jobs import Jobs
+from nerif.app.project import Project
+from nerif.json_file import write_json
+
+__all__ = ["Workspace"]
+
+P, T = ParamSpec("P"), TypeVar("T")
+
+
+class Workspace:
+    """One project, as all pages and tabs see it.
+
+    Parameters
+    ----------
+    project : Project
+    """
+
+    def __init__(self, project: Project) -> None:
+        self.project, self.jobs = project, Jobs(project.folder)
+        self._drafts: dict[str, dict[str, Any]] = {}
+
+    @property
+    def _file(self) -> Path:
+        return self.project.folder / ".nerif" / "drafts.json"
+
+    def draft(self, page: str) -> dict[str, Any]:
+        """Return what was typed on a page and is not the default: kept over a reload, and over another start."""
+        if not self._drafts and self._file.is_file():
+            try:
+                self._drafts = dict(json.loads(self._file.read_text()))
+            except ValueError:  # damaged: nothing but what was typed is lost
+                self._drafts = {}
+        return self._drafts.setdefault(page, {})
+
+    def keep(self, page: str, values: dict[str, Any]) -> None:
+        """Keep what was typed on a page; a folder that may not be written to keeps it as long as the server runs."""
+        self.draft(page)
+        self._drafts[page] = dict(values)
+        try:
+            self._file.parent.mkdir(exist_ok=True)
+            write_json(self._file, self._drafts)
+        except PermissionError:
+            return
+
+    async def beside(self, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
+        """Do blocking work in a thread, while pages go on answering; its InputError comes back as it is."""
+        return await asyncio.to_thread(work, *arguments, **named)
