@@ -1,5 +1,6 @@
 # make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo
 # make test   set up, run the tests, lint and types among them (five minutes on 2 cores; make test-all: the long ones too)
+# make app    set up, and work on out/demo (make demo) in the browser
 # make docs   the documentation site: open docs/_build/html/index.html
 # make study  the paper's numerical study (hours; benchmarks/study): out/study; make study-quick: a small one, out/study-quick
 
@@ -7,10 +8,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo test test-all lint docs study study-quick clean
+.PHONY: demo app test test-all lint docs study study-quick clean
 
 demo: .venv/.run
 	$(BIN)/nerif demo --out out/demo --force
+
+app: .venv/.app
+	mkdir -p out/demo
+	$(BIN)/nerif app out/demo
 
 test: .venv/.dev
 	$(PYTEST) -m "not slow"
@@ -36,6 +41,10 @@ study-quick: .venv/.dev
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	touch $@
+
+.venv/.app: .venv/.run
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[app]'
 	touch $@
 
 .venv/.dev: .venv/.run

@@ -1,7 +1,7 @@
 """How a run goes on, for whoever looks at its directory meanwhile.
 
     live.json    the title of the work, step, seconds, progress, losses, and their curve: twice a second at most
-    live.npz     the field on a few voxels, and one view as measured and as predicted: as often as SHARE of the time allows
+    live.npz     the field on a few voxels, one view as measured and predicted: as often as SHARE of the time allows
 
 Both appear whole or not at all. A look at the field costs a tenth of a second or so; after it, so much time passes that
 all looks together take no more than SHARE of the run.
@@ -212,5 +212,5 @@ def read_look(directory: Path) -> Look | None:
         empty = np.zeros((0, 0, 0), np.float32)
         for name in ("lower", "upper", "components"):
             about[name] = tuple(about[name])
-        arrays = {name: file[name] if name in file else empty for name in ("measured", "predicted")}
+        arrays = {name: file.get(name, empty) for name in ("measured", "predicted")}
         return Look(**about, values=file["values"], **arrays)

@@ -32,14 +32,14 @@ from nerif.volume import INDEX, Volume, field_of
 from nerif.volume_file import read_volume, read_volumes
 
 __all__ = [
-    "CALIBRATION", "FIGURES", "LIVE", "LIVE_LOOK", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions",
+    "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions",
 ]  # fmt: skip
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
 MERIDIAN, LIVE, LIVE_LOOK = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
 ENSEMBLE, FIRST_LOOK, FIGURES, CALIBRATION = "ensemble", "first_look", "figures", "calibration.toml"
-FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION, *MERIDIAN, LIVE, LIVE_LOOK)
+FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError)
@@ -155,7 +155,7 @@ class ResultDirectory:
 
     def clear(self) -> None:
         """Remove the files of a reconstruction, and nothing else."""
-        for name in FILES:
+        for name in (*FILES, *MERIDIAN, LIVE, LIVE_LOOK):
             (self.path / name).unlink(missing_ok=True)
         for name in (ENSEMBLE, FIRST_LOOK, FIGURES):
             shutil.rmtree(self.path / name, ignore_errors=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -37,8 +38,8 @@ class App(Settings):
     def __post_init__(self) -> None:
         if not 1 <= self.port <= 65535:
             raise InputError(f"port: expected 1 to 65535, got {self.port}")
-        if self.token is not None and (len(self.token) < 16 or not self.token.isascii() or not self.token.isprintable()):
-            raise InputError(f"token: expected 16 plain letters or more, got {len(self.token)}")
+        if self.token is not None and not re.fullmatch(r"[\w.~-]{16,}", self.token, re.ASCII):
+            raise InputError(f"token: expected 16 or more of A-Z a-z 0-9 _ . ~ -, got {len(self.token)} characters")
 
 
 def run(settings: App) -> None:

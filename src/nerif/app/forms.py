@@ -192,7 +192,7 @@ def _kind(hint: Any) -> tuple[str, bool]:
 
 
 def choices_of(record: Any, name: str) -> tuple[str, ...]:
-    """Return the words that a record lets a field be, by what it says when it is given another; empty if it takes any."""
+    """Return the words that a record lets a field be, by what it says of another one; empty if it takes any."""
     try:
         return _choices(record, name)
     except TypeError:  # a record that cannot be hashed
@@ -234,7 +234,7 @@ def _whole(value: Any) -> bool:
 def _same(value: Any, default: Any) -> bool:
     if isinstance(value, list | tuple) and isinstance(default, list | tuple):
         return list(value) == list(default)
-    return type(value) is type(default) and value == default or (
+    return (type(value) is type(default) and value == default) or (
         isinstance(value, int | float) and isinstance(default, int | float)
         and not isinstance(value, bool) and not isinstance(default, bool) and value == default
     )  # fmt: skip

@@ -51,7 +51,6 @@ class JobsDrawer:
                 "At the same time", value=self.work.jobs.at_once, min=1, max=64, on_change=self._set
             ).props("dense outlined")
             self.place = ui.element("div").props('role="list" aria-label="Runs"')
-        self._refresh()
         ui.timer(EVERY, self._refresh)
 
     def toggle(self) -> None:

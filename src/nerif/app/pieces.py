@@ -39,7 +39,8 @@ class CommandLine:
     def __init__(self) -> None:
         with ui.element("div").classes("command").props('role="group" aria-label="Command line"'):
             self._text = ui.html("", sanitize=False).classes("line")
-            button = ui.button("Copy", icon="content_copy").props('flat no-caps dense aria-label="Copy the command line"')
+            button = ui.button("Copy", icon="content_copy")
+            button.props('flat no-caps dense aria-label="Copy the command line"')
             button.on("click", js_handler=COPY)
         self.line = ""
 
@@ -56,7 +57,8 @@ COPY = """(event) => {
   const old = () => { const a = document.createElement('textarea'); a.value = text; document.body.append(a); a.select();
     document.execCommand('copy'); a.remove(); };
   (navigator.clipboard ? navigator.clipboard.writeText(text).catch(old) : Promise.resolve(old())).then(() => {
-    const before = label.textContent; label.textContent = 'Copied'; setTimeout(() => { label.textContent = before }, 1500); });
+    const before = label.textContent; label.textContent = 'Copied';
+    setTimeout(() => { label.textContent = before }, 1500); });
 }"""
 
 

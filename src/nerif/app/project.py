@@ -1,4 +1,4 @@
-"""A project: a folder, and what is in it. Nothing is kept of it but what is in the folder; it is read anew each time."""
+"""A project: a folder, and what is in it. Nothing else is kept of it; what is in the folder is read anew each time."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ class Project:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder).resolve()
         if not self.folder.is_dir():
-            raise InputError(f"{folder}: expected a folder to work in, got {'a file' if self.folder.exists() else 'none'}")
+            got = "a file" if self.folder.exists() else "none"
+            raise InputError(f"{folder}: expected a folder to work in, got {got}")
         self._cache: dict[tuple[str, str], tuple[tuple[int, int], object]] = {}
 
     @property

@@ -46,7 +46,8 @@ def rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
             f"<title>background of {escape(camera.name)}</title></line>"
         )
         x, y = at(lens.mean(dim=0)).split(",")
-        things.append(f'<circle cx="{x}" cy="{y}" r="8" fill="var(--plot)"><title>{escape(camera.name)}</title></circle>')
+        name = f"<title>{escape(camera.name)}</title>"
+        things.append(f'<circle cx="{x}" cy="{y}" r="8" fill="var(--plot)">{name}</circle>')
     x, y = at(torch.zeros(2)).split(",")
     radius = max(flow_size / 2 * unit, 3)
     flow = f'<circle cx="{x}" cy="{y}" r="{radius:.1f}" fill="var(--flow)"><title>flow</title></circle>'

@@ -6,7 +6,7 @@ import ipaddress
 import secrets
 import socket
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
@@ -104,6 +104,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
             webbrowser.open(address.link)
 
     app.on_startup(begun)
+    app.on_startup(lambda: work.beside(work.project.contents))  # the first look is the longest
     app.timer(QUEUE_EVERY, work.jobs.advance)
     try:
         ui.run(
@@ -117,16 +118,18 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
 
 FAVICON = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><rect width="32" height="32" rx="6" fill="#0b5a9c"/>'
-    '<path d="M6 22c5-12 8 6 13-6 2-4 4-6 7-6" fill="none" stroke="#fff" stroke-width="3" stroke-linecap="round"/></svg>'
+    '<path d="M6 22c5-12 8 6 13-6 2-4 4-6 7-6" fill="none" stroke="#fff" stroke-width="3"/></svg>'
 )
 
 
-def _built(work: Workspace, page: Page) -> Callable[[], None]:
+def _built(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:
     """The function that builds a page for a browser that asks for it."""
 
-    def build() -> None:
+    async def build() -> None:
         with frame(work, page, PAGES):
-            page.build(work)
+            waited = page.build(work)
+            if waited is not None:
+                await waited
 
     return build
 

@@ -1,4 +1,4 @@
-"""What every page is given: the project, its runs, what was typed and not yet used, and a way to work beside the page."""
+"""What every page is given: the project, its runs, what was typed, and a way to work beside the page."""
 
 from __future__ import annotations
 

@@ -74,6 +74,7 @@ def run(settings: Demo) -> None:
     evaluate.run(evaluate.Evaluate(settings.out, truth=simulate.truth_path(measured)))
     page = write_report(settings.out, monitor=MONITOR)
     say(f"Open {page} in a browser: the field, the views, and whether it can be trusted.")
+    say(f"Or in the app, with everything that can be done next: nerif app {settings.out} (pip install 'nerif[app]')")
     say(f"Open {settings.out}/volume.vti in ParaView; figures for print: nerif figures {settings.out}")
 
 

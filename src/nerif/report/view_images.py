@@ -102,7 +102,8 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
             for c, component in enumerate(o.components):
                 images = (measured[..., c], seen[..., c], seen[..., c] - measured[..., c])
                 ends = (scale.limits, scale.limits, scale.apart)
-                first, second, third = (picture_address(_shrink(x, shrinks[i]), e) for x, e in zip(images, ends, strict=True))
+                small = [_shrink(image, shrinks[i]) for image in images]
+                first, second, third = (picture_address(x, e) for x, e in zip(small, ends, strict=True))
                 rows[i][component] = first, second, third
     found = [
         ViewImages(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from nerif.app.workspace import Workspace
@@ -20,11 +20,11 @@ class Page:
     title : for people
     path : of its address
     about : one sentence below the title
-    build : builds it within the frame
+    build : builds it within the frame; a coroutine function where it waits for something
     """
 
     name: str
     title: str
     path: str
     about: str
-    build: Callable[[Workspace], None]
+    build: Callable[[Workspace], Awaitable[None] | None]

@@ -1,0 +1,172 @@
+"""A run as it goes on: how far it is, its loss, a view as measured and as predicted, three slices of the field."""
+
+from __future__ import annotations
+
+import math
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+
+from nerif.app.jobs import Job
+from nerif.app.pieces import refusals
+from nerif.app.workspace import Workspace
+from nerif.conventions import unit_shown
+from nerif.drawing import colour_range, map_range
+from nerif.live import Look, read_live, read_look
+from nerif.report.view_images import picture_address
+from nerif.result import LIVE, LIVE_LOOK
+from nerif.volume import name_of
+
+__all__ = ["LiveView", "curve_options", "look_html", "told"]
+
+EVERY = 0.7  # seconds
+CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
+BUTTONS = {"pause": ("Pause", "pause"), "stop": ("Stop", "stop"), "resume": ("Go on", "play_arrow")}
+
+
+class LiveView:
+    """One of the runs of nerif reconstruct, the newest open one unless another is chosen."""
+
+    def __init__(self, work: Workspace) -> None:
+        self.work, self.job = work, ""
+        self._seen: dict[str, Any] = {}
+        with ui.element("section").classes("card").props('aria-label="The run"'):
+            ui.html("<h2>The run</h2>", sanitize=False)
+            self.choice = ui.select({}, label="Run", on_change=lambda e: self.follow(e.value)).props(
+                'outlined dense options-dense aria-label="Run"'
+            )
+            self.told = ui.html("", sanitize=False).classes("told").props('aria-live="off"')
+            self.bar = ui.linear_progress(0.0, show_value=False).props('aria-label="Progress"')
+            with ui.row().classes("gap-2"):
+                self.buttons = {
+                    name: ui.button(text, icon=icon, on_click=lambda n=name: self._do(n)).props("outline no-caps dense")
+                    for name, (text, icon) in BUTTONS.items()
+                }
+            self.chart = ui.echart(curve_options({})).classes("curve").style("height: 260px; width: 100%")
+            self.look = ui.html("", sanitize=False)
+        self.chart.set_visibility(False)
+        ui.timer(EVERY, self._refresh)
+
+    def follow(self, id: str | None) -> None:
+        """Show that run from now on."""
+        if id and id != self.job:
+            self.job, self._seen = id, {}
+            self.look.set_content("")
+
+    async def _do(self, action: str) -> None:
+        with refusals():
+            getattr(self.work.jobs, action)(self.job)
+        await self._refresh()
+
+    async def _refresh(self) -> None:
+        jobs = [job for job in await self.work.beside(self.work.jobs.all) if job.resumable]
+        options = {job.id: f"{job.title} ({job.state})" for job in jobs}
+        if not self.job and jobs:
+            self.follow(jobs[0].id)
+        if options != self.choice.options or self.choice.value != self.job:
+            self.choice.set_options(options, value=self.job if self.job in options else None)
+        job = next((job for job in jobs if job.id == self.job), None)
+        for name, button in self.buttons.items():
+            open_ = job is not None and job.state in ("running", "queued") and not job.asked
+            over = job is not None and job.state in ("paused", "stopped", "failed")
+            button.set_visibility(over if name == "resume" else open_ and (name == "stop" or job.state == "running"))
+        self.bar.set_visibility(job is not None)
+        if job is not None:
+            await self._show(job)
+
+    async def _show(self, job: Job) -> None:
+        out = self.work.project.path(job.out)
+        live, drawn = await self.work.beside(self._changed, out, job)
+        self.told.set_content(told(job, live))
+        self.bar.set_value(float(live.get("progress") or 0.0) if live else float(job.state == "done"))
+        if live and live.get("curve"):
+            self.chart.set_visibility(True)
+            self.chart.options.clear()
+            self.chart.options.update(curve_options(live["curve"]))
+        if drawn is not None:
+            self.look.set_content(drawn)
+
+    def _changed(self, out: Path, job: Job) -> tuple[dict[str, Any], str | None]:
+        """What the run tells, and the pictures of its last look where there is a new one."""
+        stamp = _stamp(out / LIVE_LOOK)
+        drawn = None
+        if stamp and stamp != self._seen.get(LIVE_LOOK):
+            self._seen[LIVE_LOOK] = stamp
+            look = read_look(out)
+            drawn = None if look is None else look_html(look)
+        if (new := _stamp(out / LIVE)) != self._seen.get(LIVE):
+            self._seen[LIVE], self._seen["live"] = new, read_live(out)
+        return self._seen.get("live", {}), drawn
+
+
+def _stamp(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.is_file() else 0
+
+
+def told(job: Job, live: dict[str, Any]) -> str:
+    """Return in words, as HTML, what a run is doing."""
+    words = {"done": "It has ended.", "paused": "Paused: its checkpoint is kept.", "queued": "It waits for its turn."}
+    said = words.get(job.state, job.state.capitalize() + ".")
+    if job.state == "running":
+        said = {"stop": "Stopping after this step.", "pause": "Pausing after this step."}.get(job.asked, "It runs.")
+        if not live:
+            said += " Nothing is told yet."
+    parts = [said]
+    if live:
+        seconds, share = float(live["seconds"] or 0), float(live["progress"] or 0)
+        parts.append(f"{live['title'].capitalize()}: step {live['step']}, {seconds:.0f} s")
+        if job.state == "running" and 0.001 < share < 1:
+            parts.append(f"{seconds * (1 / share - 1):.0f} s left")
+        known = {name: value for name, value in live["losses"].items() if value is not None}
+        parts += [f"{name.replace('_', ' ')} {value:.3g}" for name, value in known.items()]
+    return f"<p>{escape(' · '.join(parts))}</p>"
+
+
+def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:
+    """Return the chart of the loss over seconds."""
+    names = [name for name in CURVES if name in curve]
+    seconds = curve.get("seconds", [])
+    series = [
+        {
+            "name": name.replace("_", " "), "type": "line", "showSymbol": False, "animation": False,
+            "data": [[s, y] for s, y in zip(seconds, curve[name], strict=True) if y is not None and y > 0],
+        }
+        for name in names
+    ]  # fmt: skip
+    return {
+        "grid": {"left": 64, "right": 16, "top": 34, "bottom": 42}, "legend": {"top": 0},
+        "tooltip": {"trigger": "axis"},
+        "xAxis": {"type": "value", "name": "s", "nameLocation": "middle", "nameGap": 26},
+        "yAxis": {"type": "log"}, "series": series, "aria": {"enabled": True},
+    }  # fmt: skip
+
+
+def look_html(look: Look) -> str:
+    """Return the pictures of a look as HTML: view as measured and predicted, three middle slices."""
+    figures = []
+    unit = unit_shown(look.unit)
+    for c, component in enumerate(look.components):
+        measured, predicted = look.measured[..., c], look.predicted[..., c]
+        limits = map_range(measured[np.isfinite(measured)], True, 0.998)
+        ends = f"{limits[0]:.2g} to {limits[1]:.2g} {unit}".strip()
+        seen = "held out" if look.held_out else "not held out"
+        known = np.isfinite(measured)
+        rms = math.sqrt(float(np.mean((predicted - measured)[known] ** 2)))
+        for what, image in (("measured", measured), ("predicted", np.where(known, predicted, np.nan))):
+            apart = "" if what == "measured" else f"; rms apart {rms:.2g} {unit}"
+            text = f"{look.view} ({seen}), {component} {what}; {ends}{apart}"
+            figures.append((picture_address(image, limits), text))
+    z, y, x = (n // 2 for n in look.values.shape)
+    limits = colour_range(look.values)
+    for normal, image in (("z", look.values[z]), ("y", look.values[:, y]), ("x", look.values[:, :, x])):
+        middle = (look.lower["xyz".index(normal)] + look.upper["xyz".index(normal)]) / 2
+        text = f"{name_of(look.quantity)} at {normal} = {middle:g} mm; {limits[0]:.2g} to {limits[1]:.2g}"
+        figures.append((picture_address(image[::-1], limits), text))
+    inside = "".join(
+        f'<figure><img src="{address}" alt="{escape(text)}"><figcaption>{escape(text)}</figcaption></figure>'
+        for address, text in figures
+    )
+    return f"<div class=pictures>{inside}</div><p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"

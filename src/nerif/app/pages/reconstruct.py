@@ -1,0 +1,128 @@
+"""Reconstruct: settings of a run, the queue, and the run as it goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+from typing import Any
+
+import tyro
+from nicegui import ui
+
+from nerif.app.form_view import FormView
+from nerif.app.forms import Form
+from nerif.app.live_view import LiveView
+from nerif.app.pages.page import Page
+from nerif.app.pieces import CommandLine, card, refusals
+from nerif.app.workspace import Workspace
+from nerif.commands.methods import RECORDS, Reconstruct
+from nerif.reconstruction.presets import PRESETS, preset
+from nerif.reconstruction.trials import KINDS
+
+__all__ = ["PAGE"]
+
+WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live")
+MAIN = ("time_limit", "hold_out", "uncertainty", "voxels")
+LABELS = {
+    "nerif": "NeRIF: a neural field", "tikhonov": "Tikhonov, on voxels", "landweber": "Landweber, on voxels",
+    "tv": "Total variation, on voxels", "mlem": "MLEM, never negative", "mart": "MART, never negative",
+}  # fmt: skip
+
+
+def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
+    """Return the form of a method; the defaults of NeRIF are those of its preset."""
+    record = RECORDS[method](measurement=tyro.MISSING, out=tyro.MISSING, method=method)
+    if method == "nerif":
+        record = replace(record, reconstructor=preset(preset_name), preset=preset_name)  # type: ignore[call-arg]
+    return Form(record, without=WITHOUT, choices={"uncertainty": tuple(KINDS)})
+
+
+class ReconstructPage:
+    """The page in one tab."""
+
+    def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
+        self.work = work
+        kept = work.draft(PAGE.name)
+        self.measurements = measurements
+        known = str(kept.get("measurement", ""))
+        first = self.measurements[0] if self.measurements else None
+        self.values: dict[str, Any] = dict(kept.get("values", {}))
+        with ui.element("div").classes("columns"):
+            with card("A run"), ui.element("div").classes("form"):
+                if not self.measurements:
+                    text = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
+                    ui.html(f"<p class=note>{text}</p>", sanitize=False)
+                self.measurement = self._select(
+                    "Measurement", list(self.measurements), known if known in self.measurements else first
+                )
+                self.method = self._select("Method", LABELS, kept.get("method", "nerif"))
+                self.preset = self._select("Preset", ["auto", *PRESETS], kept.get("preset", "auto"))
+                self.out = ui.input("Result directory", value=self._free()).props("outlined dense debounce=250")
+                self.out.on_value_change(self._show)
+                self.place = ui.element("div").classes("form")
+                self.start = ui.button("Start", icon="play_arrow", on_click=self._start).props("unelevated no-caps")
+            with ui.element("div").classes("stack"):
+                with card("The same on the command line"):
+                    self.command = CommandLine()
+                self.live = LiveView(work)
+        self._build_form()
+
+    def _select(self, label: str, options: Any, value: Any) -> ui.select:
+        select = ui.select(options, label=label, value=value)
+        select.props(f'outlined dense options-dense aria-label="{label}"')
+        return select.on_value_change(self._chosen)
+
+    def _chosen(self) -> None:
+        if hasattr(self, "live"):
+            self.out.set_value(self._free())
+            self._build_form()
+
+    def _free(self) -> str:
+        stem = PurePosixPath(self.measurement.value or "run").stem
+        return self.work.project.free_name(f"results/{stem}-{self.method.value}")
+
+    def _build_form(self) -> None:
+        form = form_of(self.method.value, self.preset.value)
+        self.preset.set_visibility(self.method.value == "nerif")
+        self.place.clear()
+        names = {f.name for f in form.fields}
+        with self.place:
+            self.view = FormView(form, self._show, self.values, [name for name in MAIN if name in names])
+        self._show()
+
+    def arguments(self) -> list[str]:
+        """Return the arguments of nerif that the page is set to."""
+        words = ["reconstruct", self.measurement.value or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
+        if self.method.value != "nerif":
+            words += ["--method", self.method.value]
+        elif self.preset.value != "auto":
+            words += ["--preset", self.preset.value]
+        return [*words, *self.view.arguments, "--live"]
+
+    def _show(self) -> None:
+        self.values = dict(self.view.values)
+        kept = {name: getattr(self, name).value for name in ("measurement", "method", "preset")}
+        self.work.keep(PAGE.name, {**kept, "values": self.values})
+        self.command.show(self.arguments())
+        self.start.set_enabled(bool(self.measurement.value and self.out.value) and self.view.right)
+
+    def _start(self) -> None:
+        with refusals():
+            self.view.made()
+            self.work.project.path(self.measurement.value)
+            out = self.work.project.relative(self.out.value)
+            job = self.work.jobs.add(self.arguments(), f"{self.measurement.value} → {out}", out)
+            (self.work.project.folder / out).parent.mkdir(parents=True, exist_ok=True)
+            self.out.set_value(self.work.project.free_name(out + "-2"))
+            self.live.follow(job.id)
+
+
+async def build(work: Workspace) -> None:
+    """Build the page."""
+    found = await work.beside(work.project.contents)
+    ReconstructPage(work, found.measurements)
+
+
+ABOUT = "The field behind a measurement, watched while it is found."
+PAGE = Page("reconstruct", "Reconstruct", "/reconstruct", ABOUT, build)

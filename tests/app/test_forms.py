@@ -1,0 +1,116 @@
+"""Forms: fields, texts, units and choices as the records have them, errors beside fields, and the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import tyro
+
+from nerif.app.form_view import _meant, _shown
+from nerif.app.forms import Form
+from nerif.app.pages.reconstruct import form_of
+from nerif.commands.design import Design
+from nerif.commands.methods import RECORDS
+from nerif.commands.settings import help_of, parse
+from nerif.conventions import InputError
+from nerif.geometry import Ring
+
+FORM = Form(Design(), ("design",))
+
+
+def test_fields_are_those_of_the_record():
+    focal = FORM.field("focal_length")
+    assert (focal.kind, focal.unit, focal.default, focal.help) == ("number", "mm", 50.0, "Focal length, mm.")
+    assert FORM.field("projection").choices == ("perspective", "telecentric")
+    assert FORM.field("extra_angles").kind == "words"
+    assert FORM.field("views").kind == "integer"
+    assert FORM.field("temperature").optional
+    assert FORM.field("force").kind == "switch"
+    assert {f.name for f in dataclasses.fields(Ring)} <= {f.name for f in FORM.fields}
+    assert all(f.help for f in FORM.fields)
+
+
+@pytest.mark.parametrize("method", list(RECORDS))
+def test_every_field_of_every_method_has_its_text(method):
+    form = form_of(method, "auto")
+    assert [f.name for f in form.fields if not f.help] == []
+    assert {"time_limit", "hold_out", "uncertainty"} <= {f.name for f in form.fields}
+
+
+def test_help_is_that_of_the_class_that_has_the_field():
+    assert help_of(RECORDS["tv"], "tensorboard") == "Write TensorBoard scalars to OUT/tensorboard."
+    assert help_of(Ring, "nothing") == ""
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "said"),
+    [
+        ({"f_number": -1.0}, "f_number", "Expected a positive number, got -1.0"),
+        ({"views": "many"}, "views", "valid integer"),
+        ({"magnification": 0.5}, "magnification", "with projection = telecentric"),
+        ({"image_size": [0, 4]}, "image_size", "(height, width) > 0"),
+        ({"temperature": 293.15}, "temperature", "another one than ambient_temperature"),
+    ],
+)
+def test_what_is_wrong_stands_beside_its_field(values, name, said):
+    errors = FORM.errors(values)
+    assert list(errors) == [name]
+    assert said in errors[name]
+    with pytest.raises(InputError):
+        FORM.made(values)
+
+
+def test_what_is_right_only_beside_another_is_right():
+    assert FORM.errors({"projection": "telecentric", "magnification": 0.5}) == {}
+
+
+def test_nested_fields():
+    form = form_of("nerif", "fast")
+    errors = form.errors({"network.width": 0, "schedule": "constant"})
+    assert errors == {"network.width": "Expected at least 1, got 0"}
+    assert form.made({"network.width": 32}).reconstructor.network.width == 32
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"f_number": 8.0, "views": 5, "extra_angles": [10.5, 20.0], "projection": "telecentric", "magnification": 0.5},
+        {"index_contrast": 1.23456789e-5, "force": True},
+        {"image_size": [48, 64], "temperature": 900.0, "arc": [0.0, 150.0]},
+    ],
+)
+def test_the_command_line_gives_the_same_record(values):
+    words = FORM.arguments(values)
+    assert words[0] == "design"
+    assert parse(Design(), words[1:], "nerif design", "") == FORM.made(values)
+
+
+def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
+    form = form_of("nerif", "fast")
+    values = {"report": False, "network.gradient_head": True, "weights.head": 0.5, "hold_out": ["0deg", "20deg"]}
+    made = form.made(values)
+    given = dataclasses.replace(form.record, measurement=tyro.MISSING, out=tyro.MISSING)
+    parsed = parse(given, ["m.nc", "-o", "x", *form.arguments(values)], "nerif reconstruct", "")
+    assert parsed.run == made.run
+    assert parsed.reconstructor == made.reconstructor
+
+
+def test_defaults_are_not_written():
+    assert FORM.arguments({"f_number": 16, "views": 9.0, "image_size": [200, 200]}) == ["design"]
+
+
+@pytest.mark.parametrize(
+    ("name", "typed", "meant"),
+    [
+        ("views", 5.0, 5), ("f_number", 8, 8.0), ("extra_angles", "10 20.5", [10.0, 20.5]),
+        ("image_size", "48, 64", [48, 64]), ("image_size", "a 4", ["a", 4]), ("temperature", None, None),
+    ],
+)  # fmt: skip
+def test_what_is_typed_is_taken_as_it_is_meant(name, typed, meant):
+    field = FORM.field(name)
+    found = _meant(field, typed)
+    assert found == meant
+    if isinstance(meant, list):
+        assert [type(v) for v in found] == [type(v) for v in meant]
+    assert _shown(field, field.default) is not None or field.optional

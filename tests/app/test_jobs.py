@@ -1,0 +1,140 @@
+"""The queue: on disk, found again by another server, runs that outlive it, stopped, paused and gone on with."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from nerif.app.jobs import Job, Jobs, command_line
+from nerif.conventions import InputError
+from nerif.json_file import write_json
+
+HELP = ("--version",)
+
+
+def until(jobs: Jobs, id: str, *states: str, seconds: float = 60.0) -> Job:
+    """Let the queue go on until a run is in one of the states."""
+    end = time.monotonic() + seconds
+    while (job := jobs.get(id)).state not in states:
+        assert time.monotonic() < end, f"{job.state}: {jobs.log(id)}"
+        jobs.advance()
+        time.sleep(0.05)
+    return job
+
+
+def test_a_run_is_done_and_its_words_are_kept(tmp_path):
+    jobs = Jobs(tmp_path)
+    first, second = jobs.add(HELP, "one"), jobs.add(("nonsense",), "two")
+    assert [job.state for job in jobs.all()] == ["queued", "queued"]
+    assert until(jobs, first.id, "done").code == 0
+    assert jobs.log(first.id)[0].startswith("nerif ")
+    assert until(jobs, second.id, "failed").code == 2
+    assert "unknown verb" in jobs.log(second.id)[-1]
+    assert [job.title for job in jobs.all()] == ["two", "one"]
+    jobs.remove(first.id)
+    with pytest.raises(InputError, match="job: expected one of"):
+        jobs.get(first.id)
+
+
+def test_one_at_a_time_and_in_order(tmp_path):
+    jobs = Jobs(tmp_path)
+    jobs.advance()
+    ids = [jobs.add(("app", "missing"), str(i)).id for i in range(3)]
+    jobs.first(ids[2])
+    assert [job.title for job in jobs.all()] == ["2", "0", "1"]
+    jobs.advance()
+    assert [job.state for job in jobs.all()] == ["running", "queued", "queued"]
+    jobs.at_once = 2
+    jobs.advance()
+    assert [job.state for job in jobs.all()].count("running") <= 2
+    jobs.stop(ids[1])
+    for id in ids:
+        until(jobs, id, "failed", "stopped")
+    with pytest.raises(InputError, match="at_once"):
+        jobs.at_once = 0
+
+
+def sleeping(jobs: Jobs, process: subprocess.Popen[bytes], **more: object) -> str:
+    """A run whose process is one that only sleeps."""
+    import psutil
+
+    job = jobs.add(("reconstruct", "m.nc", "--out", "r", "--live"), "run", "r")
+    where = jobs.directory / job.id
+    began = psutil.Process(process.pid).create_time()
+    write_json(where / "started.json", {"pid": process.pid, "began": began, "time": time.time(), **more})
+    return job.id
+
+
+@pytest.fixture
+def process():
+    code = "import signal, time; signal.signal(2, signal.default_int_handler); print('up', flush=True); time.sleep(60)"
+    found = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert found.stdout is not None
+    found.stdout.readline()
+    yield found
+    found.kill()
+    found.communicate()
+
+
+def test_another_server_finds_what_runs_and_may_end_it(tmp_path, process):
+    id = sleeping(Jobs(tmp_path), process)
+    other = Jobs(tmp_path)
+    assert other.get(id).state == "running"
+    assert other.get(id).pid == process.pid
+    with pytest.raises(InputError, match="stop it first"):
+        other.remove(id)
+    other.stop(id)
+    process.wait(10)
+    assert other.get(id).state == "stopped"
+
+
+def test_a_number_of_a_process_that_was_given_again_is_no_run(tmp_path, process):
+    jobs = Jobs(tmp_path)
+    id = sleeping(jobs, process, began=1.0)
+    assert jobs.get(id).state == "failed"
+
+
+def test_what_is_paused_goes_on_from_its_checkpoint(tmp_path, process):
+    jobs = Jobs(tmp_path)
+    id = sleeping(jobs, process)
+    jobs.pause(id)
+    process.wait(10)
+    where = jobs.directory / id
+    write_json(where / "ended.json", {"code": 0, "time": time.time()})
+    assert jobs.get(id).state == "paused"
+    jobs.resume(id)
+    assert jobs.get(id).attempt == ("reconstruct", "m.nc", "--out", "r", "--live")  # nothing was written yet
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "run.toml").write_text("")
+    write_json(where / "started.json", {"pid": 1, "began": 0.0, "time": 1.0})
+    jobs.resume(id)
+    job = jobs.get(id)
+    assert (job.state, job.line) == ("queued", "nerif reconstruct --resume --out r --live")
+    other = jobs.add(HELP, "x")
+    with pytest.raises(InputError, match="only nerif reconstruct can be paused"):
+        jobs.pause(other.id)
+
+
+def test_a_run_outlives_the_server(tmp_path):
+    code = "import sys; from nerif.app.jobs import Jobs; from pathlib import Path; jobs = Jobs(Path(sys.argv[1]));"
+    code += "print(jobs.add(('--version',), 'x').id); jobs.advance()"
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert until(Jobs(tmp_path), done.stdout.strip(), "done").code == 0
+
+
+def test_command_lines_are_quoted():
+    assert command_line(["info", "a b; rm -rf $HOME.nc"]) == "nerif info 'a b; rm -rf $HOME.nc'"
+
+
+def test_damaged_files_are_no_runs(tmp_path):
+    jobs = Jobs(tmp_path)
+    bad: Path = jobs.directory / "bad"
+    bad.mkdir(parents=True)
+    (bad / "job.json").write_text("{")
+    assert jobs.all() == []
+    assert os.listdir(bad) == ["job.json"]

@@ -1,0 +1,91 @@
+"""What is found in a folder, and that nothing outside of it is touched."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from nerif.app.project import Project
+from nerif.cli import main
+from nerif.conventions import InputError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "secret").write_text("x")
+    inside = tmp_path / "project"
+    inside.mkdir()
+    return inside
+
+
+@pytest.mark.parametrize("name", ["../secret", "/etc/passwd", "a/../../secret", "", "x\0y"])
+def test_paths_outside_are_refused(folder, name):
+    project = Project(folder)
+    if name:
+        with pytest.raises(InputError, match="path: expected"):
+            project.path(name)
+    else:
+        assert project.path(name) == folder
+
+
+def test_links_that_lead_outside_are_refused(folder):
+    (folder / "out").symlink_to(folder.parent)
+    (folder / "in").symlink_to(folder)
+    project = Project(folder)
+    with pytest.raises(InputError, match="outside"):
+        project.path("out/secret")
+    assert project.path("in/new.nc") == folder / "new.nc"
+    assert project.relative(folder / "in" / "a b.nc") == "a b.nc"
+
+
+def test_what_is_in_a_folder(folder):
+    small = ["--image-size", "6", "8", "--views", "3", "--truth-voxels", "5"]
+    assert main(["simulate", "-o", str(folder / "<b>&.nc"), *small]) == 0
+    (folder / "cal.toml").write_text('format = "nerif-calibration-1"\n')
+    (folder / "notes.toml").write_text("a = 1\n")
+    (folder / "broken.nc").write_bytes(b"CDF no")
+    (folder / "runs" / "one").mkdir(parents=True)
+    (folder / "runs" / "one" / "run.toml").write_text("")
+    (folder / "film.zarr").mkdir()
+    for source in ("reference", "flow"):
+        (folder / "pictures" / "cam1" / source).mkdir(parents=True)
+    (folder / "away").symlink_to(folder.parent)
+    (folder / "away.nc").symlink_to(folder.parent / "secret")
+    project = Project(folder)
+    found = project.contents()
+    assert found.measurements == ("<b>&.nc", "broken.nc")
+    assert found.volumes == ("<b>&.truth.nc",)
+    assert found.calibrations == ("cal.toml",)
+    assert found.results == ("runs/one",)
+    assert found.films == ("film.zarr",)
+    assert found.experiments == ("pictures",)
+    assert [view.name for view in project.views("pictures")] == ["cam1"]
+
+
+def test_what_cannot_be_read_is_named(folder):
+    if os.geteuid() == 0:
+        pytest.skip("root may read everything")
+    (folder / "closed").mkdir(mode=0)
+    assert Project(folder).contents().unread[0][0] == "closed"
+
+
+def test_what_is_kept_of_a_file_is_as_new_as_the_file(folder):
+    project, path = Project(folder), folder / "a"
+    path.write_text("1")
+    calls = []
+
+    def read(p):
+        calls.append(p)
+        return p.read_text()
+
+    assert [project.cached("a", "text", read) for _ in range(3)] == ["1"] * 3
+    path.write_text("22")
+    assert project.cached("a", "text", read) == "22"
+    assert len(calls) == 2
+
+
+def test_names_that_are_free(folder):
+    (folder / "x").mkdir()
+    assert Project(folder).free_name("x") == "x-2"
+    assert Project(folder).free_name("y.nc") == "y.nc"

@@ -1,0 +1,127 @@
+"""Who is let in, what leaves, and how the server begins and ends: a real one, asked over the wire."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from app.serving import Served, served
+from nerif.app.command import App
+from nerif.app.guard import cookie_of
+from nerif.app.server import Address
+from nerif.cli import main
+from nerif.conventions import InputError
+
+STATIC = "/_nicegui/3.18.0/static/nicegui.css"
+SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with served(tmp_path_factory.mktemp("project")) as found:
+        yield found
+
+
+@pytest.mark.parametrize("path", ["/", "/design", STATIC, SOCKET, "/design?token=wrong", "/nowhere"])
+def test_without_the_token_nothing_is_answered(server, path):
+    status, headers, text = server.get(path)
+    assert status == 403
+    assert "nicegui" not in text
+    assert "set-cookie" not in headers
+
+
+def test_the_token_is_exchanged_for_a_cookie_that_no_script_reads(server):
+    status, headers, _ = server.get(f"/design?token={server.token}&x=1")
+    assert (status, headers["location"]) == (303, "/design?x=1")
+    kept = headers["set-cookie"]
+    assert "HttpOnly" in kept
+    assert "SameSite=Strict" in kept
+    assert server.token not in kept
+    assert cookie_of(server.token) in kept
+
+
+@pytest.mark.parametrize("path", ["/design", STATIC, SOCKET])
+def test_with_the_cookie_it_is(server, path):
+    status, headers, _ = server.get(path, {"Cookie": server.cookie()})
+    assert status == 200
+    assert "default-src 'self'" in headers["content-security-policy"]
+
+
+@pytest.mark.parametrize("path", ["/design", STATIC, SOCKET])
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1.evil.example:1"])
+def test_a_foreign_name_that_leads_here_is_refused(server, path, host):
+    assert server.get(path, {"Host": host, "Cookie": server.cookie()})[0] == 421
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
+def test_a_page_of_others_is_refused(server, origin):
+    for path in ("/design", SOCKET):
+        assert server.get(path, {"Origin": origin, "Cookie": server.cookie()})[0] == 403
+        assert server.get(f"/?token={server.token}", {"Origin": origin})[0] == 403
+
+
+def upgrade(server: Served, *headers: str) -> str:
+    """The first line of the answer to a browser that asks for a websocket."""
+    with socket.create_connection(("127.0.0.1", server.port), timeout=20) as wire:
+        lines = (
+            "GET /_nicegui_ws/socket.io/?EIO=4&transport=websocket HTTP/1.1", f"Host: 127.0.0.1:{server.port}",
+            "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", *headers, "", "",
+        )  # fmt: skip
+        wire.sendall("\r\n".join(lines).encode())
+        return wire.recv(4096).decode().splitlines()[0]
+
+
+def test_the_websocket_too(server):
+    cookie = f"Cookie: {server.cookie()}"
+    assert " 403" in upgrade(server)
+    assert " 403" in upgrade(server, cookie, "Origin: http://evil.example")
+    assert " 101" in upgrade(server, cookie, f"Origin: http://127.0.0.1:{server.port}")
+
+
+def test_it_listens_on_this_machine_alone(server):
+    with socket.socket() as probe:
+        own = socket.gethostbyname(socket.gethostname())
+        if own.startswith("127."):
+            pytest.skip("this machine has no other address than its own")
+        assert probe.connect_ex((own, server.port)) != 0
+
+
+def test_others_are_let_in_with_a_token_only():
+    with pytest.raises(InputError, match=r"host: expected --token together with --host 0\.0\.0\.0"):
+        Address.of("0.0.0.0", 8000, None)
+    with pytest.raises(InputError, match="token: expected 16"):
+        App(token="short")
+    assert "[::1]" in Address("::1", 1, "x" * 16).names
+
+
+def test_a_port_that_is_taken_gives_the_next(capsys):
+    with socket.socket() as first:
+        first.bind(("127.0.0.1", 0))
+        first.listen()
+        port = first.getsockname()[1]
+        assert Address.of("127.0.0.1", port, None).port > port
+    assert f"port {port} is taken" in capsys.readouterr().out
+
+
+def test_a_folder_that_is_none_is_said_in_one_line(tmp_path, capsys):
+    assert main(["app", str(tmp_path / "nowhere"), "--no-browser"]) == 2
+    assert "expected a folder to work in" in capsys.readouterr().err
+
+
+def test_without_nicegui_the_remedy_is_said(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["app", str(tmp_path)]) == 2
+    assert "pip install 'nerif[app]'" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_it_cleanly(tmp_path: Path):
+    with served(tmp_path) as server:
+        server.process.send_signal(signal.SIGINT)
+        rest, _ = server.process.communicate(timeout=20)
+        assert server.process.returncode == 0
+        assert "Traceback" not in rest
