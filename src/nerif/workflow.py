@@ -161,10 +161,10 @@ def reconstruct_into(
         del settings["gas"]
     run, begin = replace(run, hold_out=unseen), _begin(out, settings, resume)
     data = measurement if look is None else look.data
-    seen = Live(out.path, data, reconstructor, *unseen[:1]) if live else None
-    if seen is not None and look is not None:
-        look = replace(look, monitor=seen.watching(monitor, held_out=True))
-    watched = monitor if seen is None else seen.watching(monitor, held_out=bool(unseen))
+    looked = Live(out.path, data, reconstructor, *unseen[:1]) if live else None
+    if looked is not None and look is not None:
+        look = replace(look, monitor=looked.watching(monitor, held_out=True))
+    watched = monitor if looked is None else looked.watching(monitor, held_out=bool(unseen))
     first, method, origin = look(begin) if look is not None and state is None else None, reconstructor, start
     if first is not None:
         origin, method = first.field, reconstructor.in_two()[1]
@@ -182,7 +182,7 @@ def reconstruct_into(
         if repetitions is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
             known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
-            watched = monitor if seen is None else seen.watching(monitor, held_out=False, looks=False)
+            watched = monitor if looked is None else looked.watching(monitor, held_out=False, looks=False)
             members = Members(
                 out, repetitions, reconstructor, known, start, made_of, run.checkpoint_every, watched
             )

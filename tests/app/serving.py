@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,10 +41,11 @@ class Served:
 
     def get(self, path: str, headers: Mapping[str, str] | None = None) -> tuple[int, dict[str, str], str]:
         """Ask for a path: status, headers and text of the answer."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
-        connection.request("GET", path, headers={"Host": f"127.0.0.1:{self.port}", **(headers or {})})
-        answer = connection.getresponse()
-        return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read().decode("utf-8", "replace")
+        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)) as connection:
+            connection.request("GET", path, headers={"Host": f"127.0.0.1:{self.port}", **(headers or {})})
+            answer = connection.getresponse()
+            text = answer.read().decode("utf-8", "replace")
+            return answer.status, {k.lower(): v for k, v in answer.getheaders()}, text
 
     def cookie(self) -> str:
         """The cookie that the token is exchanged for."""
@@ -62,7 +63,9 @@ def free_port() -> int:
 def served(folder: Path, *arguments: str, port: int | None = None) -> Iterator[Served]:
     """Start nerif app on a folder, and end it by Ctrl-C."""
     words = [sys.executable, "-m", "nerif", "app", str(folder), "--no-browser", "--port", str(port or free_port())]
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+    # NiceGUI behaves otherwise where it is told of a test
+    outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    environment = {**outside, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [*words, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
     )

@@ -103,7 +103,7 @@ def test_defaults_are_not_written():
 @pytest.mark.parametrize(
     ("name", "typed", "meant"),
     [
-        ("views", 5.0, 5), ("f_number", 8, 8.0), ("extra_angles", "10 20.5", [10.0, 20.5]),
+        ("views", 5.0, 5), ("f_number", 8, 8.0), ("extra_angles", "10 20.5", [10, 20.5]),
         ("image_size", "48, 64", [48, 64]), ("image_size", "a 4", ["a", 4]), ("temperature", None, None),
     ],
 )  # fmt: skip

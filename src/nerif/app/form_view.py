@@ -104,12 +104,30 @@ class FormView(Generic[T]):
             control.on_value_change(lambda event: self._changed(field, _meant(field, event.value)))
             self._controls[field.name] = control
             if field.name in self.sliders:
-                low, high = self.sliders[field.name]
-                slider = ui.slider(min=low, max=high, step=_step(field, low, high))
-                slider.props(f'aria-label="{escape(label)}" tabindex=0').bind_value(control)
+                self._slider(field, control, f"{label}, slider")
             self._said[field.name] = ui.html("", sanitize=False).classes("error")
             if field.help:
                 ui.html(f"<p>{escape(field.help)}</p>", sanitize=False).classes("help")
+
+    def _slider(self, field: FormField, control: Any, label: str) -> None:
+        """The browser's own slider: keys and screen readers know it."""
+        low, high = self.sliders[field.name]
+        slider = ui.element("input").classes("range")
+        slider.props(f'type=range min={low} max={high} step={_step(field, low, high)} aria-label="{escape(label)}"')
+        by_hand: list[float] = []
+
+        def moved(event: Any) -> None:
+            by_hand[:] = [float(event.args)]
+            control.set_value(by_hand[0])
+
+        def follow() -> None:
+            value = control.value
+            if isinstance(value, int | float) and [value] != by_hand:  # one that is being moved is where it should be
+                slider.props(f"value={value}")
+
+        slider.on("input", moved, throttle=0.05, js_handler="(event) => emit(event.target.value)")
+        control.on_value_change(follow)
+        follow()
 
     def _made(self, field: FormField, value: Any) -> Any:
         """The control itself, by the kind of the field."""
@@ -121,8 +139,8 @@ class FormView(Generic[T]):
         if field.kind in ("number", "integer"):
             control = ui.number(label, value=value, suffix=field.unit or None)
             return control.props('outlined dense debounce=150 step="any"')
-        control = ui.input(label, value=value).props("outlined dense debounce=250")
-        return control.props(f'suffix="{field.unit}"') if field.unit else control
+        text = ui.input(label, value=value).props("outlined dense debounce=250")
+        return text.props(f'suffix="{field.unit}"') if field.unit else text
 
     def _changed(self, field: FormField, value: Any) -> None:
         if self.values.get(field.name, field.default) == value:

@@ -43,7 +43,7 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[Frame]
     dark = ui.dark_mode(None)
     ui.add_body_html('<a class="skip" href="#main">Skip to the page</a>')
     with ui.header(elevated=False).classes("top"):
-        ui.button(icon="menu", on_click=lambda: left.toggle()).props('flat round aria-label="Pages"')
+        menu = ui.button(icon="menu").props('flat round aria-label="Pages"')
         ui.html(
             f"<span class=brand>nerif</span><span class=project title='{escape(str(work.project.folder))}'>"
             f"{escape(str(work.project.folder))}</span>", sanitize=False,
@@ -52,6 +52,7 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[Frame]
         drawer = JobsDrawer(work)
         _switch(dark)
     with ui.left_drawer(value=True, bordered=True).props("width=208 breakpoint=900").classes("side") as left:
+        menu.on_click(left.toggle)
         links = "".join(
             f"<li><a href='{p.path}'{' aria-current=page' if p is page else ''}>"
             f"<span class=number>{i}</span>{escape(p.title)}</a></li>"

@@ -18,6 +18,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -99,7 +100,6 @@ class Jobs:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.directory = folder, folder / ".nerif" / "jobs"
-        self._runners: list[subprocess.Popen[bytes]] = []
 
     # -- what there is -------------------------------------------------------------------------------------------
 
@@ -257,7 +257,6 @@ class Jobs:
 
     def advance(self) -> None:
         """Start as many of the waiting runs as may run at the same time."""
-        self._runners = [runner for runner in self._runners if runner.poll() is None]
         jobs = self.all()
         free = self.at_once - sum(job.state == "running" for job in jobs)
         for job in [job for job in jobs if job.state == "queued"][: max(free, 0)]:
@@ -275,7 +274,7 @@ class Jobs:
             [sys.executable, "-m", "nerif.app.runner", str(where)], stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
         )  # fmt: skip
-        self._runners.append(runner)
+        threading.Thread(target=runner.wait, daemon=True).start()  # its end is taken note of, by the system at least
         with os.fdopen(claim, "w") as file:
             json.dump({"pid": runner.pid, "began": psutil.Process(runner.pid).create_time()}, file)
 

@@ -24,6 +24,7 @@ __all__ = ["LiveView", "curve_options", "look_html", "told"]
 
 EVERY = 0.7  # seconds
 CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
+SHOWN = {"pause": ("running",), "stop": ("running", "queued"), "resume": ("paused", "stopped", "failed")}  # in states
 BUTTONS = {"pause": ("Pause", "pause"), "stop": ("Stop", "stop"), "resume": ("Go on", "play_arrow")}
 
 
@@ -70,9 +71,8 @@ class LiveView:
             self.choice.set_options(options, value=self.job if self.job in options else None)
         job = next((job for job in jobs if job.id == self.job), None)
         for name, button in self.buttons.items():
-            open_ = job is not None and job.state in ("running", "queued") and not job.asked
-            over = job is not None and job.state in ("paused", "stopped", "failed")
-            button.set_visibility(over if name == "resume" else open_ and (name == "stop" or job.state == "running"))
+            state = "" if job is None or (job.asked and job.state == "running") else job.state
+            button.set_visibility(state in SHOWN[name])
         self.bar.set_visibility(job is not None)
         if job is not None:
             await self._show(job)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import secrets
 import socket
@@ -11,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
 
-from nicegui import app, ui
+from nicegui import app, background_tasks, ui
+from nicegui.server import Server
 from starlette.responses import RedirectResponse
 
 from nerif.app.frame import frame
@@ -97,13 +99,15 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     for page in PAGES:
         ui.page(page.path, response_timeout=30)(_built(work, page))
 
-    def begun() -> None:
+    async def begun() -> None:
+        while not Server.instance.started:
+            await asyncio.sleep(0.01)
         say(f"{work.project.folder}: {address.link}")
         say("Ctrl-C ends the server; what runs goes on.")
         if browser:
             webbrowser.open(address.link)
 
-    app.on_startup(begun)
+    app.on_startup(lambda: background_tasks.create(begun()))
     app.on_startup(lambda: work.beside(work.project.contents))  # the first look is the longest
     app.timer(QUEUE_EVERY, work.jobs.advance)
     try:

@@ -14,7 +14,8 @@ from nerif.json_file import write_json
 
 __all__ = ["Workspace"]
 
-P, T = ParamSpec("P"), TypeVar("T")
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class Workspace:
