@@ -109,28 +109,32 @@ class Live:
         @contextmanager
         def training(title: str) -> Iterator[OnStep]:
             with monitor.training(title) as told:
-                yield compose(self._teller(title, held_out, looks), told)
+                last: list[Step] = []
+                yield compose(self._teller(title, held_out, looks, last), told)
+            if last:  # where it ended
+                self._write(title, last[0])
 
         return replace(monitor, training=training)
 
-    def _teller(self, title: str, held_out: bool, looks: bool) -> OnStep:
+    def _teller(self, title: str, held_out: bool, looks: bool, newest: list[Step]) -> OnStep:
         begun = time.monotonic()
-        written, spent, looked = -EVERY, 0.0, begun
+        written, spent, last = -EVERY, 0.0, 0.0
         self._curve, self._every = [], 1
 
         def tell(step: Step) -> None:
-            nonlocal written, spent, looked
+            nonlocal written, spent, last
             if not self.directory.is_dir():
                 return
+            newest[:] = [step]
             self._remember(step)
             now = time.monotonic()
-            if now - written >= EVERY or step.progress >= 1:
+            if now - written >= EVERY:
                 self._write(title, step)
                 written = now
-            if looks and now - begun >= FIRST and spent <= SHARE * (now - begun):
+            if looks and now - begun >= FIRST and spent + last <= SHARE * (now - begun):
                 self._look(title, step, held_out)
-                looked = time.monotonic()
-                spent += looked - now
+                last = time.monotonic() - now
+                spent += last
 
         return tell
 

@@ -25,6 +25,9 @@ __all__ = ["LiveView", "curve_options", "look_html", "told"]
 EVERY = 0.7  # seconds
 CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
 SHOWN = {"pause": ("running",), "stop": ("running", "queued"), "resume": ("paused", "stopped", "failed")}  # in states
+GREY, COLOURS = "#76838f", ["#2f86c9", "#d9721f"]  # seen on light and dark
+GRID: dict[str, Any] = {"axisLabel": {"color": GREY}, "nameTextStyle": {"color": GREY}}
+GRID["splitLine"] = {"lineStyle": {"color": "#76838f55"}}
 BUTTONS = {"pause": ("Pause", "pause"), "stop": ("Stop", "stop"), "resume": ("Go on", "play_arrow")}
 
 
@@ -137,10 +140,12 @@ def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:
         for name in names
     ]  # fmt: skip
     return {
-        "grid": {"left": 64, "right": 16, "top": 34, "bottom": 42}, "legend": {"top": 0},
+        "grid": {"left": 64, "right": 16, "top": 34, "bottom": 42},
+        "legend": {"top": 0, "textStyle": {"color": GREY}},
+        "color": COLOURS,
         "tooltip": {"trigger": "axis"},
-        "xAxis": {"type": "value", "name": "s", "nameLocation": "middle", "nameGap": 26},
-        "yAxis": {"type": "log"}, "series": series, "aria": {"enabled": True},
+        "xAxis": {"type": "value", "name": "s", "nameLocation": "middle", "nameGap": 26, **GRID},
+        "yAxis": {"type": "log", **GRID}, "series": series, "aria": {"enabled": True},
     }  # fmt: skip
 
 
