@@ -22,7 +22,7 @@ LAYERS = (
     ("imaging",),
     ("fields",),
     ("physics",),
-    ("alignment", "metrics", "residuals", "resolution", "simulation", "rendering"),
+    ("alignment", "metrics", "residuals", "resampling", "resolution", "simulation", "rendering"),
     ("experiment", "particles"),
     ("reconstruction",),
     ("result", "monitor"),

@@ -175,7 +175,8 @@ def _fields(record: Any, choices: Mapping[str, Sequence[str]], prefix: str = "")
         kind, optional = _kind(hint)
         words = tuple(choices.get(prefix + name, ())) or (choices_of(holder, name) if kind == "text" else ())
         kind = "choice" if words else kind
-        unit = _unit(text) if kind in ("integer", "number", "words") else ""
+        numbers = kind in ("integer", "number") or (kind == "words" and "str" not in str(hint))
+        unit = _unit(text) if numbers else ""
         found.append(FormField(prefix + name, kind, text, unit, default, words, optional))
     return found
 

@@ -95,7 +95,9 @@ class Guard:
     async def _pass(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def with_headers(message: MutableMapping[str, Any]) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [*message.get("headers", ()), *HEADERS]
+                own = list(message.get("headers", ()))
+                named = {name.lower() for name, _ in own}  # an answer may have a policy of its own
+                message["headers"] = [*own, *((name, value) for name, value in HEADERS if name not in named)]
             await send(message)
 
         await self.app(scope, receive, with_headers)

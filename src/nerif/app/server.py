@@ -20,6 +20,7 @@ from nerif.app.frame import frame
 from nerif.app.guard import Guard
 from nerif.app.pages import PAGES, Page
 from nerif.app.project import Project
+from nerif.app.result_answers import ROUTES
 from nerif.app.workspace import Workspace
 from nerif.commands.output import say
 from nerif.conventions import InputError
@@ -96,6 +97,8 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     work = Workspace(Project(folder))
     app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
     app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
+    for path, answer in ROUTES.items():
+        app.add_api_route(path, answer(work), include_in_schema=False)
     for page in PAGES:
         ui.page(page.path, response_timeout=30)(_built(work, page))
 

@@ -13,7 +13,7 @@ from nerif.volume import Volume
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["default_level", "draw_isosurface", "filled", "surface_triangles"]
+__all__ = ["default_level", "draw_isosurface", "filled", "stl_of", "surface_triangles"]
 
 LARGEST = 80  # voxels along an edge: finer surfaces cannot be told apart in print, and take minutes to draw
 FACE = "#E69F00"
@@ -42,6 +42,16 @@ def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"
     vertices, faces, _, _ = marching_cubes(values, level)
     first = np.array([float(volume.grid.axis(a)[0]) for a in "xyz"])
     return (vertices[:, ::-1] * np.array(volume.grid.spacing) * stride + first)[faces]
+
+
+def stl_of(triangles: Float[np.ndarray, "n 3 3"]) -> bytes:
+    """Return triangles (mm) as a binary STL file, which CAD programs and three.js read."""
+    a, b, c = (triangles[:, i] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    records = np.zeros(len(triangles), dtype=[("numbers", "<f4", (4, 3)), ("attribute", "<u2")])
+    records["numbers"] = np.concatenate([normals[:, None], triangles], axis=1)
+    return b"nerif, mm".ljust(80) + np.uint32(len(triangles)).tobytes() + records.tobytes()
 
 
 def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:

@@ -17,7 +17,7 @@ from nerif.report.isosurface import default_level, filled
 from nerif.volume import Volume, field_of
 from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["STYLES", "Movie", "frames_there"]
+__all__ = ["STYLES", "Movie", "frames_there", "ranges_over_time"]
 
 STYLES = ("isosurface", "slices")
 FORMATS = (".mp4", ".gif")
@@ -71,10 +71,8 @@ class Movie:
     def pictures(self, store: VolumeSequence, frames: Sequence[int]) -> Iterator[np.ndarray]:
         """Draw the frames one after the other: (row, column, 3) of 8 bit. The colours are those of the whole movie."""
         quantity = self.quantity_of(store)
-        some = [store.volume(i, quantity) for i in frames[:: max(1, len(frames) // 8)]]
-        ends = [colour_range(shown(v)) for v in some]
-        limits = min(low for low, _ in ends), max(high for _, high in ends)
-        level = self.level if self.level is not None else float(np.median([default_level(v) for v in some]))
+        limits, found = ranges_over_time(store, quantity, frames)
+        level = found if self.level is None else self.level
         for i in frames:
             volume = store.volume(i, quantity)
             yield self._picture(volume, f"t = {store.times[i] * 1e3:.3f} ms", limits, level)
@@ -164,6 +162,16 @@ class Movie:
             for done, picture in enumerate(self.pictures(store, frames), start=1):
                 writer.append_data(picture)
                 on_frame(done)
+
+
+def ranges_over_time(
+    store: VolumeSequence, quantity: str, frames: Sequence[int]
+) -> tuple[tuple[float, float], float]:  # fmt: skip
+    """Return the ends of the colours and the level of an isosurface for all of the frames, found from some of them."""
+    some = [store.volume(i, quantity) for i in frames[:: max(1, len(frames) // 8)]]
+    ends = [colour_range(shown(v)) for v in some]
+    limits = min(low for low, _ in ends), max(high for _, high in ends)
+    return limits, float(np.median([default_level(v) for v in some]))
 
 
 def frames_there(store: VolumeSequence) -> list[int]:

@@ -142,14 +142,21 @@ def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Fl
     return image[:height, :width].reshape(height // down, down, width // across, across).mean(axis=(1, 3))
 
 
-def picture_address(image: Float[np.ndarray, "row column"], limits: tuple[float, float]) -> str:
-    """Return a PNG of 255 colours between the limits, grey where there is nothing, as a data address."""
+def picture_address(
+    image: Float[np.ndarray, "row column"], limits: tuple[float, float], colours: str = ""
+) -> str:  # fmt: skip
+    """Return a PNG of 255 colours between the limits, grey where there is nothing, as a data address.
+
+    Parameters
+    ----------
+    colours : name of a Matplotlib colour map; that of maps (map_colours) if empty
+    """
     from PIL import Image
 
     low, high = limits
-    scaled = np.clip((np.nan_to_num(image) - low) / (high - low), 0, 1) * 254
+    scaled = np.clip((np.nan_to_num(image) - low) / ((high - low) or 1.0), 0, 1) * 254
     codes = np.where(np.isfinite(image), np.round(scaled), 255).astype(np.uint8)
-    table = colour_table(map_colours(limits))
+    table = colour_table(colours or map_colours(limits))
     palette = [c for i in range(255) for c in table[round(i * 255 / 254)]] + [190, 190, 190]
     picture = Image.fromarray(codes)
     picture.putpalette(palette)

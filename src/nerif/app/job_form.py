@@ -1,0 +1,59 @@
+"""A form whose settings become a run of nerif, with its command line and a button that puts it into the queue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from nicegui import ui
+
+from nerif.app.form_view import FormView
+from nerif.app.forms import Form
+from nerif.app.pieces import CommandLine, refusals
+from nerif.app.workspace import Workspace
+
+__all__ = ["JobForm"]
+
+
+class JobForm:
+    """A form, its command line and a button, where the page is being built.
+
+    Parameters
+    ----------
+    work : Workspace
+    form : settings, all but those that `words` gives
+    words : the verb, and what stands before the settings of the form
+    button : what it says
+    main : names of the fields that are seen at once
+    out : what is written, relative to the project; its folder is made
+    """
+
+    def __init__(
+        self, work: Workspace, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
+        main: Sequence[str] = (), out: Callable[[], str] | None = None,
+    ) -> None:  # fmt: skip
+        self.work, self.words, self.out = work, words, out
+        self.view = FormView(form, self.show, main=main)
+        self.command = CommandLine()
+        self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
+        self.show()
+
+    @property
+    def arguments(self) -> list[str]:
+        """Arguments of nerif."""
+        return [*self.words(), *self.view.arguments]
+
+    def show(self) -> None:
+        """Show the command line as it is now."""
+        if hasattr(self, "command"):
+            self.command.show(self.arguments)
+            self.button.set_enabled(self.view.right)
+
+    def _start(self) -> None:
+        with refusals():
+            self.view.made()
+            if self.out is not None:
+                self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
+            words = self.arguments
+            self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}")
+            ui.notify("It is in the queue: Runs, above, tells how it goes.", type="positive")

@@ -1,0 +1,199 @@
+"""Results: what came out, whether to trust it, and what others can do with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+import tyro
+from nicegui import ui
+
+from nerif.app.forms import Form
+from nerif.app.job_form import JobForm
+from nerif.app.pages.page import Page
+from nerif.app.pieces import CommandLine, card, figures, refusals, text_html
+from nerif.app.result_answers import report_address, report_file
+from nerif.app.result_look import ResultLook
+from nerif.app.result_table import Row, result_table, rows_of
+from nerif.app.workspace import Workspace
+from nerif.commands.export import Export
+from nerif.commands.figures import Figures
+from nerif.commands.movie import MovieCommand
+from nerif.exports import FORMATS
+from nerif.report.movie import STYLES
+from nerif.report.pages import JOURNALS
+
+__all__ = ["PAGE"]
+
+TABS = {"slices": "Slices", "surface": "In 3-D", "report": "Report", "export": "Export"}
+PROGRAMS = {
+    ".vti": "ParaView (.vti)", ".nc": "NetCDF (.nc)", ".npz": "NumPy (.npz)", ".mat": "MATLAB (.mat)",
+    ".csv": "Text (.csv)",
+}  # fmt: skip
+
+
+class ResultsPage:
+    """The page in one tab."""
+
+    def __init__(self, work: Workspace, rows: Sequence[Row]) -> None:
+        self.work, self.rows = work, rows
+        self.draft: dict[str, Any] = dict(work.draft(PAGE.name))
+        with ui.element("div").classes("stack"):
+            self.table = ui.element("div")
+            self.place = ui.element("div").classes("stack")
+
+    @property
+    def row(self) -> Row:
+        """The result that is shown."""
+        return next((row for row in self.rows if row.name == self.draft.get("result")), self.rows[0])
+
+    async def choose(self, name: str) -> None:
+        """Show another result."""
+        self.draft["result"] = name
+        await self.build()
+
+    async def build(self) -> None:
+        """Build everything for the result that is chosen."""
+        self.work.keep(PAGE.name, self.draft)
+        self.table.clear()
+        self.place.clear()
+        with self.table, card("In this folder"):
+            if not self.rows:
+                text = "No result in this folder yet: the page Reconstruct makes one, or nerif reconstruct."
+                text_html(text, classes="note")
+                return
+            result_table(self.rows, self.row.name, self.choose)
+        with self.place:
+            self._verdict()
+            await self._views()
+
+    def _verdict(self) -> None:
+        row = self.row
+        with card(row.name):
+            text_html(row.sentence)
+            if row.figures:
+                ui.html(figures([(a, b, "") for a, b in row.figures]), sanitize=False)
+
+    async def _views(self) -> None:
+        kept = str(self.draft.get("tab", "slices"))
+        with ui.element("section").classes("card").props('aria-label="The result"'):
+            with ui.tabs().props("no-caps align=left dense") as tabs:
+                for name, title in TABS.items():
+                    ui.tab(name, title)
+            others = [r.name for r in self.rows if r.name != self.row.name and r.film == self.row.film]
+            look = ResultLook(self.work, self.row.name, others, self.draft)
+            first = kept if kept in TABS else "slices"
+            with ui.tab_panels(tabs, value=first, animated=False).classes("panels-of-tabs") as panels:
+                with ui.tab_panel("slices"):
+                    await look.build()
+                with ui.tab_panel("surface"):
+                    surface = ui.element("div").classes("stack")
+                with ui.tab_panel("report"):
+                    self._report()
+                with ui.tab_panel("export"):
+                    self._export()
+
+        async def turned() -> None:
+            self.draft["tab"] = panels.value
+            self.work.keep(PAGE.name, self.draft)
+            if panels.value == "surface":  # of what is chosen in the slices
+                surface.clear()
+                with surface, refusals():
+                    await look.surfaces()
+
+        panels.on_value_change(turned)
+        if panels.value == "surface":
+            await turned()
+
+    # -- report --------------------------------------------------------------------------------------------------
+
+    def _report(self) -> None:
+        name = self.row.name
+        file = report_file(self.work.project.path(name))
+        if file.is_file():
+            address = report_address(name, file.stat().st_mtime_ns)
+            link = ui.link("Open the report alone", address, new_tab=True).classes("alone")
+            link.props["rel"] = "noopener"
+            frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts allow-downloads" loading=lazy')
+            frame.props["src"] = address
+            frame.props["title"] = f"Report of {name}"
+        else:
+            text_html("There is no report yet.", classes="note")
+        text_html("The same on the command line", "h3")
+        command = CommandLine()
+        command.show(["report", name])
+
+        def write() -> None:
+            with refusals():
+                self.work.jobs.add(["report", name], f"Report {name}")
+                ui.notify("It is in the queue; load this page again when it is done.", type="positive")
+
+        button = "Write it anew" if file.is_file() else "Write the report"
+        ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
+
+    # -- for others ----------------------------------------------------------------------------------------------
+
+    def _export(self) -> None:
+        with ui.element("div").classes("halves"):
+            if self.row.film:
+                with card("A movie", "Every frame drawn off-screen; needs the extra nerif[movie]."):
+                    self._movie()
+                return
+            with card("The field, for other programs", "On any grid: a network has no voxels of its own."):
+                self._volume()
+            with card("Figures for print", "Vector PDF and PNG, as wide as the columns of a journal."):
+                self._figures()
+
+    def _free(self, ending: str) -> str:
+        return self.work.project.free_name(f"exports/{PurePosixPath(self.row.name).stem}{ending}")
+
+    def _named(self, label: str, options: dict[str, str]) -> tuple[ui.select, ui.input]:
+        """A choice of formats and the name of the file, which follows it."""
+        first = next(iter(options))
+        choice = ui.select(options, label=label, value=first).props("outlined dense options-dense")
+        choice.props["aria-label"] = label
+        name = ui.input("File to write", value=self._free(first)).props("outlined dense debounce=250")
+        name.props["aria-label"] = "File to write"
+        choice.on_value_change(lambda: name.set_value(self._free(choice.value)))
+        return choice, name
+
+    def _volume(self) -> None:
+        record = Export(tyro.MISSING, tyro.MISSING)
+        form = Form(record, without=("config", "result", "out", "force"))
+        with ui.element("div").classes("form"):
+            _, name = self._named("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
+            made = JobForm(
+                self.work, form, lambda: ["export", self.row.name, "-o", name.value or "FILE"], "Export",
+                ("voxels", "quantities"), lambda: name.value,
+            )  # fmt: skip
+        name.on_value_change(made.show)
+
+    def _figures(self) -> None:
+        record = Figures(tyro.MISSING)
+        form = Form(record, without=("config", "result", "out"), choices={"journal": tuple(JOURNALS)})
+        with ui.element("div").classes("form"):
+            text_html(f"They are written to {self.row.name}/figures.", classes="note")
+            JobForm(self.work, form, lambda: ["figures", self.row.name], "Draw the figures")
+
+    def _movie(self) -> None:
+        record = MovieCommand(tyro.MISSING, tyro.MISSING)
+        form = Form(record, without=("config", "result", "out", "force"), choices={"style": STYLES})
+        with ui.element("div").classes("form"):
+            _, name = self._named("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
+            made = JobForm(
+                self.work, form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"], "Make the movie",
+                ("style", "every"), lambda: name.value,
+            )  # fmt: skip
+        name.on_value_change(made.show)
+
+
+async def build(work: Workspace) -> None:
+    """Build the page."""
+    found = await work.beside(work.project.contents)
+    page = ResultsPage(work, await work.beside(rows_of, work.project, found))
+    await page.build()
+
+
+ABOUT = "What came out, whether to trust it, and what to take along."
+PAGE = Page("results", "Results", "/results", ABOUT, build)

@@ -1,0 +1,79 @@
+"""Answers of the server beside its pages: the report of a result, and the isosurface of a quantity.
+
+A report is a page that somebody may have been sent: it stands in a sandbox of its own, with no way to this server.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from urllib.parse import quote, urlencode
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+
+from nerif.app.sources import source_of
+from nerif.app.workspace import Workspace
+from nerif.conventions import InputError
+from nerif.report.isosurface import stl_of, surface_triangles
+from nerif.result import REPORT
+
+__all__ = ["ROUTES", "report_address", "report_file", "surface_address"]
+
+SANDBOX = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; font-src data:; frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
+)
+KEPT = "private, max-age=3600"  # the address changes with the file
+
+Answer = Callable[[Request], Awaitable[Response]]
+
+
+def report_file(path: Path) -> Path:
+    """Return where the report of a result directory, or of a store over time, is written to."""
+    return path.with_suffix(".html") if path.suffix == ".zarr" else path / REPORT
+
+
+def report_address(name: str, stamp: int) -> str:
+    """Return the address of a report; `stamp` changes with its file."""
+    return "/report?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+
+
+def surface_address(name: str, quantity: str, level: float, frame: int, stamp: int) -> str:
+    """Return the address of an isosurface."""
+    asked = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
+    return "/surface?" + urlencode(asked, quote_via=quote)
+
+
+def _report(work: Workspace) -> Answer:
+    async def answer(request: Request) -> Response:
+        try:
+            file = work.project.path(report_file(work.project.path(request.query_params.get("of", ""))))
+        except InputError as error:
+            return PlainTextResponse(str(error), 404)
+        if not file.is_file():
+            return PlainTextResponse("There is no report yet: nerif report writes it.", 404)
+        headers = {"content-security-policy": SANDBOX, "cache-control": KEPT}
+        return FileResponse(file, media_type="text/html; charset=utf-8", headers=headers)
+
+    return answer
+
+
+def _surface(work: Workspace) -> Answer:
+    def made(name: str, quantity: str, level: float, frame: int) -> bytes:
+        return stl_of(surface_triangles(source_of(work.project.path(name)).volume(quantity, frame), level))
+
+    async def answer(request: Request) -> Response:
+        asked = request.query_params
+        try:
+            level, frame = float(asked.get("level", "0")), int(asked.get("frame", "0"))
+            stl = await work.beside(made, asked.get("of", ""), asked.get("quantity", ""), level, frame)
+        except (InputError, ValueError) as error:
+            return PlainTextResponse(str(error), 404)
+        return Response(stl, media_type="model/stl", headers={"cache-control": KEPT})
+
+    return answer
+
+
+ROUTES: dict[str, Callable[[Workspace], Answer]] = {"/report": _report, "/surface": _surface}
+"""Paths, and what makes their answer."""

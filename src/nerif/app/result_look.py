@@ -1,0 +1,204 @@
+"""A result, or a film, to be looked at: slices beside those of another, the difference, time, uncertainty, surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from nicegui import ui
+
+from nerif.app.pieces import text_html
+from nerif.app.range_slider import RangeSlider
+from nerif.app.slices_view import Panel, SlicesView
+from nerif.app.sources import Source, source_of
+from nerif.app.surface_view import Surface, SurfaceView
+from nerif.app.workspace import Workspace
+from nerif.conventions import InputError, unit_shown
+from nerif.drawing import DIVERGING, LABELS, map_range
+from nerif.report.slice_pictures import colours_of
+from nerif.resampling import common_grid, difference, resampled
+from nerif.result import VOLUME
+from nerif.volume import Volume, describe
+
+__all__ = ["ResultLook"]
+
+PLAY_EVERY = 0.25  # seconds a frame
+
+
+class ResultLook:
+    """The pictures of one result in one tab; `build` fills the place that is being built.
+
+    Parameters
+    ----------
+    work : Workspace
+    name : of the result, relative to the project
+    others : names of those it can be compared with
+    draft : what was chosen before; changed with what is chosen
+    """
+
+    def __init__(self, work: Workspace, name: str, others: Sequence[str], draft: dict[str, Any]) -> None:
+        self.work, self.name, self.others, self.draft = work, name, tuple(others), draft
+        self.source: Source | None = None
+        self.step = 0
+        self._playing: ui.timer | None = None
+
+    # -- controls ------------------------------------------------------------------------------------------------
+
+    async def build(self) -> None:
+        """Build controls and pictures; InputError in words where there is nothing to see."""
+        try:
+            self.source = await self.work.beside(self._open, self.name)
+            quantities = [q for q in self.source.quantities if not q.endswith("_std")]
+        except InputError as error:
+            text_html(f"{error}.", classes="note")
+            return
+        if not quantities:
+            text_html(f"{self.name}: no field in it.", classes="note")
+            return
+        kept = str(self.draft.get("quantity", ""))
+        options = {q: describe(q)[1].capitalize() for q in quantities}
+        with ui.element("div").classes("choices"):
+            self.quantity = _select("Quantity", options, kept if kept in options else quantities[0])
+            against = str(self.draft.get("against", ""))
+            choices = {"": "Nothing", **{name: name for name in self.others}}
+            self.against = _select("Compare with", choices, against if against in choices else "")
+            self.spread = ui.switch("Standard deviation", value=bool(self.draft.get("spread")))
+        for control in (self.quantity, self.against, self.spread):
+            control.on_value_change(self._chosen)
+        self.time: RangeSlider | None = None
+        if len(self.source.frames) > 1:
+            self._build_time()
+        self.said = ui.html("", sanitize=False).props("aria-live=polite")
+        self.slices = SlicesView(self.work)
+        await self.draw()
+
+    def _build_time(self) -> None:
+        source = self.source
+        assert source is not None
+
+        async def move(step: int) -> None:
+            self.step = step
+            await self.draw()
+
+        with ui.element("div").classes("time"):
+            self.play = ui.button(icon="play_arrow", on_click=self._play).props("round unelevated dense")
+            self.play.props["aria-label"] = "Play or halt the film"
+
+            def text(step: int) -> str:
+                return f"{source.times[source.frames[step]] * 1e3:.4g} ms (frame {source.frames[step] + 1})"
+
+            self.time = RangeSlider("Time", len(source.frames) - 1, 0, text, move)
+
+    def _play(self) -> None:
+        if self._playing is not None:
+            self._playing.cancel()
+            self._playing = None
+            self.play.props("icon=play_arrow")
+            return
+
+        async def on() -> None:
+            assert self.source is not None
+            assert self.time is not None
+            self.step = (self.step + 1) % len(self.source.frames)
+            self.time.put(self.step)
+            await self.draw()
+
+        self._playing = ui.timer(PLAY_EVERY, on)
+        self.play.props("icon=pause")
+
+    async def _chosen(self) -> None:
+        self.draft |= {
+            "quantity": self.quantity.value, "against": self.against.value, "spread": bool(self.spread.value),
+        }  # fmt: skip
+        await self.draw()
+
+    # -- pictures ------------------------------------------------------------------------------------------------
+
+    @property
+    def frame(self) -> int:
+        """The frame that is shown; 0 of a result of one instant."""
+        assert self.source is not None
+        return self.source.frames[self.step]
+
+    async def draw(self) -> None:
+        """Draw everything as it is chosen now."""
+        assert self.source is not None
+        has = f"{self.quantity.value}_std" in self.source.quantities
+        self.spread.set_visibility(has)
+        quantity = f"{self.quantity.value}_std" if has and self.spread.value else self.quantity.value
+        try:
+            panels, note = await self.work.beside(self._panels, quantity, self.against.value, self.step)
+        except InputError as error:
+            panels, note = [], f"{error}."
+        self.said.set_content(f"<p class=note>{escape(note)}</p>" if note else "")
+        await self.slices.show(panels)
+
+    def _open(self, name: str) -> Source:
+        return source_of(self.work.project.path(name))
+
+    def _panels(self, quantity: str, against: str, step: int) -> tuple[list[Panel], str]:
+        """What is shown side by side, and what is to be said of it."""
+        source = self.source
+        assert source is not None
+        first, limits = source.volume(quantity, source.frames[step]), source.limits(quantity)
+        unit, colours = _unit(first), colours_of(quantity)
+        if not against:
+            return [Panel(describe(quantity)[1].capitalize(), first, limits, unit, colours)], ""
+        other = self._open(against)
+        if quantity not in other.quantities:
+            raise InputError(f"{against}: there is no {describe(quantity)[1]} in it to compare with")
+        second = other.volume(quantity, other.frames[min(step, len(other.frames) - 1)])
+        beside = other.limits(quantity)
+        limits = min(limits[0], beside[0]), max(limits[1], beside[1])
+        grid = common_grid(first, second)
+        apart = difference(first, second, grid)
+        ends = map_range(apart.values.numpy(), True, 0.998)
+        panels = [
+            Panel(self.name, resampled(first, grid), limits, unit, colours),
+            Panel(against, resampled(second, grid), limits, unit, colours),
+            Panel(f"{against} minus {self.name}", apart, ends, unit, DIVERGING),
+        ]
+        if first.grid == second.grid:
+            return panels, ""
+        shape = " × ".join(str(n) for n in grid.shape[::-1])
+        return panels, f"The grids differ: both are shown on {shape} voxels (x, y, z), trilinear between theirs."
+
+    # -- in three dimensions -------------------------------------------------------------------------------------
+
+    async def surfaces(self) -> None:
+        """Build the isosurface of what is chosen."""
+        if self.source is None:
+            text_html("There is no field to show yet.", classes="note")
+            return
+        quantity, against = self.quantity.value, self.against.value
+        volume, limits, level = await self.work.beside(self._surface, quantity)
+        if min(volume.grid.shape) < 2:
+            text_html("The field is a plane: there is no surface in it.", classes="note")
+            return
+        view = SurfaceView(quantity, _unit(volume), limits, level, volume.grid.box)
+        shown = [self._shown(self.name, self.frame)]
+        if against:
+            shown.append(self._shown(against, self.frame if against.endswith(".zarr") else 0))
+        view.show(shown)
+
+    def _surface(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
+        assert self.source is not None
+        volume = self.source.volume(quantity, self.frame)
+        return volume, self.source.limits(quantity), self.source.level(quantity)
+
+    def _shown(self, name: str, frame: int) -> Surface:
+        path = self.work.project.path(name)
+        file = path / ("zarr.json" if path.suffix == ".zarr" else VOLUME)
+        return Surface(name, frame, file.stat().st_mtime_ns if file.is_file() else 0)
+
+
+def _unit(volume: Volume) -> str:
+    """The unit as people write it; nothing of a pure number."""
+    return unit_shown(LABELS.get(volume.quantity.removesuffix("_std"), ("", volume.unit))[1])
+
+
+def _select(label: str, options: Any, value: str) -> ui.select:
+    select = ui.select(options, label=label, value=value).props("outlined dense options-dense")
+    select.props["aria-label"] = label
+    return select

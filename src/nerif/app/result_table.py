@@ -1,0 +1,112 @@
+"""The results of a project in a table: verdict, error figures, how the run ended."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+
+from nicegui import ui
+
+from nerif.app.project import Contents, Project
+from nerif.conventions import InputError
+from nerif.evaluation import rms_text
+from nerif.reconstruction.files import FIELD
+from nerif.report.movie import frames_there
+from nerif.report.summary import trust_figures
+from nerif.result import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
+from nerif.verdict import verdict
+from nerif.volume_sequence import VolumeSequence
+
+__all__ = ["Row", "result_table", "rows_of"]
+
+HEAD = ("Name", "Method", "Verdict", "Likely error", "Views, worst rms", "Outcome", "Time", "Ended")
+CLASSES = {"use": "good", "use with care": "care", "do not use": "bad"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One result or film.
+
+    Parameters
+    ----------
+    name : relative to the project
+    cells : of the table, after the name
+    word : of the verdict
+    sentence : the verdict in full, or what is missing
+    figures : names and values by which to trust it
+    film : whether it is one over time
+    """
+
+    name: str
+    cells: tuple[str, ...]
+    word: str
+    sentence: str
+    figures: tuple[tuple[str, str], ...]
+    film: bool = False
+
+
+def rows_of(project: Project, contents: Contents) -> list[Row]:
+    """Return the rows of a project: results, then films; measurements over time are no films."""
+    rows = [_cached(project, name) for name in contents.results]
+    return rows + [row for name in contents.films if (row := _film(project, name)) is not None]
+
+
+def _cached(project: Project, name: str) -> Row:
+    """A row, read anew when the file that was written last among those it rests on has changed."""
+    there = [n for n in (METRICS, FIELD, RUN, LIVE, VOLUME) if (project.path(name) / n).is_file()]
+    last = max(there, key=lambda n: (project.path(name) / n).stat().st_mtime_ns)
+    return project.cached(f"{name}/{last}", "row", lambda _: _of(name, ResultDirectory(project.path(name)).glance()))
+
+
+def _of(name: str, result: Result) -> Row:
+    found, metrics = verdict(result), result.metrics
+    views = [v for v in metrics.get("views", []) if v.get("rms") is not None]
+    worst = rms_text(max(views, key=lambda v: float(v["rms"])), 3) if views else ""
+    outcome = str(metrics.get("outcome") or result.about.get("outcome") or "not ended").replace("_", " ")
+    seconds = metrics.get("seconds", result.about.get("seconds"))
+    error = "" if found.error is None else f"{found.error:.1%} of the variation"
+    ended, word, sentence = bool(metrics), found.word, found.sentence
+    if not ended:
+        word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "Nothing of it is known yet."
+    time = "" if seconds is None else f"{float(seconds):.0f} s"
+    cells = (result.method, word, error, worst, outcome, time, str(result.about.get("finished", "")))
+    return Row(name, cells, word, sentence, tuple(trust_figures(result)) if ended else ())
+
+
+def _film(project: Project, name: str) -> Row | None:
+    """A row of a film; None of a store that holds measurements."""
+    try:
+        store = VolumeSequence(project.path(name))
+    except InputError:
+        return None
+    count, done = len(store), len(frames_there(store))
+    span = f"{store.times[0]:g} to {store.times[-1]:g} s" if count else ""
+    outcome = "complete" if done == count else f"{done} of {count} frames"
+    grid = " × ".join(str(n) for n in store.grid.shape[::-1])
+    figures = (("Frames", f"{done} of {count}"), ("Time", span), ("Voxels", f"{grid} (x, y, z)"))
+    cells = (f"film, {count} frames", "", "", "", outcome, span, "")
+    return Row(name, cells, "", f"{done} of {count} frames can be shown.", figures, film=True)
+
+
+def result_table(rows: Sequence[Row], chosen: str, choose: Callable[[str], Awaitable[None]]) -> None:
+    """Build the table, with a button in each row that shows it."""
+    around = ui.element("div").classes("tabled").props('tabindex=0 role=region aria-label="Results"')
+    with around, ui.element("table"):
+        with ui.element("thead"), ui.element("tr"):
+            for title in HEAD:
+                ui.html(escape(title), sanitize=False, tag="th").props("scope=col")
+        with ui.element("tbody"):
+            for row in rows:
+                _line(row, row.name == chosen, choose)
+
+
+def _line(row: Row, chosen: bool, choose: Callable[[str], Awaitable[None]]) -> None:
+    with ui.element("tr").classes("chosen" if chosen else ""):
+        with ui.element("th").props("scope=row"):
+            button = ui.button(row.name, on_click=lambda: choose(row.name)).props("flat dense no-caps align=left")
+            button.props["aria-label"] = f"Show {row.name}"
+            button.props["aria-pressed"] = "true" if chosen else "false"
+        for title, cell in zip(HEAD[1:], row.cells, strict=True):
+            verdict_class = f"verdict {CLASSES.get(row.word, '')}" if title == "Verdict" and cell else ""
+            ui.html(escape(cell), sanitize=False, tag="td").classes(verdict_class)

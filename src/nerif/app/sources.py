@@ -1,0 +1,145 @@
+"""What a page of results draws from: the volumes of a result directory, or of a frame of a film."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+from nerif.conventions import STATISTICS, InputError
+from nerif.drawing import colour_range, shown
+from nerif.report.isosurface import default_level
+from nerif.report.movie import frames_there, ranges_over_time
+from nerif.report.packing import coarsen
+from nerif.result import VOLUME
+from nerif.volume import INDEX, Volume
+from nerif.volume_file import read_volumes
+from nerif.volume_sequence import VolumeSequence
+
+__all__ = ["Film", "Source", "Still", "source_of"]
+
+Limits = tuple[float, float]
+
+
+class Source(Protocol):
+    """Volumes of several quantities on one grid, of one instant or of several."""
+
+    @property
+    def quantities(self) -> tuple[str, ...]: ...
+    @property
+    def times(self) -> tuple[float, ...]: ...
+    @property
+    def frames(self) -> Sequence[int]: ...
+    def volume(self, quantity: str, frame: int = 0) -> Volume: ...
+    def limits(self, quantity: str) -> Limits: ...
+    def level(self, quantity: str) -> float: ...
+
+
+class Still:
+    """A result directory.
+
+    Parameters
+    ----------
+    path : of the directory
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.times = path, (0.0,)
+        self.frames: Sequence[int] = (0,)
+
+    @property
+    def _volumes(self) -> dict[str, Volume]:
+        file = self.path / VOLUME
+        if not file.is_file():
+            raise InputError(f"{self.path.name}: there is no field to show yet; it comes when the run has ended")
+        return _read(str(file), file.stat().st_mtime_ns)
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What there is: of an index the excess stands for n too; standard deviations beside what they belong to."""
+        return _worth_showing(self._volumes)
+
+    def volume(self, quantity: str, frame: int = 0) -> Volume:
+        """Return one quantity, averaged down if it is large.
+
+        Raises
+        ------
+        InputError
+            If the result lacks it.
+        """
+        found = self._volumes
+        if quantity not in found:
+            raise InputError(f"{self.path.name}: expected one of {', '.join(found)}, got '{quantity}'")
+        return found[quantity]
+
+    def limits(self, quantity: str) -> Limits:
+        """Return the ends of its colours."""
+        return colour_range(shown(self.volume(quantity)))
+
+    def level(self, quantity: str) -> float:
+        """Return the level of its isosurface to begin with."""
+        return default_level(self.volume(quantity))
+
+
+class Film:
+    """A store of volumes over time.
+
+    Parameters
+    ----------
+    path : of the Zarr store
+
+    Raises
+    ------
+    InputError
+        If it holds no volumes over time, or none of its frames is done.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        store = VolumeSequence(path)
+        self.times, self.frames = store.times, frames_there(store)
+        self.quantities = _worth_showing(store.quantities)
+        if not self.frames:
+            raise InputError(f"{path.name}: no frame of it is done yet")
+
+    @property
+    def _stamp(self) -> int:
+        return (self.path / "zarr.json").stat().st_mtime_ns
+
+    def volume(self, quantity: str, frame: int = 0) -> Volume:
+        """Return one quantity of a frame, averaged down if it is large."""
+        return _frame(str(self.path), self._stamp, quantity, frame)
+
+    def limits(self, quantity: str) -> Limits:
+        """Return the ends of its colours, those of all frames."""
+        return _over_time(str(self.path), self._stamp, quantity, tuple(self.frames))[0]
+
+    def level(self, quantity: str) -> float:
+        """Return the level of its isosurface to begin with, that of all frames."""
+        return _over_time(str(self.path), self._stamp, quantity, tuple(self.frames))[1]
+
+
+def source_of(path: Path) -> Source:
+    """Return what can be drawn of a result directory, or of a store over time."""
+    return Film(path) if path.suffix == ".zarr" else Still(path)
+
+
+def _worth_showing(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
+    kept = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
+    return tuple(name for q in kept for name in (q, f"{q}_std") if name in quantities)
+
+
+@lru_cache(maxsize=6)
+def _read(path: str, stamp: int) -> dict[str, Volume]:
+    return {name: coarsen(volume) for name, volume in read_volumes(path).items()}
+
+
+@lru_cache(maxsize=24)
+def _frame(path: str, stamp: int, quantity: str, frame: int) -> Volume:
+    return coarsen(VolumeSequence(path).volume(frame, quantity))
+
+
+@lru_cache(maxsize=24)
+def _over_time(path: str, stamp: int, quantity: str, frames: tuple[int, ...]) -> tuple[Limits, float]:
+    return ranges_over_time(VolumeSequence(path), quantity, frames)

@@ -1,0 +1,46 @@
+"""Slices of a volume as small pictures for a page, at any voxel along an axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nerif.drawing import COLOUR_MAPS, PLANES, SEQUENTIAL
+from nerif.report.view_images import picture_address
+from nerif.volume import Volume
+
+__all__ = ["bar_picture", "colours_of", "slice_aspect", "slice_picture"]
+
+
+def colours_of(quantity: str) -> str:
+    """Return the colour map that a quantity is drawn in."""
+    return COLOUR_MAPS.get(quantity.partition("_")[0], SEQUENTIAL)
+
+
+def slice_picture(volume: Volume, normal: str, index: int, limits: tuple[float, float], colours: str) -> str:
+    """Return the slice across an axis as a PNG in a data address, a pixel a voxel, masked voxels grey.
+
+    Parameters
+    ----------
+    normal : axis across which it is cut: x, y or z
+    index : of the voxel along it
+    limits : ends of the colours, as values are shown (drawing.shown)
+    colours : name of a Matplotlib colour map
+    """
+    axis = "zyx".index(normal)
+    index = min(max(index, 0), volume.grid.shape[axis] - 1)
+    plane = np.take(volume.values.numpy(), index, axis=axis)
+    if volume.quantity in ("n", "n_mean"):  # as drawing.shown has it
+        plane = plane.astype(np.float64) - 1
+    return picture_address(plane[::-1], limits, colours)
+
+
+def slice_aspect(volume: Volume, normal: str) -> float:
+    """Return width over height of the slice across an axis."""
+    across, up = PLANES[normal]
+    edges = volume.grid.box.edges
+    return edges["xyz".index(across)] / edges["xyz".index(up)]
+
+
+def bar_picture(colours: str) -> str:
+    """Return a colour bar, low on the left, as a PNG in a data address."""
+    return picture_address(np.linspace(0.0, 1.0, 256)[None], (0.0, 1.0), colours)
