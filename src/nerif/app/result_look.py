@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
@@ -35,10 +35,13 @@ class ResultLook:
     name : of the result, relative to the project
     others : names of those it can be compared with
     draft : what was chosen before; changed with what is chosen
+    keep : called when it has changed
     """
 
-    def __init__(self, work: Workspace, name: str, others: Sequence[str], draft: dict[str, Any]) -> None:
-        self.work, self.name, self.others, self.draft = work, name, tuple(others), draft
+    def __init__(
+        self, work: Workspace, name: str, others: Sequence[str], draft: dict[str, Any], keep: Callable[[], None]
+    ) -> None:
+        self.work, self.name, self.others, self.draft, self.keep = work, name, tuple(others), draft, keep
         self.source: Source | None = None
         self.step = 0
         self._playing: ui.timer | None = None
@@ -111,6 +114,7 @@ class ResultLook:
         self.draft |= {
             "quantity": self.quantity.value, "against": self.against.value, "spread": bool(self.spread.value),
         }  # fmt: skip
+        self.keep()
         await self.draw()
 
     # -- pictures ------------------------------------------------------------------------------------------------

@@ -48,6 +48,10 @@ class ResultsPage:
         """The result that is shown."""
         return next((row for row in self.rows if row.name == self.draft.get("result")), self.rows[0])
 
+    def keep(self) -> None:
+        """Keep what is chosen over a reload."""
+        self.work.keep(PAGE.name, self.draft)
+
     async def choose(self, name: str) -> None:
         """Show another result."""
         self.draft["result"] = name
@@ -55,7 +59,7 @@ class ResultsPage:
 
     async def build(self) -> None:
         """Build everything for the result that is chosen."""
-        self.work.keep(PAGE.name, self.draft)
+        self.keep()
         self.table.clear()
         self.place.clear()
         with self.table, card("In this folder"):
@@ -82,7 +86,7 @@ class ResultsPage:
                 for name, title in TABS.items():
                     ui.tab(name, title)
             others = [r.name for r in self.rows if r.name != self.row.name and r.film == self.row.film]
-            look = ResultLook(self.work, self.row.name, others, self.draft)
+            look = ResultLook(self.work, self.row.name, others, self.draft, self.keep)
             first = kept if kept in TABS else "slices"
             with ui.tab_panels(tabs, value=first, animated=False).classes("panels-of-tabs") as panels:
                 with ui.tab_panel("slices"):
@@ -96,7 +100,7 @@ class ResultsPage:
 
         async def turned() -> None:
             self.draft["tab"] = panels.value
-            self.work.keep(PAGE.name, self.draft)
+            self.keep()
             if panels.value == "surface":  # of what is chosen in the slices
                 surface.clear()
                 with surface, refusals():

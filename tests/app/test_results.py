@@ -1,0 +1,226 @@
+"""The Results page in a real browser, on results made by hand: slices that move together, films, reports, exports."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.serving import Served, served
+from app.test_pages import line
+from nerif.app.jobs import Jobs
+from nerif.app.project import Project
+from nerif.app.result_table import rows_of
+from nerif.app.sources import Film, Still
+from nerif.conventions import InputError
+from nerif.exports import export
+from nerif.fields.grid import VoxelField
+from nerif.fields.phantoms import Flame
+from nerif.geometry import Box, Grid
+from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.result import ResultDirectory
+from nerif.volume import Volume
+from nerif.volume_file import read_volumes
+from nerif.volume_sequence import VolumeSequence
+from report.browsing import errors, needs_browser, requests, text, wait_for
+
+BOX = Box((-25.0, -24.0, -20.0), (25.0, 24.0, 20.0))
+AMBIENT = 1.00027
+REPORT = """<!doctype html><title>r</title><p id=said>nothing</p><script>
+const said = document.querySelector('#said'); said.textContent = 'run';
+try { parent.document.title = 'taken'; said.textContent += ' reached' } catch { said.textContent += ' kept out' }
+fetch('/design').then(() => { said.textContent += ' fetched' }, () => { said.textContent += ' refused' });
+</script>"""
+
+
+def result(path: Path, voxels: int, error: float) -> None:
+    """A finished result of a flame, as nerif reconstruct leaves it, with standard deviations."""
+    grid = Grid.of_resolution(BOX, voxels)
+    values = Flame(BOX).sample(grid)
+    field, found = VoxelField.through(values, grid), ResultDirectory(path)
+    found.begin({"measurement": "m.nc", "method": "tikhonov"})
+    found.write_field(Reconstruction(field, BOX, AMBIENT, [], Outcome("converged", "by hand"), {}))
+    index = Volume.of(values * (1 + error), grid, "index_excess", AMBIENT)
+    spread = Volume.of((values * 0.02).abs(), grid, "index_excess_std", AMBIENT)
+    found.write_volumes([index, spread])
+    views = [
+        {"name": str(i), "held_out": i == 0, "measured": "displacement", "unit": "px", "cc": 0.99, "rms": 0.01,
+         "rms_predicted": 0.5} for i in range(5)
+    ]  # fmt: skip
+    found.write_metrics({"views": views, "outcome": "converged", "seconds": 12.0, "uncertainty": {"members": 4}})
+    (path / "report.html").write_text(REPORT)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("project")
+    result(found / "results" / "a <b>", 20, 0.0)
+    result(found / "results" / "other", 16, 0.1)
+    grid = Grid.of_resolution(BOX, 12)
+    store = VolumeSequence.create(found / "film.zarr", [0.0, 1e-3, 2e-3], grid, ("index_excess",), AMBIENT)
+    for i in range(3):
+        store.write(i, [Volume(Flame(BOX).sample(grid) * (1 - 0.4 * i), grid)])
+    return found
+
+
+def test_what_is_listed_and_what_is_said_of_it(folder):
+    project = Project(folder)
+    first, second, film = rows_of(project, project.contents())
+    assert (first.name, second.name, film.name) == ("results/a <b>", "results/other", "film.zarr")
+    assert first.cells[:5] == ("Tikhonov", "use", "2.0% of the variation", "0.01 px", "converged")
+    assert dict(film.figures)["Frames"] == "3 of 3"
+    unfinished = folder / "results" / "z"
+    ResultDirectory(unfinished).begin({"method": "nerif"})
+    row = rows_of(project, project.contents())[2]
+    assert (row.name, row.word, row.cells[4]) == ("results/z", "", "not ended")
+    assert "has not ended" in row.sentence
+    with pytest.raises(InputError, match="no field to show yet"):
+        Still(unfinished).volume("index_excess")
+    (unfinished / "run.toml").unlink()
+    unfinished.rmdir()
+
+
+def test_sources_follow_the_files(folder, tmp_path):
+    still, film = Still(folder / "results" / "other"), Film(folder / "film.zarr")
+    assert still.quantities == ("index_excess", "index_excess_std")
+    assert film.frames == [0, 1, 2]
+    assert film.limits("index_excess")[0] == pytest.approx(float(film.volume("index_excess", 0).values.min()), rel=0.1)
+    with pytest.raises(InputError, match="expected one of"):
+        still.volume("density")
+    copy = tmp_path / "r"
+    copy.mkdir()
+    export(copy / "volume.nc", [still.volume("index_excess")])
+    before = Still(copy).limits("index_excess")
+    twice = still.volume("index_excess")
+    export(copy / "volume.nc", [Volume.of(2 * twice.values, twice.grid, "index_excess", AMBIENT)])
+    assert Still(copy).limits("index_excess")[0] == pytest.approx(2 * before[0])
+
+
+@pytest.fixture(scope="module")
+def server(folder: Path) -> Iterator[Served]:
+    with served(folder) as found:
+        yield found
+
+
+def visit(driver: Any, server: Served) -> None:
+    """Open the page and wait until it answers."""
+    driver.get_log("browser")
+    driver.get_log("performance")
+    driver.get(f"http://127.0.0.1:{server.port}/results?token={server.token}")
+    wait_for(driver, "return document.querySelector('[role=tab]') !== null && window.socket?.connected")
+
+
+def tab(driver: Any, name: str) -> None:
+    """Turn to one of the tabs."""
+    driver.find_element("xpath", f"//div[@role='tab'][contains(., '{name}')]").click()
+
+
+def pick(driver: Any, label: str, option: str) -> None:
+    """Choose something by its words."""
+    driver.find_element("xpath", f"//*[@aria-label='{label}']").click()
+    found = f"//div[@role='option'][contains(., '{option}')]"
+    wait_for(driver, f"return document.evaluate({found!r}, document, null, 9, null).singleNodeValue?.offsetParent")
+    driver.find_element("xpath", found).click()
+
+
+def pictures(driver: Any) -> list[str]:
+    """Addresses of the slices."""
+    return list(driver.execute_script("return [...document.querySelectorAll('.cuts img[src]')].map(e => e.src)"))
+
+
+@needs_browser
+def test_two_results_side_by_side_move_together(browser, server):
+    from selenium.webdriver.common.keys import Keys
+
+    visit(browser, server)
+    wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 3")
+    assert text(browser, ".tabled tr.chosen td") == "Tikhonov"
+    assert browser.execute_script("return document.querySelectorAll('main b i, main th b').length") == 0
+    before = pictures(browser)
+    browser.find_element("css selector", "[role=switch]").click()
+    wait_for(browser, f"return document.querySelector('.cuts img').src !== {before[0]!r}")
+    assert "Standard deviation" in text(browser, ".bars figcaption")
+    browser.find_element("css selector", "[role=switch]").click()
+    pick(browser, "Compare with", "results/other")
+    wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 9")
+    assert "20 × 19 × 16 voxels" in text(browser, "main [aria-live=polite] .note")
+    said = browser.execute_script("return [...document.querySelectorAll('.bars figcaption')].map(e => e.textContent)")
+    assert said == ["results/a <b> and results/other", "results/other minus results/a <b>"]
+    before = pictures(browser)
+    slider = browser.find_element("css selector", "input[aria-label='Slice across z']")
+    slider.send_keys(Keys.RIGHT * 3)
+    alt = "document.querySelector('.cuts img').alt"
+    wait_for(browser, f"return /z = 8.75 mm/.test({alt})")
+    after = pictures(browser)
+    assert [a != b for a, b in zip(after, before, strict=True)] == [True] * 3 + [False] * 6
+    assert errors(browser) == []
+    here = f"http://127.0.0.1:{server.port}/", f"ws://127.0.0.1:{server.port}/"
+    assert [address for address in requests(browser) if not address.startswith(here)] == []
+
+
+@needs_browser
+def test_surface_report_and_export(browser, server, folder):
+    visit(browser, server)  # what was chosen before is still there
+    wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 9")
+    tab(browser, "In 3-D")
+    wait_for(browser, "return document.querySelectorAll('.legend li').length === 2")
+    wait_for(browser, "return document.querySelector('.surface canvas') !== null")
+    tab(browser, "Report")
+    wait_for(browser, "return document.querySelector('iframe.report') !== null")
+    browser.switch_to.frame(browser.find_element("css selector", "iframe.report"))
+    wait_for(browser, "return document.querySelector('#said')?.textContent.split(' ').length > 3")
+    assert text(browser, "#said") == "run kept out refused"
+    browser.switch_to.default_content()
+    surfaces = [address for address in requests(browser) if "/surface?" in address]
+    assert len(surfaces) == 2
+    for address in surfaces:
+        status, headers, _ = server.get(address.partition(str(server.port))[2], {"Cookie": server.cookie()})
+        assert (status, headers["content-type"]) == (200, "model/stl")
+    tab(browser, "Export")
+    wait_for(browser, "return document.querySelector('input[name=voxels]')?.offsetParent")
+    pick(browser, "Format", "NetCDF")
+    wait_for(browser, "return document.querySelector('.command code').textContent.includes('.nc')")
+    assert line(browser) == ["nerif", "export", "results/a <b>", "-o", "exports/a <b>.nc"]
+    browser.find_element("xpath", "//button[contains(., 'Export')]").click()
+    jobs = Jobs(folder)
+    wait_for(browser, "return /Runs/.test(document.querySelector('header').textContent)")
+    for _ in range(400):
+        if jobs.all() and jobs.all()[0].state == "done":
+            break
+        wait_for(browser, "return true")
+        browser.execute_async_script("setTimeout(arguments[0], 50)")
+    assert shlex.split(jobs.all()[0].line) == ["nerif", "export", "results/a <b>", "-o", "exports/a <b>.nc"]
+    assert read_volumes(folder / "exports" / "a <b>.nc")["density"].grid.box == BOX
+
+
+@needs_browser
+def test_a_film_is_moved_through_time(browser, server):
+    from selenium.webdriver.common.keys import Keys
+
+    visit(browser, server)
+    browser.find_element("xpath", "//button[@aria-label='Show film.zarr']").click()
+    wait_for(browser, "return document.querySelector('.tabled tr.chosen')?.textContent.includes('film')")
+    tab(browser, "Slices")
+    wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 3")
+    before = pictures(browser)
+    browser.find_element("css selector", "input[aria-label=Time]").send_keys(Keys.RIGHT * 2)
+    wait_for(browser, "return document.querySelector('.time b').textContent === '2 ms (frame 3)'")
+    wait_for(browser, f"return document.querySelector('.cuts img').src !== {before[0]!r}")
+    browser.find_element("xpath", "//button[@aria-label='Play or halt the film']").click()
+    wait_for(browser, "return document.querySelector('.time b').textContent === '0 ms (frame 1)'")
+    browser.find_element("xpath", "//button[@aria-label='Play or halt the film']").click()
+    assert errors(browser) == []
+
+
+def test_reports_and_surfaces_come_from_the_folder_alone(server):
+    cookie = {"Cookie": server.cookie()}
+    status, headers, answer = server.get("/report?of=results/a%20%3Cb%3E", cookie)
+    assert (status, answer) == (200, REPORT)
+    assert headers["content-security-policy"].startswith("sandbox allow-scripts allow-downloads; default-src 'none'")
+    assert server.get("/report?of=results/a%20%3Cb%3E")[0] == 403
+    for asked in ("/report?of=../x", "/report?of=results", "/report?of=%00", "/surface?of=/etc&quantity=n"):
+        assert server.get(asked, cookie)[0] == 404
+    assert server.get("/surface?of=film.zarr&quantity=index_excess&level=x", cookie)[0] == 404
