@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from nerif.app.jobs import Job, Jobs, command_line
+from nerif.app.jobs_drawer import film_progress
+from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.json_file import write_json
 
@@ -116,7 +118,7 @@ def test_what_is_paused_goes_on_from_its_checkpoint(tmp_path, process):
     job = jobs.get(id)
     assert (job.state, job.line) == ("queued", "nerif reconstruct --resume --out r --live")
     other = jobs.add(HELP, "x")
-    with pytest.raises(InputError, match="only nerif reconstruct can be paused"):
+    with pytest.raises(InputError, match="only nerif reconstruct and sequence can be paused"):
         jobs.pause(other.id)
 
 
@@ -138,3 +140,42 @@ def test_damaged_files_are_no_runs(tmp_path):
     (bad / "job.json").write_text("{")
     assert jobs.all() == []
     assert os.listdir(bad) == ["job.json"]
+
+
+def test_waiting_runs_change_places(tmp_path):
+    jobs = Jobs(tmp_path)
+    ids = [jobs.add(HELP, str(i)).id for i in range(3)]
+    jobs.earlier(ids[2])
+    assert [job.title for job in jobs.all()] == ["0", "2", "1"]
+    jobs.later(ids[0])
+    assert [job.title for job in jobs.all()] == ["2", "0", "1"]
+    jobs.earlier(ids[2])  # the first already
+    jobs.later(ids[1])  # the last
+    assert [job.title for job in jobs.all()] == ["2", "0", "1"]
+    jobs.stop(ids[0])
+    assert [(job.title, job.state) for job in jobs.all()] == [("2", "queued"), ("1", "queued"), ("0", "stopped")]
+
+
+@pytest.mark.slow
+def test_a_film_is_paused_and_does_only_what_is_missing(tmp_path):
+    small = ["--image-size", "12", "16", "--pixel-pitch", "0.3", "--views", "4", "--truth-voxels", "8"]
+    assert main(["simulate", "-o", str(tmp_path / "f.zarr"), *small, "--times", "0:3e-3:4"]) == 0
+    jobs, out = Jobs(tmp_path), tmp_path / "r.zarr"
+    steps = ["--max-steps", "60", "--warm-steps", "20", "--chunk", "1", "--voxels", "8", "--force"]
+    line = ["sequence", "f.zarr", "--out", "r.zarr", "--workers", "1", "--threads", "1", *steps]
+    id = jobs.add(line, "film", "r.zarr").id
+    until(jobs, id, "running")
+    end = time.monotonic() + 120
+    while film_progress(out)[0] == 0:
+        assert time.monotonic() < end, jobs.log(id)
+        assert jobs.get(id).state in ("running", "queued"), jobs.log(id)
+        time.sleep(0.05)
+    jobs.pause(id)
+    job = until(jobs, id, "paused", "done", seconds=120)
+    before = film_progress(out)
+    jobs.resume(id)
+    if job.state == "paused":
+        assert "--force" not in jobs.get(id).attempt
+    until(jobs, id, "done", seconds=120)
+    assert before[0] > 0
+    assert film_progress(out) == (1.0, "4 of 4 frames")

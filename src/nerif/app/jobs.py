@@ -5,7 +5,8 @@ writes down: started.json and ended.json (runner.py). State is nowhere else.
 
     queued ─▶ running ─▶ done | failed | stopped
                  │
-                 └─▶ paused ─▶ queued ...          of nerif reconstruct: stopped, and gone on with by --resume
+                 └─▶ paused ─▶ queued ...          stopped, and gone on with: nerif reconstruct by --resume, nerif
+                                                  sequence by the same line, which does what is missing
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ __all__ = ["Job", "Jobs", "command_line"]
 
 LAUNCHED = "launched"
 CLOCK = 1.5  # seconds by which two readings of when a process was started may differ
-RESUMABLE = "reconstruct"
+RESUMABLE = ("reconstruct", "sequence")
 
 
 def command_line(arguments: Sequence[str]) -> str:
@@ -84,7 +85,7 @@ class Job:
     @property
     def resumable(self) -> bool:
         """Whether it can be paused: stopped, and gone on with later."""
-        return self.arguments[0] == RESUMABLE and bool(self.out)
+        return self.arguments[0] in RESUMABLE and bool(self.out)
 
 
 KEPT = ("id", "title", "arguments", "attempt", "folder", "out", "asked", "place")
@@ -151,7 +152,9 @@ class Jobs:
         if ended:
             job = replace(job, code=int(ended["code"]), started=started["time"], ended=ended["time"])
             over = {"pause": "paused", "stop": "stopped"}.get(job.asked, "done")
-            return replace(job, state=over if not job.code else "stopped" if job.asked else "failed")
+            if job.code and job.arguments[0] != "sequence":  # which ends by Ctrl-C in no other way
+                over = "stopped"
+            return replace(job, state=over if job.asked or not job.code else "failed")
         if started:
             job = replace(job, started=started["time"], pid=int(started["pid"]))
             if _alive(job.pid, started["began"]):
@@ -197,7 +200,9 @@ class Jobs:
             If it cannot be gone on with.
         """
         if not self.get(id).resumable:
-            raise InputError(f"job {id}: only nerif {RESUMABLE} can be paused; stop it and start it again")
+            raise InputError(
+                f"job {id}: only nerif {' and '.join(RESUMABLE)} can be paused; stop it and start it again"
+            )
         self._ask(id, "pause")
 
     def resume(self, id: str) -> None:
@@ -206,8 +211,10 @@ class Jobs:
         if job.state in ("queued", "running"):
             return
         attempt = job.arguments
-        if job.resumable and (self.folder / job.out / RUN).is_file():
-            attempt = (RESUMABLE, "--resume", "--out", job.out, *(("--live",) if "--live" in attempt else ()))
+        if job.arguments[0] == "sequence":
+            attempt = tuple(word for word in attempt if word != "--force")
+        elif job.resumable and (self.folder / job.out / RUN).is_file():
+            attempt = (job.arguments[0], "--resume", "--out", job.out, *(("--live",) if "--live" in attempt else ()))
         for name in (STARTED, ENDED, LAUNCHED):
             (self._of(job) / name).unlink(missing_ok=True)
         self._keep(replace(job, attempt=attempt, asked="", place=time.time()))
@@ -216,6 +223,23 @@ class Jobs:
         """Let a waiting run be the next."""
         job = self.get(id)
         self._keep(replace(job, place=min((j.place for j in self.all()), default=0.0) - 1))
+
+    def earlier(self, id: str) -> None:
+        """Let a waiting run change places with the one before it."""
+        self._swap(id, -1)
+
+    def later(self, id: str) -> None:
+        """Let a waiting run change places with the one after it."""
+        self._swap(id, 1)
+
+    def _swap(self, id: str, by: int) -> None:
+        waiting = [job for job in self.all() if job.state == "queued"]
+        at = next((i for i, job in enumerate(waiting) if job.id == id), None)
+        if at is None or not 0 <= at + by < len(waiting):
+            return
+        job, other = waiting[at], waiting[at + by]
+        self._keep(replace(job, place=other.place))
+        self._keep(replace(other, place=job.place))
 
     def remove(self, id: str) -> None:
         """Forget a run that has ended or waits; what it wrote stays.

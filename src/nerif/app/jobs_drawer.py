@@ -4,35 +4,56 @@ from __future__ import annotations
 
 import time
 from html import escape
+from pathlib import Path
 
 from nicegui import ui
 
 from nerif.app.jobs import Job
 from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
+from nerif.conventions import InputError
 from nerif.live import read_live
+from nerif.report.movie import frames_there
+from nerif.volume_sequence import VolumeSequence
 
-__all__ = ["JobsDrawer", "progress_of"]
+__all__ = ["JobsDrawer", "film_progress", "progress_of"]
 
 EVERY = 1.0  # seconds
 SHOWN = 30  # runs
 ACTIONS = {
     "running": ("pause", "stop"),
-    "queued": ("first", "stop"),
+    "queued": ("first", "earlier", "later", "stop"),
     "paused": ("resume", "stop", "remove"),
     "done": ("remove",),
     "failed": ("resume", "remove"),
     "stopped": ("resume", "remove"),
 }
-NAMES = {"pause": "Pause", "stop": "Stop", "resume": "Go on", "remove": "Forget", "first": "Next"}
+NAMES = {
+    "pause": "Pause", "stop": "Stop", "resume": "Go on", "remove": "Forget", "first": "Next", "earlier": "Earlier",
+    "later": "Later",
+}  # fmt: skip
 
 
 def progress_of(work: Workspace, job: Job) -> tuple[float, str]:
     """Return how far a run is, from 0 to 1, and what it is doing; of one that does not tell, 0 and nothing."""
+    if job.out.endswith(".zarr") and job.state in ("running", "paused"):
+        return film_progress(work.project.path(job.out))
     live = read_live(work.project.path(job.out)) if job.out and job.state in ("running", "paused") else {}
     if not live or live["written"] < job.started:
         return 0.0, ""
     return float(live["progress"] or 0.0), str(live["title"])
+
+
+def film_progress(path: Path) -> tuple[float, str]:
+    """Return the share of the frames of a film that are done, and that in words; of a store not yet made, nothing."""
+    if not (path / "zarr.json").is_file():
+        return 0.0, ""
+    try:
+        store = VolumeSequence(path)
+    except InputError:  # just being made
+        return 0.0, ""
+    done, count = len(frames_there(store)), len(store)
+    return done / max(count, 1), f"{done} of {count} frames"
 
 
 class JobsDrawer:
@@ -93,9 +114,9 @@ class JobsDrawer:
             with ui.row().classes("gap-1"):
                 for action in ACTIONS[job.state]:
                     if action != "pause" or job.resumable:
-                        ui.button(NAMES[action], on_click=lambda a=action, i=job.id: self._do(a, i)).props(
-                            f'flat dense no-caps aria-label="{NAMES[action]}: {escape(job.title)}"'
-                        )
+                        name = "Cancel" if (action, job.state) == ("stop", "queued") else NAMES[action]
+                        button = ui.button(name, on_click=lambda a=action, i=job.id: self._do(a, i))
+                        button.props("flat dense no-caps").props["aria-label"] = f"{name}: {job.title}"
                 ui.button("Log", on_click=lambda i=job.id: self._log(i)).props("flat dense no-caps")
 
     async def _do(self, action: str, id: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from nicegui import ui
 
 from nerif.app.jobs import Job
+from nerif.app.jobs_drawer import film_progress
 from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.conventions import unit_shown
@@ -82,6 +83,12 @@ class LiveView:
 
     async def _show(self, job: Job) -> None:
         out = self.work.project.path(job.out)
+        if out.suffix == ".zarr":
+            share, title = await self.work.beside(film_progress, out)
+            self.told.set_content(told(job, {}, title))
+            self.bar.set_value(share)
+            self.chart.set_visibility(False)
+            return
         live, drawn = await self.work.beside(self._changed, out, job)
         self.told.set_content(told(job, live))
         self.bar.set_value(float(live.get("progress") or 0.0) if live else float(job.state == "done"))
@@ -109,15 +116,15 @@ def _stamp(path: Path) -> int:
     return path.stat().st_mtime_ns if path.is_file() else 0
 
 
-def told(job: Job, live: dict[str, Any]) -> str:
-    """Return in words, as HTML, what a run is doing."""
+def told(job: Job, live: dict[str, Any], title: str = "") -> str:
+    """Return in words, as HTML, what a run is doing; `title` says it of a film, which has no live.json."""
     words = {"done": "It has ended.", "paused": "Paused: its checkpoint is kept.", "queued": "It waits for its turn."}
     said = words.get(job.state, job.state.capitalize() + ".")
     if job.state == "running":
         said = {"stop": "Stopping after this step.", "pause": "Pausing after this step."}.get(job.asked, "It runs.")
-        if not live:
+        if not live and not title:
             said += " Nothing is told yet."
-    parts = [said]
+    parts = [said, title] if title else [said]
     if live:
         seconds, share = float(live["seconds"] or 0), float(live["progress"] or 0)
         parts.append(f"{live['title'].capitalize()}: step {live['step']}, {seconds:.0f} s")

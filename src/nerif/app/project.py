@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -90,11 +90,11 @@ class Project:
         """Return a path in the folder relative to it, as the command line is given it."""
         return str(self.path(path).relative_to(self.folder))
 
-    def free_name(self, stem: str) -> str:
-        """Return the first of stem, stem-2, stem-3, ... that is not there."""
+    def free_name(self, stem: str, taken: Collection[str] = ()) -> str:
+        """Return the first of stem, stem-2, stem-3, ... that is not there, nor among the names `taken`."""
         first, ending = os.path.splitext(stem)
         names = (stem if i == 1 else f"{first}-{i}{ending}" for i in range(1, MANY))
-        return next(name for name in names if not self.path(name).exists())
+        return next(name for name in names if name not in taken and not self.path(name).exists())
 
     def views(self, experiment: str) -> tuple[View, ...]:
         """Return the views of a folder of pictures; InputError where there are none."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import tyro
@@ -17,6 +17,9 @@ from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals
 from nerif.app.workspace import Workspace
 from nerif.commands.methods import RECORDS, Reconstruct
+from nerif.commands.sequence import Sequence
+from nerif.conventions import InputError
+from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.trials import KINDS
 
@@ -24,6 +27,10 @@ __all__ = ["PAGE"]
 
 WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live")
 MAIN = ("time_limit", "hold_out", "uncertainty", "voxels")
+FILM = ".zarr"
+VALUES = {False: "values", True: "film_values"}  # of what is not a film, and of one
+FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine")
+FILM_MAIN = ("cluster", "workers", "chunk", "temporal", "hold_out", "voxels")
 LABELS = {
     "nerif": "NeRIF: a neural field", "tikhonov": "Tikhonov, on voxels", "landweber": "Landweber, on voxels",
     "tv": "Total variation, on voxels", "mlem": "MLEM, never negative", "mart": "MART, never negative",
@@ -38,16 +45,22 @@ def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
     return Form(record, without=WITHOUT, choices={"uncertainty": tuple(KINDS)})
 
 
+def form_of_film(preset_name: str) -> Form[Sequence]:
+    """Return the form of a film: where its frames are reconstructed, and how."""
+    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))
+    return Form(record, without=FILM_WITHOUT, choices={"temporal": ("frames", "joint")})
+
+
 class ReconstructPage:
     """The page in one tab."""
 
-    def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
+    def __init__(self, work: Workspace, measurements: Iterable[str]) -> None:
         self.work = work
         kept = work.draft(PAGE.name)
-        self.measurements = measurements
+        self.measurements = tuple(measurements)
         known = str(kept.get("measurement", ""))
         first = self.measurements[0] if self.measurements else None
-        self.values: dict[str, Any] = dict(kept.get("values", {}))
+        self.values: dict[str, dict[str, Any]] = {name: dict(kept.get(name, {})) for name in VALUES.values()}
         with ui.element("div").classes("columns"):
             with card("A run"), ui.element("div").classes("form"):
                 if not self.measurements:
@@ -78,22 +91,39 @@ class ReconstructPage:
             self.out.set_value(self._free())
             self._build_form()
 
+    @property
+    def film(self) -> bool:
+        """Whether what is chosen has many instants."""
+        return bool(self.measurement.value) and self.measurement.value.endswith(FILM)
+
     def _free(self) -> str:
         stem = PurePosixPath(self.measurement.value or "run").stem
-        return self.work.project.free_name(f"results/{stem}-{self.method.value}")
+        taken = [job.out for job in self.work.jobs.all()]
+        ending = FILM if self.film else f"-{self.method.value}"
+        return self.work.project.free_name(f"results/{stem}{ending}", taken)
 
     def _build_form(self) -> None:
-        form = form_of(self.method.value, self.preset.value)
-        self.preset.set_visibility(self.method.value == "nerif")
+        form: Form[Any] = form_of(self.method.value, self.preset.value)
+        if self.film:
+            form = form_of_film(self.preset.value)
+        self.method.set_visibility(not self.film)
+        self.preset.set_visibility(self.film or self.method.value == "nerif")
+        self.out.props["label"] = "Result (.zarr)" if self.film else "Result directory"
+        self.out.update()
         self.place.clear()
         names = {f.name for f in form.fields}
+        main = [name for name in (FILM_MAIN if self.film else MAIN) if name in names]
         with self.place:
-            self.view = FormView(form, self._show, self.values, [name for name in MAIN if name in names])
+            self.view = FormView(form, self._show, self.values[VALUES[self.film]], main)
         self._show()
 
     def arguments(self) -> list[str]:
         """Return the arguments of nerif that the page is set to."""
-        words = ["reconstruct", self.measurement.value or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
+        verb = "sequence" if self.film else "reconstruct"
+        words = [verb, self.measurement.value or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
+        if self.film:
+            chosen = ["--preset", self.preset.value] if self.preset.value != "auto" else []
+            return [*words, *chosen, *self.view.arguments]
         if self.method.value != "nerif":
             words += ["--method", self.method.value]
         elif self.preset.value != "auto":
@@ -101,9 +131,9 @@ class ReconstructPage:
         return [*words, *self.view.arguments, "--live"]
 
     def _show(self) -> None:
-        self.values = dict(self.view.values)
+        self.values[VALUES[self.film]] = dict(self.view.values)
         kept = {name: getattr(self, name).value for name in ("measurement", "method", "preset")}
-        self.work.keep(PAGE.name, {**kept, "values": self.values})
+        self.work.keep(PAGE.name, {**kept, **self.values})
         self.command.show(self.arguments())
         self.start.set_enabled(bool(self.measurement.value and self.out.value) and self.view.right)
 
@@ -114,14 +144,30 @@ class ReconstructPage:
             out = self.work.project.relative(self.out.value)
             job = self.work.jobs.add(self.arguments(), f"{self.measurement.value} → {out}", out)
             (self.work.project.folder / out).parent.mkdir(parents=True, exist_ok=True)
-            self.out.set_value(self.work.project.free_name(out + "-2"))
+            self.out.set_value(self._free())
             self.live.follow(job.id)
 
 
 async def build(work: Workspace) -> None:
     """Build the page."""
     found = await work.beside(work.project.contents)
-    ReconstructPage(work, found.measurements)
+    films = [name for name in found.films if await work.beside(_measured, work, name)]
+    ReconstructPage(work, (*found.measurements, *films))
+
+
+def _measured(work: Workspace, name: str) -> bool:
+    """Whether a store over time holds measurements."""
+
+    def read(path: Path) -> bool:
+        try:
+            return len(MeasurementSequence.read(path.parent)) > 0
+        except InputError:
+            return False
+
+    try:
+        return work.project.cached(f"{name}/zarr.json", "measured", read)
+    except FileNotFoundError:  # just being made, or none of ours
+        return False
 
 
 ABOUT = "The field behind a measurement, watched while it is found."
