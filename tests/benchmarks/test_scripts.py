@@ -21,6 +21,7 @@ SMALLEST = {
     "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5 --joint 5",
     "verdicts": "--cases 1 --method tv",
     "voxel_cost": "--voxels 8 --basis linear --iterations 1 --pixels 12",
+    "watching": "--pixels 12 --seconds 3 --turns 1",
     "warm_start": "--pixels 12 --seconds 8 --voxels 12 --fit-steps 5",
 }
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in ("abel_peers", "bench", "spoiling"))
