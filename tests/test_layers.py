@@ -25,7 +25,7 @@ LAYERS = (
     ("alignment", "metrics", "residuals", "resampling", "resolution", "simulation", "rendering"),
     ("experiment", "particles"),
     ("reconstruction",),
-    ("result", "monitor"),
+    ("result", "glance", "monitor"),
     (
         "prediction", "halves", "evaluation", "consistency", "rig_check", "mistakes", "quick_views", "symptoms",
         "gains", "verdict",

@@ -321,33 +321,6 @@ class ResultDirectory:
             missing=tuple(missing),
         )
 
-    def glance(self) -> Result:
-        """Read what a verdict rests on: settings, figures, and the volumes where there are standard deviations.
-
-        Views and curves are left out, which makes it quick for a list of many results.
-        """
-        missing: list[Missing] = []
-        run: dict[str, Any] = {}
-        metrics: dict[str, Any] = {}
-        volumes: dict[str, Volume] = {}
-        try:
-            run = self.settings()
-            metrics = self.metrics() if self.has(METRICS) else {}
-            if {"uncertainty", "ensemble"} & set(metrics) and self.has(VOLUME):
-                volumes = self.volumes()
-        except UNREADABLE as error:
-            missing.append(Missing(RUN, " ".join(str(error).split())))
-        if not self.has(FIELD):
-            missing.append(Missing(FIELD, f"The run has not ended: there is no {FIELD}."))
-        return Result(
-            directory=self.path,
-            settings={k: v for k, v in run.items() if k != "about"},
-            about=run.get("about", {}),
-            metrics=metrics,
-            volumes=volumes,
-            missing=tuple(missing),
-        )
-
     def _truth(self, metrics: dict[str, Any], volumes: dict[str, Volume], missing: list[Missing]) -> Volume | None:
         """The truth it was compared with: where it was then, or beside the result if both have moved."""
         path = metrics.get("truth")

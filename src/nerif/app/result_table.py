@@ -11,10 +11,11 @@ from nicegui import ui
 from nerif.app.project import Contents, Project
 from nerif.conventions import InputError
 from nerif.evaluation import rms_text
+from nerif.glance import glance
 from nerif.reconstruction.files import FIELD
 from nerif.report.movie import frames_there
 from nerif.report.summary import trust_figures
-from nerif.result import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
+from nerif.result import LIVE, METRICS, RUN, VOLUME, Result
 from nerif.verdict import verdict
 from nerif.volume_sequence import VolumeSequence
 
@@ -56,7 +57,7 @@ def _cached(project: Project, name: str) -> Row:
     """A row, read anew when the file that was written last among those it rests on has changed."""
     there = [n for n in (METRICS, FIELD, RUN, LIVE, VOLUME) if (project.path(name) / n).is_file()]
     last = max(there, key=lambda n: (project.path(name) / n).stat().st_mtime_ns)
-    return project.cached(f"{name}/{last}", "row", lambda _: _of(name, ResultDirectory(project.path(name)).glance()))
+    return project.cached(f"{name}/{last}", "row", lambda _: _of(name, glance(project.path(name))))
 
 
 def _of(name: str, result: Result) -> Row:
