@@ -50,6 +50,9 @@ class Calibrate(Settings):
     """The target laid on the backgrounds is the same one printed this many times larger."""
     views: tuple[str, ...] = ()
     """Only these views; with --simple and a picture, what its view is called (default: camera)."""
+    leave_out: tuple[str, ...] = ()
+    """Target pictures that are not used: cam1/target/7 is pose 7 of view cam1, cam1/background/2 one that lies on its
+    background. NAME.toml tells their errors under these names."""
     simple: bool = False
     """One camera from distances, no target: its frame has z along the axis of the flow, y away from the camera."""
     rig: Annotated[SimpleRig, Flat] = field(default_factory=SimpleRig)
@@ -127,7 +130,7 @@ def _calibrate(settings: Calibrate) -> Calibration:
     with counting_bar("looking for targets", target_pictures(views)) as bar:
         return calibrate_views(
             views, settings.target, settings.method, settings.background_scale,
-            settings.taken_over.background_distance, say, lambda: bar(next(count)),
+            settings.taken_over.background_distance, say, lambda: bar(next(count)), settings.leave_out,
         )  # fmt: skip
 
 

@@ -21,11 +21,13 @@ from nerif.imaging.calibration_result import Calibration
 from nerif.imaging.first_guess import first_guess
 from nerif.imaging.targets import CalibrationTarget, ViewPictures
 from nerif.imaging.telecentric_guess import mirrored
-from nerif.imaging.views import View, find_targets
+from nerif.imaging.views import View, find_targets, pose_names
+from nerif.toml import check_known
 
 __all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_pictures"]
 
 ON_A_SIDE = 0.1  # of a unit vector towards a camera: what it has to be more on one side than its mirror image
+FREE_OR_LAID = ("target", "background")
 GUESSED_NOISE, LEAST_NOISE = 0.1, 1e-4  # px, of a point: before it is known, and what nothing is better than
 
 
@@ -93,6 +95,7 @@ def calibrate_views(
     background_distance: float | None = None,
     say: Callable[[str], None] = lambda text: None,
     on_picture: Callable[[], None] = lambda: None,
+    leave_out: Sequence[str] = (),
 ) -> Calibration:
     """Find a target in the pictures of all views, and calibrate their cameras by it.
 
@@ -105,22 +108,25 @@ def calibrate_views(
     background_distance : as `calibrate`
     say : told of pictures that are of no use
     on_picture : called after each picture (`target_pictures` of them in all)
+    leave_out : pictures that are not used, such as cam1/target/7 or cam1/background/2: view, source and pose
 
     Raises
     ------
     InputError
-        If pictures are missing, or as `calibrate`.
+        If pictures are missing, one to be left out is none of them, or as `calibrate`.
     """
     laid = target.scaled(background_scale)
     settings.check_names([view.name for view in views])
     target_pictures(views)  # what is missing is said before the long work
-    found = [find_targets(view, target, say, on_picture, laid) for view in views]
+    there = [f"{v.name}/{s}/{p}" for v in views for s in FREE_OR_LAID if s in v.sources for p in pose_names(v.open(s))]
+    check_known(leave_out, there, "leave_out", "picture")
+    found = [find_targets(view, target, say, on_picture, laid).without(leave_out) for view in views]
     return calibrate(found, settings, background_distance)
 
 
 def target_pictures(views: Sequence[View]) -> int:
     """Return how many pictures of the target, in space and on the background, the views have."""
-    return sum(len(view.open(s)) for view in views for s in ("target", "background") if s in ("target", *view.sources))
+    return sum(len(view.open(s)) for view in views for s in FREE_OR_LAID if s in ("target", *view.sources))
 
 
 def calibrate(

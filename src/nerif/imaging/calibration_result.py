@@ -36,6 +36,11 @@ class ImageError:
     used: bool
     background: bool
 
+    @property
+    def name(self) -> str:
+        """Name of the picture, such as cam1/target/7."""
+        return f"{self.camera}/{'background' if self.background else 'target'}/{self.picture}"
+
 
 @dataclass(frozen=True)
 class FittedPlane:
@@ -235,6 +240,7 @@ class Calibration:
             "sigma_rotation_deg": dict(zip(self.names, self.sigma_rotation.tolist(), strict=True)),
             "sigma_translation_mm": dict(zip(self.names, self.sigma_translation.tolist(), strict=True)),
             "notes": list(self.notes),
+            "picture": [{"name": e.name, "rms_px": e.rms, "points": e.points, "used": e.used} for e in self.errors],
         }
         write_cameras(path, self.cameras, about, box)
 

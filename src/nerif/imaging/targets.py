@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -51,6 +51,14 @@ class ViewPictures:
     size: tuple[int, int]
     poses: Mapping[str, Detection]
     background: Mapping[str, Detection]
+
+    def without(self, names: Collection[str]) -> ViewPictures:
+        """Return what was found but for the pictures of these names."""
+        poses, background = (
+            {pose: d for pose, d in found.items() if f"{self.name}/{source}/{pose}" not in names}
+            for source, found in (("target", self.poses), ("background", self.background))
+        )
+        return replace(self, poses=poses, background=background)
 
 
 @dataclass(frozen=True)

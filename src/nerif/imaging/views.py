@@ -36,7 +36,7 @@ from nerif.imaging.readers import open_frames
 from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
 from nerif.toml import check_known, read_toml
 
-__all__ = ["SOURCES", "Pictures", "View", "find_targets", "find_views", "good_pictures"]
+__all__ = ["SOURCES", "Pictures", "View", "find_targets", "find_views", "good_pictures", "pose_names"]
 
 SOURCES = ("target", "background", "reference", "flow", "mask", "region")
 """What a view may have: target pictures, the target on the background, pictures without and with flow, drawn masks."""
@@ -259,7 +259,7 @@ def find_targets(
                 view.open(source)  # says what is missing
             continue
         frames = view.open(source)
-        keys = _pose_keys([frames.name(i) for i in range(len(frames))])
+        keys = pose_names(frames)
         for i, image in read_each(frames, range(len(frames))):
             if isinstance(image, InputError):
                 say(f"left out: {image}")
@@ -279,6 +279,11 @@ def find_targets(
             else:
                 found[source][keys[i]] = detection
     return ViewPictures(view.name, size, found["target"], found["background"])
+
+
+def pose_names(frames: Frames) -> list[str]:
+    """Return the names of the poses that pictures of a target show: see find_targets."""
+    return _pose_keys([frames.name(i) for i in range(len(frames))])
 
 
 def _pose_keys(names: list[str]) -> list[str]:

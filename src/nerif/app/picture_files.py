@@ -1,0 +1,64 @@
+"""Pictures of a project as a page shows them: looks and small pictures, kept until their files change."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from nerif.app.project import Project
+from nerif.conventions import InputError
+from nerif.imaging.crop import Crop
+from nerif.imaging.picture_looks import SourceLook, address_of, look_at
+from nerif.imaging.views import View
+
+__all__ = ["PictureFiles"]
+
+MOST = 400  # entries that are kept
+
+
+class PictureFiles:
+    """What is shown of the pictures of one project.
+
+    Parameters
+    ----------
+    project : Project
+    """
+
+    def __init__(self, project: Project) -> None:
+        self.project = project
+        self._kept: dict[tuple[Any, ...], Any] = {}
+
+    def stamp(self, view: View, source: str) -> tuple[Any, ...]:
+        """Return what changes with the files of a source."""
+        name = view.sources.get(source, "")
+        path = view.folder / name
+        where = path if path.exists() else path.parent
+        if not where.resolve().is_relative_to(self.project.folder):
+            raise InputError(f"{name}: expected pictures in {self.project.folder}, got some outside of it")
+        found = [os.stat(where), *(entry.stat() for entry in os.scandir(where))] if where.is_dir() else [os.stat(where)]
+        return len(found), max(f.st_mtime_ns for f in found), sum(f.st_size for f in found)
+
+    def look(self, view: View, source: str, most: int) -> SourceLook:
+        """Return how the pictures of a source are; InputError where there are none of use."""
+        return self._once(view, source, ("look", most), lambda: look_at(view, source, most))
+
+    def picture(self, view: View, source: str, number: int, largest: int, crop: Crop | None, white: float = 0.0) -> str:
+        """Return a picture in a data address: of a frame, or of the part that `crop` leaves of it."""
+
+        def read() -> str:
+            frames = view.open(source)
+            image = frames[number]
+            return address_of(crop(image, frames.name(number)) if crop else image, largest, white)
+
+        return self._once(view, source, ("picture", number, largest, crop, white), read)
+
+    def _once(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
+        key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, what
+        stamp = self.stamp(view, source) if source in view.sources else ()
+        kept = self._kept.get(key)
+        if kept is None or kept[0] != stamp:
+            if len(self._kept) > MOST:
+                self._kept.clear()
+            kept = self._kept[key] = (stamp, read())
+        return kept[1]
