@@ -10,6 +10,7 @@ from nerif.app.project import Project
 from nerif.conventions import InputError
 from nerif.imaging.crop import Crop
 from nerif.imaging.picture_looks import SourceLook, address_of, look_at
+from nerif.imaging.targets import CalibrationTarget, Detection
 from nerif.imaging.views import View
 
 __all__ = ["PictureFiles"]
@@ -52,6 +53,15 @@ class PictureFiles:
             return address_of(crop(image, frames.name(number)) if crop else image, largest, white)
 
         return self._once(view, source, ("picture", number, largest, crop, white), read)
+
+    def found(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
+        """Return what is found of a target in a picture; None if it is not found."""
+
+        def read() -> Detection | None:
+            frames = view.open(source)
+            return target.detect(view.cropped(frames[number], frames.name(number)))
+
+        return self._once(view, source, ("found", number, target), read)
 
     def _once(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
         key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, what

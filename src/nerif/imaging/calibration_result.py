@@ -15,8 +15,9 @@ from nerif.conventions import InputError
 from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
 from nerif.imaging.bundle import Bundle, Observation, Pose, crossing
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
+from nerif.toml import read_toml
 
-__all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError"]
+__all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "rms_of"]
 
 MOUNT = 0.05, 0.005
 """How far a camera may have been moved (mm) and turned (degrees) since it was calibrated, where nobody says."""
@@ -40,6 +41,35 @@ class ImageError:
     def name(self) -> str:
         """Name of the picture, such as cam1/target/7."""
         return f"{self.camera}/{'background' if self.background else 'target'}/{self.picture}"
+
+
+def rms_of(errors: Sequence[ImageError]) -> float:
+    """Return the rms reprojection error over the points of the pictures that were used, px."""
+    used = [e for e in errors if e.used]
+    return float(np.sqrt(np.average([e.rms**2 for e in used], weights=[e.points for e in used])))
+
+
+def read_errors(path: str | os.PathLike[str]) -> tuple[ImageError, ...]:
+    """Read the errors of the pictures that a calibration file was made from; none where it does not tell them.
+
+    Raises
+    ------
+    InputError
+        If it is missing, no TOML, or its [[about.picture]] are not as nerif calibrate writes them.
+    """
+    table = read_toml(path, "file; expected a calibration")
+    about = table.get("about")
+    errors = []
+    for entry in (about.get("picture") or []) if isinstance(about, dict) else []:
+        try:
+            camera, source, picture = str(entry["name"]).rsplit("/", 2)
+            rms, points, used = float(entry["rms_px"]), int(entry["points"]), bool(entry["used"])
+        except (KeyError, TypeError, ValueError):
+            raise InputError(
+                f"{path}: expected about.picture with name, rms_px, points and used, got {entry!r}; calibrate again"
+            ) from None
+        errors.append(ImageError(camera, picture, rms, points, used, source == "background"))
+    return tuple(errors)
 
 
 @dataclass(frozen=True)
@@ -146,8 +176,7 @@ class Calibration:
 
     def rms(self, camera: str | None = None) -> float:
         """Rms reprojection error over the pictures used, of one camera or all, px."""
-        chosen = [e for e in self.errors if e.used and camera in (None, e.camera)]
-        return float(np.sqrt(np.average([e.rms**2 for e in chosen], weights=[e.points for e in chosen])))
+        return rms_of([e for e in self.errors if camera in (None, e.camera)])
 
     @property
     def cameras(self) -> tuple[CalibratedCamera, ...]:

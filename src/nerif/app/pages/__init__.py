@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from nerif.app.pages import design, pictures, reconstruct, results
+from nerif.app.pages import calibration, design, pictures, reconstruct, results
 from nerif.app.pages.page import Page
 
 __all__ = ["PAGES", "Page"]
 
-PAGES: tuple[Page, ...] = (design.PAGE, pictures.PAGE, reconstruct.PAGE, results.PAGE)
+PAGES: tuple[Page, ...] = (design.PAGE, pictures.PAGE, calibration.PAGE, reconstruct.PAGE, results.PAGE)

@@ -1,0 +1,287 @@
+"""Calibration: cameras from pictures of a target, or one from a ruler; what was found, how well it fits, the rig."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import tyro
+from nicegui import ui
+
+from nerif.app.form_view import FormView
+from nerif.app.forms import Form
+from nerif.app.pages.page import Page
+from nerif.app.picture_files import PictureFiles
+from nerif.app.pieces import CommandLine, card, refusals, text_html
+from nerif.app.project import Contents
+from nerif.app.rig_scene import read_rig, show_rig
+from nerif.app.target_pictures import TargetPictures
+from nerif.app.workspace import Workspace
+from nerif.commands.calibrate import Calibrate
+from nerif.commands.settings import merge
+from nerif.conventions import InputError
+from nerif.imaging.calibration_result import ImageError
+from nerif.imaging.simple_rig import SimpleRig
+from nerif.imaging.targets import KINDS
+from nerif.imaging.views import View
+from nerif.toml import read_toml
+
+__all__ = ["PAGE"]
+
+RULER = tuple(f.name for f in fields(SimpleRig))
+BY_PAGE = ("config", "source", "out", "check", "simple", "force", "leave_out")
+MAIN = ("target.kind", "target.columns", "target.rows", "target.pitch", "background_scale", "world")
+SIMPLE = ("distance", "mm_per_px", "background_distance", "axis_from", "axis_to", "f_number", "focal_length",
+          "pixel_pitch_um", "principal_point", "lower", "upper", "views")  # fmt: skip
+SIMPLE_MAIN = SIMPLE[:3]
+SETTINGS = "calibrate.toml"
+WAYS = {False: "Pictures of a target", True: "A ruler: one camera, no target"}
+EVERY = 0.7  # seconds
+
+
+def form_of(simple: bool, settings: dict[str, Any] | None = None) -> Form[Calibrate]:
+    """Return the form of one of the two ways; its defaults are those of a file of settings, if there is one."""
+    record = Calibrate(tyro.MISSING)
+    if simple:
+        return Form(record, only=SIMPLE)
+    record = merge(record, settings or {}, SETTINGS)
+    choices = {"target.kind": KINDS, "projection": ("perspective", "telecentric")}
+    return Form(record, without=(*BY_PAGE, *RULER), choices=choices)
+
+
+class CalibrationPage:
+    """The page in one tab."""
+
+    def __init__(self, work: Workspace, found: Contents) -> None:
+        self.work, self.found, self.files = work, found, PictureFiles(work.project)
+        kept = work.draft(PAGE.name)
+        self.kept = dict(kept)
+        self.left_out: dict[str, list[str]] = {k: list(v) for k, v in kept.get("leave_out", {}).items()}
+        self.values: dict[str, dict[str, Any]] = {name: dict(kept.get(name, {})) for name in ("target", "ruler")}
+        self.views: dict[str, View] = {}
+        self.errors: dict[str, ImageError] = {}
+        self.shown: tuple[Any, ...] = ()
+        self.job = str(kept.get("job", ""))
+        experiments = list(found.experiments)
+        known = kept.get("experiment")
+        with ui.element("div").classes("columns"):
+            with card("Calibrate"), ui.element("div").classes("form"):
+                if not experiments:
+                    text_html("There are no pictures in this folder yet; the page Pictures says where they go.")
+                first = known if known in experiments else next(iter(experiments), None)
+                self.experiment = self._select("Experiment", experiments, first)
+                self.way = self._select("From", WAYS, bool(kept.get("simple", False)))
+                self.out = ui.input("Calibration to write", value=str(kept.get("out", "calibration.toml")))
+                self.out.props("outlined dense debounce=250").props["aria-label"] = "Calibration to write"
+                self.out.on_value_change(self._show)
+                self.note = ui.html("", sanitize=False)
+                self.place = ui.element("div").classes("form")
+                self.start = ui.button("Calibrate", icon="play_arrow", on_click=self._start)
+                self.start.props("unelevated no-caps")
+            with ui.element("div").classes("stack"):
+                with card("The same on the command line"):
+                    self.command = CommandLine()
+                    self.told = ui.element("div").props("role=status aria-live=polite")
+                with card("The rig"):
+                    self.calibration = self._select("Calibration", list(found.calibrations), None)
+                    self.rig = ui.element("div")
+                with card("Pictures of the target", "Circles: points found, the first one filled. What is left out is "
+                          "part of the command line; calibrate again after it."):  # fmt: skip
+                    self.view = self._select("View", [], None)
+                    self.pictures = TargetPictures(work, self.files, self._toggled)
+
+    def _select(self, label: str, options: Any, value: Any) -> ui.select:
+        select = ui.select(options, label=label, value=value).props("outlined dense options-dense").classes("short")
+        select.props["aria-label"] = label
+        return select
+
+    # -- the form ------------------------------------------------------------------------------------------------
+
+    async def build(self) -> None:
+        """Fill the page, and listen."""
+        await self._turned()
+        await self._choose_calibration()
+        self.experiment.on_value_change(self._turned)
+        self.way.on_value_change(self._turned)
+        self.calibration.on_value_change(self._draw)
+        self.view.on_value_change(self._pictures)
+        await self._draw()
+        await self._pictures()
+        ui.timer(EVERY, self._follow)
+
+    @property
+    def simple(self) -> bool:
+        """Whether one camera comes from a ruler."""
+        return bool(self.way.value)
+
+    @property
+    def settings(self) -> str:
+        """The file of settings that lies beside the pictures, relative to the project; empty if there is none."""
+        name = f"{self.experiment.value}/{SETTINGS}"
+        there = self.experiment.value and not self.simple and self.work.project.path(name).is_file()
+        return name if there else ""
+
+    async def _turned(self) -> None:
+        """Another experiment, or another way."""
+        self.views = {}
+        if self.experiment.value:
+            with refusals():
+                found = await self.work.beside(self.work.project.views, self.experiment.value)
+                self.views = {view.name: view for view in found}
+        settings: dict[str, Any] = {}
+        if self.settings:
+            with refusals():
+                settings = read_toml(self.work.project.path(self.settings))
+        form = form_of(False)
+        with refusals():
+            form = form_of(self.simple, settings)
+        self.place.clear()
+        with self.place:
+            values = self.values["ruler" if self.simple else "target"]
+            self.form = FormView(form, self._show, values, SIMPLE_MAIN if self.simple else MAIN)
+        named = list(self.views)
+        kept = self.kept.get("view")
+        self.view.set_options(named, value=kept if kept in named else next(iter(named), None))
+        self._show()
+
+    @property
+    def left(self) -> list[str]:
+        """Names of the pictures of this experiment that are left out."""
+        return self.left_out.setdefault(self.experiment.value or "", [])
+
+    def arguments(self) -> list[str]:
+        """Return the arguments of nerif that the page is set to."""
+        words = ["calibrate", self.experiment.value or "FOLDER", "-o", self.out.value or "NAME.toml"]
+        words += ["--config", self.settings] if self.settings else []
+        words += ["--simple"] if self.simple else []
+        words += self.form.arguments
+        words += ["--leave-out", *self.left] if self.left and not self.simple else []
+        return [*words, "--force"] if self._exists() else words
+
+    def _exists(self) -> bool:
+        try:
+            return bool(self.out.value) and self.work.project.path(self.out.value).exists()
+        except InputError:  # outside of the folder: it is refused when it is started
+            return False
+
+    def _show(self) -> None:
+        if not hasattr(self, "form"):
+            return
+        self.values["ruler" if self.simple else "target"] = self.form.form.changed(self.form.values)
+        self.kept = {
+            "experiment": self.experiment.value, "simple": self.simple, "out": self.out.value, "view": self.view.value,
+            "leave_out": self.left_out, "job": self.job, "calibration": self.calibration.value, **self.values,
+        }  # fmt: skip
+        self.work.keep(PAGE.name, self.kept)
+        self.command.show(self.arguments())
+        notes = [f"Its settings are those of {self.settings}, but for what is changed here."] if self.settings else []
+        notes += [f"{self.out.value} is there; it is replaced."] if self._exists() else []
+        self.note.set_content("")
+        self.note.clear()
+        with self.note:
+            for text in notes:
+                text_html(text, classes="note")
+        self.start.set_enabled(bool(self.experiment.value and self.out.value) and self.form.right)
+
+    def _toggled(self, name: str) -> None:
+        left = self.left
+        if name in left:
+            left.remove(name)
+        else:
+            left.append(name)
+        self._show()
+
+    # -- the run -------------------------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        with refusals():
+            self.form.made()
+            self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
+            job = self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}")
+            self.job = job.id
+            self._show()
+            self._say("It waits in the queue.")
+
+    def _say(self, text: str, log: Sequence[str] = ()) -> None:
+        self.told.clear()
+        with self.told:
+            text_html(text, classes="told")
+            if log:
+                text_html("\n".join(log), "pre", "said")
+
+    async def _follow(self) -> None:
+        """Tell how the run goes; show what it wrote."""
+        if not self.job:
+            return
+        try:
+            job = await self.work.beside(self.work.jobs.get, self.job)
+        except InputError:  # forgotten in another tab
+            self.job = ""
+            return
+        if job.state in ("queued", "running"):
+            log = await self.work.beside(self.work.jobs.log, job.id, 1)
+            text = "It waits in the queue." if job.state == "queued" else "It runs."
+            if self.shown != (job.state, *log):
+                self.shown = (job.state, *log)
+                self._say(text, [line.rpartition("\r")[2] for line in log])
+            return
+        log = await self.work.beside(self.work.jobs.log, job.id, 30)
+        self.job = ""
+        said = {"done": "It is done.", "failed": "It failed; what it said:"}.get(job.state, "It was stopped.")
+        self._say(said, [line.rpartition("\r")[2] for line in log])
+        if job.state == "done":
+            self.found = await self.work.beside(self.work.project.contents)
+            wrote = job.arguments[job.arguments.index("-o") + 1]
+            await self._choose_calibration(wrote)
+            await self._draw()
+            await self._pictures()
+        self._show()
+
+    # -- what came out -------------------------------------------------------------------------------------------
+
+    async def _choose_calibration(self, name: str | None = None) -> None:
+        names = list(self.found.calibrations)
+        best = [n for n in (name, self.calibration.value, self.kept.get("calibration"), self.out.value) if n in names]
+        self.calibration.set_options(names, value=next(iter([*best, *names]), None))
+
+    async def _draw(self) -> None:
+        """Show the rig of the calibration that is chosen."""
+        self.errors = {}
+        self.rig.clear()
+        with self.rig:
+            if not self.calibration.value:
+                text_html("There is no calibration in this folder yet.", classes="note")
+                return
+            with refusals(_noted):
+                path = self.work.project.path(self.calibration.value)
+                rig = await self.work.beside(read_rig, path)
+                self.errors = {error.name: error for error in rig.errors}
+                show_rig(rig)
+        self._show()
+
+    async def _pictures(self) -> None:
+        """Show the pictures of the view that is chosen."""
+        view = self.views.get(self.view.value or "")
+        if view is None:
+            return
+        self._show()
+        with refusals():
+            made = self.form.made() if not self.simple else form_of(False).record
+            targets = {"target": made.target, "background": made.target.scaled(made.background_scale)}
+            await self.pictures.show(view, targets, self.errors, self.left)
+
+
+def _noted(text: str) -> None:
+    text_html(text, classes="note")
+
+
+async def build(work: Workspace) -> None:
+    """Build the page."""
+    page = CalibrationPage(work, await work.beside(work.project.contents))
+    with ui.element("div"):
+        ui.timer(0.01, page.build, once=True)  # the page is there before its pictures are looked through
+
+
+ABOUT = "Where the cameras stand and what they see, from pictures of a target or from a ruler."
+PAGE = Page("calibration", "Calibration", "/calibration", ABOUT, build)

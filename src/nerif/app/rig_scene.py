@@ -1,0 +1,122 @@
+"""The rig in 3-D, to be turned with the mouse: what cameras see, backgrounds, box; and a table of the cameras."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from nicegui import ui
+
+from nerif.conventions import InputError
+from nerif.geometry import Box, Camera
+from nerif.imaging.calibration_result import ImageError, read_errors, rms_of
+from nerif.imaging.importers import import_box, import_cameras
+from nerif.report.rig_figure import COLOURS, picture_corners
+
+__all__ = ["Rig", "read_rig", "show_rig"]
+
+SIZE = 5.0  # of the rig in the scene
+TIP = 0.18  # of the rig: length of the pyramid of a camera
+HEAD = ("Camera", "Picture [px]", "Focal length [px]", "Place x, y, z [mm]", "Pictures used", "rms [px]")
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A calibration file as it is shown.
+
+    Parameters
+    ----------
+    cameras : those that can be drawn
+    missing : what is not known of the others
+    box : or None
+    errors : of the pictures it was made from, none if the file does not tell them
+    """
+
+    cameras: tuple[Camera, ...]
+    missing: tuple[str, ...]
+    box: Box | None
+    errors: tuple[ImageError, ...]
+
+
+def read_rig(path: Path) -> Rig:
+    """Read a calibration file; InputError if it is none."""
+    cameras, missing = [], []
+    for camera in import_cameras(path):
+        try:
+            cameras.append(replace(camera, lens=None).camera())
+        except InputError as error:
+            missing.append(str(error))
+    return Rig(tuple(cameras), tuple(missing), import_box(path), read_errors(path))
+
+
+def show_rig(rig: Rig) -> None:
+    """Build the scene and the table."""
+    for text in rig.missing:
+        ui.html(f"<p class=note>{escape(text)}</p>", sanitize=False)
+    if not rig.cameras:
+        return
+    camera = ui.scene.perspective_camera(fov=38)
+    scene = ui.scene(width=1080, height=460, grid=False, camera=camera, background_color="#eef1f4")
+    scene.classes("surface").props('role=img aria-label="The rig; drag to turn, scroll to come nearer"')
+    middle = np.zeros(3) if rig.box is None else np.array(rig.box.centre)
+    seen = [picture_corners(c, middle) for c in rig.cameras]
+    points = np.concatenate([np.concatenate([s.start, s.end]) for s in seen] + [middle[None]])
+    centre, reach = (points.max(axis=0) + points.min(axis=0)) / 2, float(np.ptp(points, axis=0).max()) or 1.0
+    scale = SIZE / reach
+
+    def line(a: np.ndarray, b: np.ndarray, colour: str) -> None:
+        scene.line(((a - centre) * scale).tolist(), ((b - centre) * scale).tolist()).material(colour)
+
+    def outline(corners: np.ndarray, colour: str) -> None:
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            line(a, b, colour)
+
+    with scene:
+        for i, (one, corners) in enumerate(zip(rig.cameras, seen, strict=True)):
+            colour = COLOURS[i % len(COLOURS)]
+            tips = corners.start + TIP * reach * corners.direction
+            outline(tips, colour)
+            for start, tip in zip(corners.start, tips, strict=True):
+                line(start, tip, colour)
+            line(corners.start.mean(axis=0), corners.end.mean(axis=0), "#a9b3bc")
+            if one.background is not None:
+                outline(corners.end, colour)
+            at = (corners.start.mean(axis=0) - 0.04 * reach * corners.direction.mean(axis=0) - centre) * scale
+            style = f"color: #16202b; font: 600 13px system-ui; border-bottom: 3px solid {colour}"
+            scene.text(one.name, style=style).move(*at.tolist())
+        if rig.box is not None:
+            ends = np.array(list(itertools.product(*zip(rig.box.lower, rig.box.upper, strict=True))))
+            for a, b in itertools.combinations(ends, 2):
+                if np.count_nonzero(a != b) == 1:
+                    line(a, b, "#16202b")
+        for axis, colour in enumerate(("#c62828", "#2e7d32", "#1565c0")):
+            end = np.zeros(3)
+            end[axis] = 0.1 * reach
+            line(np.zeros(3), end, colour)
+            scene.text("xyz"[axis], style=f"color: {colour}; font: 700 13px system-ui").move(
+                *((1.15 * end - centre) * scale).tolist()
+            )
+    scene.move_camera(0.8 * SIZE, -1.05 * SIZE, 0.75 * SIZE, 0, 0, 0, duration=0)
+    ui.html(_table(rig.cameras, rig.errors), sanitize=False)
+
+
+def _table(cameras: Sequence[Camera], errors: Sequence[ImageError]) -> str:
+    rows = []
+    for camera in cameras:
+        own = [e for e in errors if e.camera == camera.name]
+        height, width = camera.image_size
+        used = f"{sum(e.used for e in own)} of {len(own)}" if own else "not told"
+        rms = f"{rms_of(own):.3f}" if any(e.used for e in own) else "not told"
+        place = ", ".join(f"{float(x):.1f}" for x in camera.centre)
+        cells = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
+        line = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+        rows.append(f"<tr><th scope=row>{escape(camera.name)}</th>{line}</tr>")
+    head = "".join(f"<th scope=col>{escape(title)}</th>" for title in HEAD)
+    return (
+        f"<div class=tabled tabindex=0 role=region aria-label=Cameras><table><thead><tr>{head}</tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )

@@ -1,0 +1,145 @@
+"""Pictures of the target of one view: the corners found in each, its error, and a button that leaves it out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from html import escape
+
+from nicegui import ui
+
+from nerif.app.picture_files import PictureFiles
+from nerif.app.pieces import text_html
+from nerif.app.workspace import Workspace
+from nerif.conventions import InputError
+from nerif.imaging.calibration_result import ImageError
+from nerif.imaging.targets import CalibrationTarget, Detection
+from nerif.imaging.views import View, pose_names
+
+__all__ = ["TargetPictures"]
+
+SOURCES = {"target": "In space", "background": "On the background"}
+LARGEST = 420  # px
+
+
+class TargetPictures:
+    """The pictures, where the page is being built.
+
+    Parameters
+    ----------
+    work : Workspace
+    files : of its project
+    toggled : told the name of a picture that is left out, or taken again
+    """
+
+    def __init__(self, work: Workspace, files: PictureFiles, toggled: Callable[[str], None]) -> None:
+        self.work, self.files, self._toggled = work, files, toggled
+        self._turn = 0
+        self._place = ui.element("div").classes("stack")
+
+    async def show(
+        self, view: View, targets: Mapping[str, CalibrationTarget], errors: Mapping[str, ImageError],
+        left_out: Collection[str],
+    ) -> None:  # fmt: skip
+        """Show the pictures of a view, one after the other; what is asked for later takes the place.
+
+        Parameters
+        ----------
+        view : of find_views
+        targets : to look for in the pictures in space and on the background
+        errors : by the name of the picture
+        left_out : names of pictures
+        """
+        self._turn += 1
+        turn = self._turn
+        self._place.clear()
+        for source, title in SOURCES.items():
+            if source not in view.sources:
+                with self._place:
+                    text_html(f"{title}: there is no {view.name}/{source}.", classes="note")
+                continue
+            try:
+                names = await self.work.beside(_poses, view, source)
+            except InputError as error:
+                with self._place:
+                    text_html(str(error), classes="note")
+                continue
+            if turn != self._turn:
+                return
+            with self._place, ui.element("div"):
+                text_html(title, "h3")
+                grid = ui.element("div").classes("targets")
+            for number, pose in enumerate(names):
+                name = f"{view.name}/{source}/{pose}"
+                try:
+                    address = await self.work.beside(self.files.picture, view, source, number, LARGEST, view.crop)
+                    found = await self.work.beside(self.files.found, view, source, number, targets[source])
+                    shape = await self.work.beside(self._shape, view, source)
+                except InputError as error:
+                    with grid:
+                        text_html(str(error), classes="missing note")
+                    continue
+                if turn != self._turn:
+                    return
+                with grid:
+                    self._cell(name, address, found, shape, errors.get(name), name in left_out)
+
+    def _shape(self, view: View, source: str) -> tuple[int, int]:
+        shape = view.open(source).shape
+        return view.crop.shape_of(shape) if view.crop else shape
+
+    def _cell(
+        self, name: str, address: str, found: Detection | None, shape: tuple[int, int], error: ImageError | None,
+        left_out: bool,
+    ) -> None:  # fmt: skip
+        with ui.element("div").classes("target left-out" if left_out else "target") as cell:
+            said = "no target found" if found is None else f"{len(found.points)} points found"
+            with ui.element("figure"):
+                ui.html(
+                    f'<span class=shot><img src="{address}" alt="{escape(f"{name}, {said}")}">'
+                    f"{_marks(found, shape)}</span><figcaption><b>{escape(name)}</b><br>{said}{_told(error)}"
+                    "</figcaption>", sanitize=False,
+                )  # fmt: skip
+            if found is None:
+                return
+            out = [left_out]
+            button = ui.button().props("outline no-caps dense")
+
+            def say() -> None:
+                text = "Take it again" if out[0] else "Leave it out"
+                button.set_text(text)
+                button.props["aria-label"] = f"{text}: {name}"
+                button.props["aria-pressed"] = "true" if out[0] else "false"
+                button.update()
+                cell.classes(replace="target left-out" if out[0] else "target")
+
+            def toggle() -> None:
+                out[0] = not out[0]
+                say()
+                self._toggled(name)
+
+            button.on_click(toggle)
+            say()
+
+
+def _poses(view: View, source: str) -> list[str]:
+    return pose_names(view.open(source))
+
+
+def _told(error: ImageError | None) -> str:
+    if error is None:
+        return ""
+    return f", rms <b>{error.rms:.3f} px</b>{'' if error.used else ', did not fit'}"
+
+
+def _marks(found: Detection | None, shape: tuple[int, int]) -> str:
+    """A circle around each point, that of the lowest number filled."""
+    if found is None:
+        return ""
+    height, width = shape
+    radius = 0.012 * max(shape)
+    first = int(found.ids.argmin())
+    circles = "".join(
+        f"<circle{' class=first' if i == first else ''} cx={u + 0.5:.2f} cy={v + 0.5:.2f} r={radius:.2f} />"
+        for i, (u, v) in enumerate(found.pixels)
+    )
+    return f"<svg viewBox='0 0 {width} {height}' preserveAspectRatio=none aria-hidden=true>{circles}</svg>"
