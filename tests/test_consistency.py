@@ -195,6 +195,51 @@ def test_binning_keeps_rays_and_displacements(clean):
     assert float(error) < 0.05 * float(truth.displacement.square().mean().sqrt())
 
 
+@pytest.mark.parametrize("name", ["mirrored", "exchanged"])
+def test_what_was_found_is_undone(clean, tmp_path, capsys, name):
+    """Values, sigma and masks are as they were, and a measurement without mistakes is not written again."""
+    mask = torch.rand(clean.usable.shape, generator=torch.Generator().manual_seed(0)) > 0.05
+    good = replace(clean, flow_mask=mask)
+    mistake = {"mirrored": mirrored(3), "exchanged": swapped(1, 4)}[name]
+    path, out = tmp_path / "m.nc", tmp_path / "corrected.nc"
+    mistake(good).write(path)
+    assert main(["check", str(path), "-o", str(out)]) == 0
+    found = Measurement.read(out)
+    torch.testing.assert_close(found.displacement, good.displacement.float())
+    torch.testing.assert_close(found.sigma, good.sigma.float())
+    assert torch.equal(found.flow_mask, mask)
+    assert main(["check", str(path), "-o", str(out)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main(["check", str(out), "-o", str(tmp_path / "again.nc")]) == 2
+    assert "nothing was found" in capsys.readouterr().err
+    assert not (tmp_path / "again.nc").exists()
+
+
+def mirrored(view: int):
+    """Everything that a view has, as of a picture that is mirrored left to right."""
+
+    def mistake(m: Measurement) -> Measurement:
+        maps = {"displacement": m.displacement.clone(), "sigma": m.sigma.clone(), "flow_mask": m.flow_mask.clone()}
+        for values in maps.values():
+            values[view] = values[view].flip(1)
+        maps["displacement"][view, ..., 0] *= -1
+        return replace(m, **maps)
+
+    return mistake
+
+
+def swapped(i: int, j: int):
+    """Everything that two views have, exchanged."""
+
+    def mistake(m: Measurement) -> Measurement:
+        maps = {"displacement": m.displacement.clone(), "sigma": m.sigma.clone(), "flow_mask": m.flow_mask.clone()}
+        for values in maps.values():
+            values[[i, j]] = values[[j, i]]
+        return replace(m, **maps)
+
+    return mistake
+
+
 def test_the_command_names_the_view(clean, tmp_path, capsys):
     path = tmp_path / "m.nc"
     spoilt(clean.select(clean.names[::2]), in_view(1, lambda d: -d)).write(path)

@@ -27,7 +27,7 @@ LAYERS = (
     ("reconstruction",),
     ("result", "glance", "monitor"),
     (
-        "prediction", "halves", "evaluation", "consistency", "rig_check", "mistakes", "quick_views", "symptoms",
+        "prediction", "halves", "evaluation", "consistency", "corrected", "rig_check", "mistakes", "quick_views", "symptoms",
         "gains", "verdict",
     ),
     ("kept_run", "members", "first_look", "live"),

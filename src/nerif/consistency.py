@@ -8,8 +8,8 @@ fits equally well either way cannot be found: a flipped sign of everything, a mi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -76,11 +76,13 @@ class Consistency:
     views : agreement of every view; empty if there are too few views to compare
     findings : mistakes, in words
     remarks : what a user should know besides
+    corrections : what undoes the mistakes that can be undone, of each technique by its name (`corrected`)
     """
 
     views: tuple[ViewAgreement, ...]
     findings: tuple[str, ...]
     remarks: tuple[str, ...]
+    corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
 
 
 def check_consistency(
@@ -107,13 +109,15 @@ def check_consistency(
     views: list[ViewAgreement] = []
     findings: list[str] = []
     remarks: list[str] = []
+    corrections: dict[str, tuple[Correction, ...]] = {}
     for observation in observations:
         own = _check(observation, measurement, voxels, on_step)
         of = f"{observation.technique.name}: " if several else ""
         views += own.views
+        corrections |= own.corrections
         findings += [of + finding for finding in own.findings]
         remarks += [of + remark for remark in own.remarks]
-    return Consistency(tuple(views), tuple(findings), tuple(remarks))
+    return Consistency(tuple(views), tuple(findings), tuple(remarks), corrections)
 
 
 def _check(
@@ -156,7 +160,8 @@ def _check(
         mean = float(everything.sample(Grid.of_resolution(small.box, voxels)).mean())
         gas = "lighter (hot gas, helium)" if mean < 0 else "denser (cold or heavy gas)"
         remarks.append(f"the flow comes out {gas} than the ambient; if that is wrong, every sign is flipped")
-    return Consistency(tuple(views), tuple(findings), tuple(remarks))
+    undone = {kind.name: tuple(found)} if found else {}
+    return Consistency(tuple(views), tuple(findings), tuple(remarks), undone)
 
 
 def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int, int], None]) -> Correction | None:

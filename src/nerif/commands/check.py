@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import MONITOR, counting_bar, say
+from nerif.commands.output import MONITOR, check_file, counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.consistency import Consistency, check_consistency
 from nerif.conventions import InputError
+from nerif.corrected import corrected
 from nerif.measurement import Measurement
 from nerif.rig_check import RigCheck, check_rig
 
@@ -43,12 +45,21 @@ class Check(Settings):
     """With --refine: by how much cameras may be turned, degrees; else what the measurement says, or 0.02."""
     time_limit: float = 30.0
     """With --refine: seconds in which the field is found."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Measurement to write, NAME.nc, with the mistakes undone that were found; without its pictures of the pattern."""
+    force: bool = False
+    """Overwrite an existing file."""
     strict: bool = False
     """Exit with code 1 if something is found."""
 
 
 def run(settings: Check) -> Consistency | RigCheck:
     """Compare the views, or refine their cameras, and say what was found."""
+    if settings.out is not None:
+        if settings.refine or settings.out.suffix != ".nc":
+            wrong = "--refine, which corrects nothing" if settings.refine else f"'{settings.out.name}'"
+            raise InputError(f"out: expected a name ending in .nc, of what is compared, got {wrong}")
+        check_file(settings.out, settings.force)
     return _rig(settings) if settings.refine else _views(settings)
 
 
@@ -92,6 +103,9 @@ def _views(settings: Check) -> Consistency:
         say(f"FOUND: {finding}")
     if result.views and not result.findings:
         say("nothing odd found")
+    if settings.out is not None:
+        corrected(measurement, result).write(settings.out)
+        say(f"{settings.out}: the measurement with what was found undone; check it again")
     return result
 
 
