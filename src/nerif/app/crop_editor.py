@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from html import escape
 from typing import Any
 
 from nicegui import ui
@@ -107,7 +108,8 @@ class CropEditor:
             self.crop = crop
         self._error.set_content("")
         if said:
-            self._error.set_content(f"<span role=alert>{said[0].removeprefix('crop: ').capitalize()}</span>")
+            text = said[0].removeprefix("crop: ")
+            self._error.set_content(f"<span role=alert>{escape(text[:1].upper() + text[1:])}</span>")
             return
         self._show()
         await self._changed(self.crop)

@@ -81,22 +81,23 @@ class TargetPictures:
                 if turn != self._turn:
                     return
                 with grid:
-                    self._cell(name, address, found, shape, errors.get(name), name in left_out)
+                    self._cell(name, address, found, shape, errors, name in left_out)
 
     def _shape(self, view: View, source: str) -> tuple[int, int]:
         shape = view.open(source).shape
         return view.crop.shape_of(shape) if view.crop else shape
 
     def _cell(
-        self, name: str, address: str, found: Detection | None, shape: tuple[int, int], error: ImageError | None,
-        left_out: bool,
+        self, name: str, address: str, found: Detection | None, shape: tuple[int, int],
+        errors: Mapping[str, ImageError], left_out: bool,
     ) -> None:  # fmt: skip
         with ui.element("div").classes("target left-out" if left_out else "target") as cell:
+            told = _told(errors.get(name)) or (", not used" if errors and found is not None else "")
             said = "no target found" if found is None else f"{len(found.points)} points found"
             with ui.element("figure"):
                 ui.html(
                     f'<span class=shot><img src="{address}" alt="{escape(f"{name}, {said}")}">'
-                    f"{_marks(found, shape)}</span><figcaption><b>{escape(name)}</b><br>{said}{_told(error)}"
+                    f"{_marks(found, shape)}</span><figcaption><b>{escape(name)}</b><br>{said}{told}"
                     "</figcaption>", sanitize=False,
                 )  # fmt: skip
             if found is None:

@@ -23,7 +23,7 @@ from nerif.commands.settings import merge
 from nerif.conventions import InputError
 from nerif.imaging.calibration_result import ImageError
 from nerif.imaging.simple_rig import SimpleRig
-from nerif.imaging.targets import KINDS
+from nerif.imaging.targets import KINDS, CalibrationTarget
 from nerif.imaging.views import View
 from nerif.toml import read_toml
 
@@ -62,6 +62,7 @@ class CalibrationPage:
         self.views: dict[str, View] = {}
         self.errors: dict[str, ImageError] = {}
         self.shown: tuple[Any, ...] = ()
+        self.seen: tuple[Any, ...] = ()
         self.job = str(kept.get("job", ""))
         experiments = list(found.experiments)
         known = kept.get("experiment")
@@ -75,7 +76,7 @@ class CalibrationPage:
                 self.out = ui.input("Calibration to write", value=str(kept.get("out", "calibration.toml")))
                 self.out.props("outlined dense debounce=250").props["aria-label"] = "Calibration to write"
                 self.out.on_value_change(self._show)
-                self.note = ui.html("", sanitize=False)
+                self.note = ui.element("div")
                 self.place = ui.element("div").classes("form")
                 self.start = ui.button("Calibrate", icon="play_arrow", on_click=self._start)
                 self.start.props("unelevated no-caps")
@@ -109,6 +110,7 @@ class CalibrationPage:
         await self._draw()
         await self._pictures()
         ui.timer(EVERY, self._follow)
+        ui.timer(EVERY, self._look_again)
 
     @property
     def simple(self) -> bool:
@@ -177,7 +179,6 @@ class CalibrationPage:
         self.command.show(self.arguments())
         notes = [f"Its settings are those of {self.settings}, but for what is changed here."] if self.settings else []
         notes += [f"{self.out.value} is there; it is replaced."] if self._exists() else []
-        self.note.set_content("")
         self.note.clear()
         with self.note:
             for text in notes:
@@ -263,13 +264,25 @@ class CalibrationPage:
     async def _pictures(self) -> None:
         """Show the pictures of the view that is chosen."""
         view = self.views.get(self.view.value or "")
-        if view is None:
+        if view is None or not self.form.right:
             return
         self._show()
         with refusals():
-            made = self.form.made() if not self.simple else form_of(False).record
-            targets = {"target": made.target, "background": made.target.scaled(made.background_scale)}
+            targets, self.seen = self._targets(), self._wanted()
             await self.pictures.show(view, targets, self.errors, self.left)
+
+    def _targets(self) -> dict[str, CalibrationTarget]:
+        """What is looked for; a ruler needs none, then it is that of the form's defaults."""
+        made = form_of(False).record if self.simple else self.form.made()
+        return {"target": made.target, "background": made.target.scaled(made.background_scale)}
+
+    def _wanted(self) -> tuple[Any, ...]:
+        return self.experiment.value, self.view.value, *self._targets().values()
+
+    async def _look_again(self) -> None:
+        """Look anew after another target has been typed, or another experiment chosen."""
+        if self.form.right and self._wanted() != self.seen:
+            await self._pictures()
 
 
 def _noted(text: str) -> None:
