@@ -27,8 +27,8 @@ LAYERS = (
     ("reconstruction",),
     ("result", "glance", "monitor"),
     (
-        "prediction", "halves", "evaluation", "consistency", "corrected", "rig_check", "mistakes", "quick_views", "symptoms",
-        "gains", "verdict",
+        "prediction", "halves", "evaluation", "consistency", "corrected", "rig_check", "mistakes", "quick_views",
+        "symptoms", "gains", "verdict",
     ),
     ("kept_run", "members", "first_look", "live"),
     ("report", "sequence"),

@@ -60,5 +60,5 @@ def _without(correction: Correction, measurement: Measurement) -> Measurement:
         alike = of.to(own.values.dtype)[..., None].expand(*of.shape, channels).contiguous()
         return correction.undo(alike, cameras).abs()[..., 0] > 0.5
 
-    masks = {"valid": mask(measurement.valid), "flow_mask": mask(measurement.flow_mask)}
-    return replace(measurement.observed({name: values}, {name: sigma}), **masks)
+    mended = measurement.observed({name: values}, {name: sigma})
+    return replace(mended, valid=mask(measurement.valid), flow_mask=mask(measurement.flow_mask))

@@ -11,7 +11,7 @@ from typing import TypeVar
 from nerif.commands.info import is_measurement
 from nerif.conventions import InputError
 from nerif.imaging.views import View, find_views
-from nerif.result import LIVE, RUN, VOLUME
+from nerif.result import LIVE, RUN
 
 __all__ = ["Contents", "Project"]
 
@@ -173,7 +173,7 @@ class Project:
 
 
 def _is_result(path: Path) -> bool:
-    return any((path / name).is_file() for name in (RUN, LIVE, VOLUME))
+    return any((path / name).is_file() for name in (RUN, LIVE))
 
 
 def _has_views(path: Path) -> bool:

@@ -61,6 +61,7 @@ class CalibrationPage:
         self.values: dict[str, dict[str, Any]] = {name: dict(kept.get(name, {})) for name in ("target", "ruler")}
         self.views: dict[str, View] = {}
         self.errors: dict[str, ImageError] = {}
+        self.turn = 0  # of drawing the rig
         self.shown: tuple[Any, ...] = ()
         self.seen: tuple[Any, ...] = ()
         self.job = str(kept.get("job", ""))
@@ -242,22 +243,26 @@ class CalibrationPage:
     # -- what came out -------------------------------------------------------------------------------------------
 
     async def _choose_calibration(self, name: str | None = None) -> None:
-        names = list(self.found.calibrations)
+        names = sorted(self.found.calibrations, key=lambda n: (n.count("/"), n))
         best = [n for n in (name, self.calibration.value, self.kept.get("calibration"), self.out.value) if n in names]
         self.calibration.set_options(names, value=next(iter([*best, *names]), None))
 
     async def _draw(self) -> None:
         """Show the rig of the calibration that is chosen."""
-        self.errors = {}
+        self.turn += 1
+        turn, name, rig = self.turn, self.calibration.value, None
+        said = [] if name else ["There is no calibration in this folder yet."]
+        if name:
+            with refusals(said.append):
+                rig = await self.work.beside(read_rig, self.work.project.path(name))
+        if turn != self.turn:  # another one has been chosen meanwhile
+            return
+        self.errors = {error.name: error for error in rig.errors} if rig else {}
         self.rig.clear()
         with self.rig:
-            if not self.calibration.value:
-                text_html("There is no calibration in this folder yet.", classes="note")
-                return
-            with refusals(_noted):
-                path = self.work.project.path(self.calibration.value)
-                rig = await self.work.beside(read_rig, path)
-                self.errors = {error.name: error for error in rig.errors}
+            for text in said:
+                text_html(text, classes="note")
+            if rig:
                 show_rig(rig)
         self._show()
 
@@ -283,10 +288,6 @@ class CalibrationPage:
         """Look anew after another target has been typed, or another experiment chosen."""
         if self.form.right and self._wanted() != self.seen:
             await self._pictures()
-
-
-def _noted(text: str) -> None:
-    text_html(text, classes="note")
 
 
 async def build(work: Workspace) -> None:

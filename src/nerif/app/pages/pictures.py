@@ -40,6 +40,7 @@ class PicturesPage:
         self.experiment = known if known in experiments else experiments[0]
         self.chosen, self.kept, self.most = str(kept.get("view", "")), dict(kept.get("edits", {})), MOST
         self.views: dict[str, View] = {}
+        self.turn = 0  # of building
         self.editor: CropEditor | None = None
         with ui.element("div").classes("stack"):
             with card("Folder of pictures"):
@@ -60,6 +61,8 @@ class PicturesPage:
 
     async def build(self) -> None:
         """Build everything for the experiment that is chosen; pictures come one after the other."""
+        self.turn += 1
+        turn = self.turn
         with refusals():
             found = await self.work.beside(self.work.project.views, self.experiment)
             self.views = {view.name: view for view in found}
@@ -75,8 +78,10 @@ class PicturesPage:
             self.cells = {name: ui.element("article").classes("view") for name in self.views}
         wrong: list[str] = []
         await self._closer()
-        for view in self.views.values():
-            wrong += await self._cell(view)
+        for view in list(self.views.values()):
+            wrong += await self._cell(view, turn)
+            if turn != self.turn:  # another experiment has been chosen meanwhile
+                return
             self._sum_up(wrong)
         self._sum_up(wrong)
 
@@ -95,7 +100,7 @@ class PicturesPage:
 
     # -- a view in the grid --------------------------------------------------------------------------------------
 
-    async def _cell(self, view: View) -> list[str]:
+    async def _cell(self, view: View, turn: int) -> list[str]:
         """Fill the cell of a view; returns what is wrong with it."""
         wrong: list[str] = []
         looks: dict[str, SourceLook] = {}
@@ -112,6 +117,8 @@ class PicturesPage:
                 pictures[source] = await self.work.beside(
                     self.files.picture, view, source, look.first, THUMBNAIL, view.crop
                 )
+        if turn != self.turn:
+            return wrong
         cell = self.cells[view.name]
         cell.clear()
         with cell:

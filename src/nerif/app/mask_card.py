@@ -1,0 +1,115 @@
+"""The masks of a measurement: drawn view by view, by threshold elsewhere, and the run that puts them into it."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+from nicegui import ui
+
+from nerif.app.forms import Form
+from nerif.app.job_form import JobForm
+from nerif.app.mask_editor import MaskEditor
+from nerif.app.mask_edits import MaskEdits
+from nerif.app.pieces import refusals, text_html
+from nerif.app.view_maps import magnitude_address, threshold_address
+from nerif.app.workspace import Workspace
+from nerif.commands.mask import Mask
+from nerif.imaging.mask_shapes import write_masks
+from nerif.imaging.masks import MaskSettings
+from nerif.measurement import Measurement
+
+__all__ = ["MaskCard"]
+
+SETTINGS = ("threshold", "smooth", "smallest", "grow", "sigma")
+
+
+class MaskCard:
+    """Controls of the masks, where the page is being built.
+
+    Parameters
+    ----------
+    work : Workspace
+    page : name of the page, whose draft keeps what is drawn
+    name : of the measurement
+    measurement : Measurement
+    """
+
+    def __init__(self, work: Workspace, page: str, name: str, measurement: Measurement) -> None:
+        self.work, self.page, self.name, self.measurement = work, page, name, measurement
+        self.edits = MaskEdits(measurement.names, work.draft(page).get("masks", {}).get(name))
+        self.out = work.project.free_name(f"{name.removesuffix('.nc')}.masked.nc")
+        self.view = ui.select(list(measurement.names), label="View", value=measurement.names[0])
+        self.view.props('outlined dense options-dense aria-label="View to draw in"').classes("short")
+        with ui.element("div").classes("numbers"):
+            for label, icon, step in (("Undo", "undo", self.edits.undo), ("Redo", "redo", self.edits.redo)):
+                button = ui.button(label, icon=icon, on_click=lambda step=step: self._step(step()))
+                button.props("outline no-caps dense")
+            button = ui.button("Show the threshold's mask", icon="contrast", on_click=self._threshold)
+            button.props("flat no-caps dense")
+        self.place = ui.element("div").classes("stack")
+        self.told = ui.html("", sanitize=False).classes("told").props('aria-live="polite"')
+        record = Mask(Path(name), Path(self.out))
+        self.job = JobForm(work, Form(record, only=SETTINGS), self._words, "Put the masks in", SETTINGS[:1])
+        self.view.on_value_change(self._edit)
+        self._edit()
+
+    @property
+    def folder(self) -> str:
+        """Where drawn masks are written, relative to the project."""
+        return f"masks/{Path(self.name).stem}"
+
+    def _words(self) -> list[str]:
+        drawn = ["--drawn", self.folder] if self.edits.drawn else []
+        return ["mask", self.name, "--out", self.out, *drawn]
+
+    def _edit(self) -> None:
+        """Build the editor of the view that is chosen."""
+        self.place.clear()
+        with self.place:
+            index = self.measurement.names.index(str(self.view.value))
+            shape = self.measurement.cameras[index].image_size
+            address = magnitude_address(self.measurement, index)
+            MaskEditor(str(self.view.value), shape, address, self.edits, self._changed)
+        self._tell()
+
+    def _step(self, view: str) -> None:
+        if not view:
+            ui.notify("There is no step to take.")
+            return
+        self.view.set_value(view)
+        self._edit()
+        self._changed()
+
+    def _changed(self) -> None:
+        """Keep what is drawn over a reload, and as the pictures that nerif mask reads."""
+        draft = self.work.draft(self.page)
+        masks = {**draft.get("masks", {}), self.name: self.edits.kept}
+        self.work.keep(self.page, {**draft, "masks": masks})
+        with refusals():
+            for old in self.work.project.path(self.folder).glob("*.png"):
+                if old.stem not in self.edits.drawn:
+                    old.unlink()
+            if self.edits.drawn:
+                sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
+                write_masks(self.work.project.path(self.folder), self.edits.drawn, sizes)
+        self.job.show()
+        self._tell()
+
+    def _tell(self) -> None:
+        views = ", ".join(self.edits.drawn) or "no view"
+        self.told.set_content(escape(f"Drawn in {views}."))
+
+    async def _threshold(self) -> None:
+        index = self.measurement.names.index(str(self.view.value))
+        with refusals():
+            asked = self.job.view.made()
+            settings: MaskSettings = asked.masks
+            address = await self.work.beside(threshold_address, self.measurement, index, settings, asked.sigma)
+            with ui.dialog() as dialog, ui.card():
+                text_html(f"Flow in view {self.view.value}, by the threshold: white", "h3")
+                picture = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")
+                picture.props["src"], picture.props["alt"] = address, "Mask by the threshold"
+                ui.button("Close", on_click=dialog.close).props("flat no-caps")
+            dialog.open()
+

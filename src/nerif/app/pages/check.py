@@ -1,0 +1,170 @@
+"""Check: do the views of a measurement agree, and which correction is offered where they do not?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from html import escape
+
+from nicegui import ui
+
+from nerif.app.form_view import FormView
+from nerif.app.forms import Form
+from nerif.app.job_form import JobForm
+from nerif.app.pages.page import Page
+from nerif.app.pieces import CommandLine, card, refusals, text_html
+from nerif.app.workspace import Workspace
+from nerif.commands.check import Check
+from nerif.consistency import Consistency, check_consistency
+from nerif.measurement import Measurement
+
+__all__ = ["PAGE"]
+
+COMPARED = ("voxels", "aperture")
+REFINED = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
+
+
+class CheckPage:
+    """The page in one tab.
+
+    Parameters
+    ----------
+    work : Workspace
+    measurements : their names
+    """
+
+    def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
+        self.work = work
+        known = str(work.draft(PAGE.name).get("measurement", ""))
+        chosen = known if known in measurements else measurements[0]
+        with ui.element("div").classes("columns"):
+            with ui.element("div").classes("stack"):
+                with card("Do the views agree?", "Each is predicted by a quick reconstruction from the others."):
+                    with ui.element("div").classes("form"):
+                        self.select = ui.select(list(measurements), label="Measurement", value=chosen)
+                        self.select.props('outlined dense options-dense aria-label="Measurement"')
+                        self.form = FormView(Form(self._record(), only=COMPARED), self.show)
+                        self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
+                        self.button.props("unelevated no-caps")
+                with card("Is the rig as it was calibrated?", "Cameras are refined with a quick field: which one is off?"):
+                    record = replace(self._record(), refine=("cameras",))
+                    with ui.element("div").classes("form"):
+                        self.rig = JobForm(work, Form(record, only=REFINED), self._refine_words, "Refine and tell")
+            with ui.element("div").classes("stack"):
+                with card("The same on the command line"):
+                    self.command = CommandLine()
+                with card("What was found"):
+                    self.told = ui.element("div").classes("stack").props('aria-live="polite"')
+                    with self.told:
+                        text_html("Nothing has been compared yet.", classes="told")
+        self.select.on_value_change(self._turned)
+        self.show()
+
+    def _record(self) -> Check:
+        return Check(self.work.project.path(str(self.select.value)))
+
+    def _refine_words(self) -> list[str]:
+        return ["check", str(self.select.value), "--refine", "cameras"]
+
+    def show(self) -> None:
+        """Show the command line as it is now."""
+        if hasattr(self, "command"):
+            self.command.show(self.arguments)
+            self.button.set_enabled(self.form.right)
+
+    @property
+    def arguments(self) -> list[str]:
+        """Arguments of nerif that compare the views."""
+        return ["check", str(self.select.value), *self.form.arguments]
+
+    def _turned(self) -> None:
+        self.work.keep(PAGE.name, {"measurement": self.select.value})
+        self.told.clear()
+        self.show()
+        self.rig.show()
+
+    async def compare(self) -> None:
+        """Compare the views and show what was found."""
+        name = str(self.select.value)
+        self.told.clear()
+        with self.told:
+            bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
+        self.button.disable()
+        done = [0.0]
+        timer = ui.timer(0.3, lambda: bar.set_value(done[0]))
+
+        def step(count: int, total: int) -> None:
+            done[0] = count / max(total, 1)
+
+        said: list[str] = []
+        found = None
+        with refusals(said.append):
+            asked = self.form.made()
+
+            def work() -> Consistency:
+                measurement = Measurement.read(self.work.project.path(name))
+                return check_consistency(measurement, asked.voxels, step, asked.aperture)
+
+            found = await self.work.beside(work)
+        timer.cancel()
+        self.button.enable()
+        self.told.clear()
+        with self.told:
+            for text in said:
+                text_html(text, classes="told")
+            if found is not None:
+                self._show(name, found)
+
+    def _show(self, name: str, found: Consistency) -> None:
+        """The verdicts, and the correction that is offered."""
+        ui.html(views_table(found), sanitize=False)
+        notes = "".join(f"<li>{escape(text)}</li>" for text in found.remarks)
+        findings = "".join(f"<li>{escape(text)}</li>" for text in found.findings)
+        if findings:
+            ui.html(f"<h3>Found</h3><ul class=notes>{findings}</ul>", sanitize=False)
+        elif found.views:
+            text_html("Nothing odd found.", classes="told")
+        if notes:
+            ui.html(f"<h3>Notes</h3><ul>{notes}</ul>", sanitize=False)
+        if found.corrections:
+            out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
+            arguments = [*self.arguments, "--out", out]
+            text_html("The mistakes can be undone, in a new file:", "h3")
+            line = CommandLine()
+            line.show(arguments)
+
+            def correct() -> None:
+                with refusals():
+                    self.work.jobs.add(arguments, f"Correct {name}")
+                    ui.notify(f"It is in the queue; then go on with {out}, and check it again.", type="positive")
+
+            ui.button("Undo what was found", icon="auto_fix_high", on_click=correct).props("unelevated no-caps")
+        elif found.views and not found.findings:
+            link = "<a href='/reconstruct'>Go on to Reconstruct</a>"
+            ui.html(f"<p>{link}</p>", sanitize=False)
+
+
+def views_table(found: Consistency) -> str:
+    """Return the agreement of every view as HTML; nothing where there are too few views."""
+    if not found.views:
+        return ""
+    rows = "".join(
+        f"<tr><th scope=row>{escape(v.name)}</th><td>{escape(v.measured)}</td><td>{v.valid:.1%}</td>"
+        f"<td>{v.agreement:.2f}</td><td>{v.gain:.2f}</td><td>{escape(v.verdict or 'fits')}</td></tr>"
+        for v in found.views
+    )
+    heads = "".join(f"<th scope=col>{h}</th>" for h in ("View", "Measured", "Valid", "Agreement", "Gain", "Verdict"))
+    table = f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+    return f'<div class=tabled tabindex=0 role=region aria-label="Agreement of the views">{table}</div>'
+
+
+async def build(work: Workspace) -> None:
+    """Build the page."""
+    contents = await work.beside(work.project.contents)
+    if not contents.measurements:
+        text_html("There is no measurement in the folder yet: Displacement makes one of pictures.", classes="told")
+        return
+    CheckPage(work, contents.measurements)
+
+
+PAGE = Page("check", "Check", "/check", "Mistakes that cost a day, found before the reconstruction.", build)

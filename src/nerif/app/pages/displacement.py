@@ -1,0 +1,175 @@
+"""Displacement: from the pictures of all views to a measurement, with a preview of one view first; masks drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from nicegui import ui
+
+from nerif.app.forms import Form
+from nerif.app.job_form import JobForm
+from nerif.app.mask_card import MaskCard
+from nerif.app.pages.page import Page
+from nerif.app.pieces import card, refusals, text_html
+from nerif.app.project import Contents
+from nerif.app.view_maps import maps_html
+from nerif.app.workspace import Workspace
+from nerif.commands.displacement import Displacement
+from nerif.imaging.measuring import measure_instant
+from nerif.measurement import Measurement
+
+__all__ = ["PAGE"]
+
+BY_PAGE = ("config", "folder", "calibration", "out", "frames", "frame_rate")
+MAIN = ("method", "smoothness", "lower", "upper", "max_sigma", "min_correlation", "shake_border", "pictures")
+
+
+class DisplacementPage:
+    """The page in one tab.
+
+    Parameters
+    ----------
+    work : Workspace
+    contents : of the project
+    """
+
+    def __init__(self, work: Workspace, contents: Contents) -> None:
+        self.work, kept = work, work.draft(PAGE.name)
+        if contents.experiments and contents.calibrations:
+            with ui.element("div").classes("columns"):
+                with card("Pictures to displacements"), ui.element("div").classes("form"):
+                    self.experiment = self._select("Experiment", contents.experiments, kept.get("experiment"))
+                    self.calibration = self._select("Calibration", contents.calibrations, kept.get("calibration"))
+                    self.out = ui.input("Measurement to write", value=work.project.free_name("measurement.nc"))
+                    self.out.props('outlined dense aria-label="Measurement to write"')
+                    record = Displacement(Path("."), Path("."), Path("measurement.nc"))
+                    form = Form(record, without=BY_PAGE)
+                    self.job = JobForm(work, form, self._words, "Find all displacements", MAIN)
+                    for control in (self.experiment, self.calibration, self.out):
+                        control.on_value_change(self._turned)
+                with card("Preview of one view", "With these settings, before all views are done."):
+                    self.view = ui.select([], label="View").props('outlined dense options-dense aria-label="View"')
+                    self.view.classes("short")
+                    self.button = ui.button("Preview", icon="visibility", on_click=self.preview)
+                    self.button.props("outline no-caps")
+                    self.shown = ui.element("div").props('aria-live="polite"')
+            self._views()
+        else:
+            lacking = "pictures of an experiment" if not contents.experiments else "a calibration"
+            text_html(f"There is no {lacking} in the folder yet; the pages before this one help.", classes="told")
+        if contents.measurements:
+            MeasurementCard(work, contents.measurements)
+
+    def _select(self, label: str, names: Sequence[str], kept: object) -> ui.select:
+        control = ui.select(list(names), label=label, value=kept if kept in names else names[0])
+        control.props["aria-label"] = label
+        return control.props("outlined dense options-dense")
+
+    def _words(self) -> list[str]:
+        return [
+            "displacement", str(self.experiment.value), "--calibration", str(self.calibration.value),
+            "--out", str(self.out.value),
+        ]  # fmt: skip
+
+    def _turned(self) -> None:
+        draft = self.work.draft(PAGE.name)
+        chosen = {"experiment": self.experiment.value, "calibration": self.calibration.value}
+        self.work.keep(PAGE.name, {**draft, **chosen})
+        self.job.show()
+        self._views()
+
+    def _views(self) -> None:
+        names: list[str] = []
+        with refusals():
+            names = [view.name for view in self.work.project.views(str(self.experiment.value))]
+        self.view.set_options(names, value=names[0] if names else None)
+
+    async def preview(self) -> None:
+        """Find the displacements of one view and show them."""
+        self.button.disable()
+        self.shown.clear()
+        with self.shown:
+            ui.spinner(size="lg").props('aria-label="Working"')
+        said: list[str] = []
+        html = ""
+        with refusals(said.append):
+            asked = replace(
+                self.job.view.made(), folder=self.work.project.path(str(self.experiment.value)),
+                calibration=self.work.project.path(str(self.calibration.value)), views=(str(self.view.value),),
+                pictures=False,
+            )  # fmt: skip
+
+            def work() -> str:
+                numbers = range(asked.frame, asked.frame + asked.average)
+                measurement, _ = measure_instant(asked.recording(), numbers, said.append, processes=1)
+                return maps_html(measurement)
+
+            html = await self.work.beside(work)
+        self.button.enable()
+        self.shown.clear()
+        with self.shown:
+            for text in said:
+                text_html(text, classes="told")
+            ui.html(html, sanitize=False)
+
+
+class MeasurementCard:
+    """What a measurement holds, and masks drawn into it.
+
+    Parameters
+    ----------
+    work : Workspace
+    measurements : their names
+    """
+
+    def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
+        self.work = work
+        kept = work.draft(PAGE.name).get("measurement")
+        with card("What was measured"):
+            self.select = ui.select(list(measurements), label="Measurement")
+            self.select.set_value(kept if kept in measurements else measurements[-1])
+            self.select.props('outlined dense options-dense aria-label="Measurement"').classes("short")
+            with ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide"):
+                self.maps = ui.element("div")
+        with card("Where the flow is", "A mask tightens the visual hull. Views without a drawing go by the threshold."):
+            self.place = ui.element("div").classes("stack")
+        self.select.on_value_change(self._turned)
+        ui.timer(0.05, self._masks, once=True)
+
+    @property
+    def name(self) -> str:
+        """Of the measurement that is chosen."""
+        return str(self.select.value)
+
+    def _read(self) -> Measurement:
+        return self.work.project.cached(self.name, "measurement", Measurement.read)
+
+    async def _turned(self) -> None:
+        self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.name})
+        self.maps.clear()
+        await self._masks()
+
+    async def _maps(self, event: object) -> None:
+        if not getattr(event, "value", False) or list(self.maps):
+            return
+        with refusals():
+            html = await self.work.beside(lambda: maps_html(self._read()))
+            with self.maps:
+                ui.html(html, sanitize=False)
+
+    async def _masks(self) -> None:
+        self.place.clear()
+        with refusals():
+            measurement = await self.work.beside(self._read)
+            with self.place:
+                MaskCard(self.work, PAGE.name, self.name, measurement)
+
+
+async def build(work: Workspace) -> None:
+    """Build the page."""
+    DisplacementPage(work, await work.beside(work.project.contents))
+
+
+PAGE = Page("displacement", "Displacement", "/displacement", "How far the background is shifted, view by view.", build)

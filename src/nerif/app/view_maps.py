@@ -1,0 +1,76 @@
+"""The views of a measurement as maps with one scale of colours."""
+
+from __future__ import annotations
+
+from html import escape
+
+import torch
+
+from nerif.imaging.masks import MaskSettings, with_flow_masks
+from nerif.measurement import Measurement
+from nerif.observation import integrals_of
+from nerif.report.view_images import picture_address
+
+__all__ = ["magnitude_address", "maps_html", "threshold_address"]
+
+PIXELS = 320  # along the longer edge of a map
+QUANTILE = 0.995  # of what is shown, within the colours
+
+
+def maps_html(measurement: Measurement) -> str:
+    """Return a row of maps for each view: what was measured, by component, its sigma, and where it is valid."""
+    (observation, *_), parts = integrals_of(measurement), []
+    usable = measurement.usable_for(observation)
+    values = observation.values.where(usable[..., None], torch.tensor(float("nan")))
+    most = _largest(values.abs())
+    least = -most if observation.signed else 0.0
+    sigma = None if observation.sigma is None else observation.sigma[..., 0].where(usable, torch.tensor(float("nan")))
+    noisiest = 1.0 if sigma is None else _largest(sigma)
+    unit = escape(observation.technique.unit)
+    scale = f"Colours from {least:.3g} to {most:.3g} {unit} in all views; grey: not valid."
+    parts.append(f"<p class=note>{scale}</p>")
+    for i, camera in enumerate(measurement.cameras):
+        height, width = camera.image_size
+        step = -(-max(height, width) // PIXELS)
+        part = i, slice(0, height, step), slice(0, width, step)
+        shown = {
+            name: picture_address(values[part][..., c].numpy(), (least, most))
+            for c, name in enumerate(observation.components)
+        }
+        if sigma is not None:
+            shown["sigma"] = picture_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
+        shown["valid"] = picture_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
+        share = float(usable[i, :height, :width].float().mean())
+        figures = "".join(
+            f'<figure><img src="{address}" alt="{escape(f"{name} of view {camera.name}", quote=True)}">'
+            f"<figcaption>{escape(name)}</figcaption></figure>"
+            for name, address in shown.items()
+        )
+        parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3><div class=pictures>{figures}</div>")
+    return "".join(parts)
+
+
+def magnitude_address(measurement: Measurement, view: int) -> str:
+    """Return |value| of a view as a picture, px for px where it is small."""
+    (observation, *_), camera = integrals_of(measurement), measurement.cameras[view]
+    height, width = camera.image_size
+    step = -(-max(height, width) // (3 * PIXELS))
+    part = view, slice(0, height, step), slice(0, width, step)
+    size = observation.values[part].norm(dim=-1).where(measurement.usable[part], torch.tensor(float("nan")))
+    return picture_address(size.numpy(), (0.0, _largest(size)), "viridis")
+
+
+def threshold_address(measurement: Measurement, view: int, settings: MaskSettings, sigma: float | None) -> str:
+    """Return the mask of a view by threshold as a picture, white where the flow is."""
+    name = measurement.names[view]
+    masked = with_flow_masks(measurement.select([name]), settings, sigma)
+    assert masked.flow_mask is not None
+    height, width = measurement.cameras[view].image_size
+    return picture_address(masked.flow_mask[0, :height, :width].numpy().astype(float), (0.0, 1.0), "gray")
+
+
+def _largest(values: torch.Tensor) -> float:
+    """The size that nearly all values have at most."""
+    known = values[values.isfinite()].flatten()
+    some = known[:: max(1, len(known) // 1_000_000)]
+    return float(some.quantile(QUANTILE)) or 1.0 if len(some) else 1.0
