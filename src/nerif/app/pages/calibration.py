@@ -108,9 +108,8 @@ class CalibrationPage:
         self.way.on_value_change(self._turned)
         self.calibration.on_value_change(self._draw)
         self.view.on_value_change(self._pictures)
-        await self._draw()
-        await self._pictures()
         ui.timer(EVERY, self._follow)
+        await self._draw()
         ui.timer(EVERY, self._look_again)
 
     @property
@@ -237,7 +236,6 @@ class CalibrationPage:
             wrote = job.arguments[job.arguments.index("-o") + 1]
             await self._choose_calibration(wrote)
             await self._draw()
-            await self._pictures()
         self._show()
 
     # -- what came out -------------------------------------------------------------------------------------------
@@ -248,7 +246,7 @@ class CalibrationPage:
         self.calibration.set_options(names, value=next(iter([*best, *names]), None))
 
     async def _draw(self) -> None:
-        """Show the rig of the calibration that is chosen."""
+        """Show the rig of the calibration that is chosen, and its errors beside the pictures."""
         self.turn += 1
         turn, name, rig = self.turn, self.calibration.value, None
         said = [] if name else ["There is no calibration in this folder yet."]
@@ -265,6 +263,7 @@ class CalibrationPage:
             if rig:
                 show_rig(rig)
         self._show()
+        await self._pictures()
 
     async def _pictures(self) -> None:
         """Show the pictures of the view that is chosen."""
