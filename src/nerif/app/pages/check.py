@@ -20,6 +20,8 @@ from nerif.measurement import Measurement
 
 __all__ = ["PAGE"]
 
+AGREE = "Each is predicted by a quick reconstruction from the others."
+REFINE = "Cameras are refined with a quick field: which one is off? Runs, above, shows what it says."
 COMPARED = ("voxels", "aperture")
 REFINED = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
 
@@ -39,17 +41,15 @@ class CheckPage:
         chosen = known if known in measurements else measurements[0]
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("stack"):
-                with card("Do the views agree?", "Each is predicted by a quick reconstruction from the others."):
-                    with ui.element("div").classes("form"):
-                        self.select = ui.select(list(measurements), label="Measurement", value=chosen)
-                        self.select.props('outlined dense options-dense aria-label="Measurement"')
-                        self.form = FormView(Form(self._record(), only=COMPARED), self.show)
-                        self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
-                        self.button.props("unelevated no-caps")
-                with card("Is the rig as it was calibrated?", "Cameras are refined with a quick field: which one is off?"):
+                with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
+                    self.select = ui.select(list(measurements), label="Measurement", value=chosen)
+                    self.select.props('outlined dense options-dense aria-label="Measurement"')
+                    self.form = FormView(Form(self._record(), only=COMPARED), self.show)
+                    self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
+                    self.button.props("unelevated no-caps")
+                with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
                     record = replace(self._record(), refine=("cameras",))
-                    with ui.element("div").classes("form"):
-                        self.rig = JobForm(work, Form(record, only=REFINED), self._refine_words, "Refine and tell")
+                    self.rig = JobForm(work, Form(record, only=REFINED), self._refine_words, "Refine and tell")
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
