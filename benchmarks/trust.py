@@ -6,7 +6,9 @@ Simulated data on rings of cameras over half a turn. For each case: error, and i
 largest) the share of voxels whose truth lies within one and two standard deviations, where 68 and 95 % would be right;
 the rank correlation (Spearman) of errors and deviations over all voxels and, of errors averaged as the deviations are,
 in the flow; rms deviation over rms error; and the time of the whole command over that without them. Steps end a run, so
-that what else the machine does changes the seconds alone. `turbulence` took no part in the development of the method.
+that what else the machine does changes the seconds alone. `fire` took no part in the development of the method.
+
+Then the verdicts (verdicts.py) on measurements that are good and spoiled.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+import verdicts
 from bench import N_AMBIENT, Table, add_write, alone
 from nerif.conventions import InputError
 from nerif.reconstruction.base import Reconstructor
@@ -28,7 +31,7 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.workflow import Run
 
-PHANTOMS = ("gaussians", "flame", "octahedron", "turbulence")
+PHANTOMS = ("gaussians", "flame", "octahedron", "fire")
 COLUMNS = ("L2 of variation", "in 1 std", "in 2 std", "Spearman, all", "Spearman, averaged", "std / error", "cost")
 VOXELS, EDGE = 64, 50.0
 AVERAGED = 0.04  # of the box edge
@@ -109,6 +112,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600, help="of NeRIF")
     parser.add_argument("--pixels", type=int, default=64, help="of an edge of each view")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--verdicts", type=int, default=200, help="how many measurements are judged; 0 for none")
     add_write(parser)
     asked = parser.parse_args()
     if not all(f >= 0 for f in asked.f_numbers):
@@ -129,6 +133,11 @@ def main() -> None:
     one, two = (sum(column) for column in zip(*met, strict=True))
     both = sum(all(row) for row in met)
     table.text("", f"Of {len(met)} cases the goal is met within one in {one}, within two in {two}, both in {both}.")
+    if asked.verdicts:
+        table.text("")
+        table.begin(verdicts.columns())
+        numbers = range(verdicts.FIRST, verdicts.FIRST + asked.verdicts)
+        verdicts.judge(table, numbers, "nerif", verdicts.STEPS, processes=2)
 
 
 if __name__ == "__main__":

@@ -15,11 +15,13 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from bench import Table, add_write
+from nerif.verdict import WORDS
 from spoiling import SPOILED, case
 
 BAD, GOOD = 0.05, 0.02  # of the variation
 GOAL = 0.03
 VOXELS = 48
+FIRST, STEPS = 1000, 600  # number of the first case; steps of NeRIF, of 2048 points each
 
 
 def judged(number: int, method: str, steps: int) -> tuple[str, str, int, float, str, float | None]:
@@ -57,23 +59,15 @@ def share(words: Sequence[str], word: str) -> str:
     return f"{said} of {len(words)} ({said / max(len(words), 1):.1%}; goal: below {GOAL:.0%})"
 
 
-def main() -> None:
-    """Judge the cases, side by side, and print the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--first", type=int, default=1000, help="number of the first case")
-    parser.add_argument("--method", default="nerif", choices=["nerif", "tv"])
-    parser.add_argument("--steps", type=int, default=600, help="of NeRIF, 2048 points each")
-    parser.add_argument("--processes", type=int, default=2)
-    add_write(parser)
-    asked = parser.parse_args()
-    from nerif.verdict import WORDS
+def columns() -> tuple[str, ...]:
+    """Return the head of the table."""
+    return ("wrong", "cases", "median error", "largest", *WORDS)
 
-    columns = ("wrong", "cases", "median error", "largest", *WORDS)
-    table = Table("Verdicts on simulated measurements", columns, asked.write, f"\n\nMethod: {asked.method}.")
-    numbers = range(asked.first, asked.first + asked.cases)
-    with ProcessPoolExecutor(asked.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(judged, n, asked.method, asked.steps) for n in numbers]
+
+def judge(table: Table, numbers: range, method: str, steps: int, processes: int) -> None:
+    """Judge the cases of those numbers, side by side: rows of `columns`, and how often the verdict was right."""
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(judged, n, method, steps) for n in numbers]
         found = []
         for number, future in zip(numbers, waiting, strict=True):
             found.append(future.result())
@@ -97,6 +91,20 @@ def main() -> None:
         "",
         f"Where a likely error is told, it is within a factor of two in {within} of {len(close)} cases.",
     )
+
+
+def main() -> None:
+    """Judge the cases and print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--first", type=int, default=FIRST, help="number of the first case")
+    parser.add_argument("--method", default="nerif", choices=["nerif", "tv"])
+    parser.add_argument("--steps", type=int, default=STEPS, help="of NeRIF, 2048 points each")
+    parser.add_argument("--processes", type=int, default=2)
+    add_write(parser)
+    asked = parser.parse_args()
+    table = Table("Verdicts on simulated measurements", columns(), asked.write, f"\n\nMethod: {asked.method}.")
+    judge(table, range(asked.first, asked.first + asked.cases), asked.method, asked.steps, asked.processes)
 
 
 if __name__ == "__main__":
