@@ -1,10 +1,12 @@
 """When more training brings next to nothing, seen by rays that no step is given.
 
 A run goes in cycles, each twice as long as the one before. Each ends with the smallest learning rate, so that what it
-reached can be compared with what the last one did; e is the mean square of the residual on the rays held back, over
-sigma, of which the noise is 1:
+reached can be compared with what the others did; e is the mean square of the residual on the rays held back, over
+sigma, of which the noise is 1. The run has converged when the last PATIENCE cycles have gained next to nothing:
 
-    e_before - e <= max(FALL (e - 1), SCATTER e)      the run has converged
+    min e before them - min e of them <= max(FALL (e - 1), SCATTER e)
+
+One cycle alone tells too little: rays held back are few, and what others tell of them scatters from cycle to cycle.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from nerif.reconstruction.base import Outcome
 
 __all__ = ["Cycles"]
 
+PATIENCE = 2  # cycles
 FALL = 0.08  # of what is above the noise: a doubling that gains less leaves 5 % of the error, its root, to the next two
 SCATTER = 0.003  # of e itself: so much is chance
 MOST = 6  # cycles
@@ -53,12 +56,13 @@ class Cycles:
         step, seconds : done so far
         judged : whose error it is, for the message
         """
-        before, self.errors = (self.errors[-1] if self.errors else math.inf), [*self.errors, error]
+        self.errors.append(error)
+        before, least = min(self.errors[:-PATIENCE], default=math.inf), min(self.errors[-PATIENCE:])
         length, taken = self.length, seconds - self.seconds
         self.step, self.seconds, self.length = step, seconds, 2 * length
         left = f"{judged} met to {math.sqrt(min(self.errors)):.3g}{' sigma' if noise else ''}"
-        if before - error <= max(FALL * (error - noise), SCATTER * error):
-            self.verdict = f"{left}, and {length} steps more gained next to nothing"
+        if before - least <= max(FALL * (least - noise), SCATTER * least):
+            self.verdict = f"{left}, and {length + length // 2} steps more gained next to nothing"
         elif len(self.errors) == MOST:
             self.verdict = f"{left} after {MOST} cycles, the most there are"
         elif seconds + taken > self.longest:
