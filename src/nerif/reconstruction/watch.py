@@ -81,8 +81,8 @@ class Watch:
             return f"; {self.left:.0%} of what was measured, squared and noise apart, is not explained yet"
         if self.sigmas > MUCH:
             return (
-                f"; the residual is {self.sigmas:.1f} sigma: more time or a larger --network.width lowers it, more views "
-                "the error, unless cameras or sigma are wrong (nerif check)"
+                f"; the residual is {self.sigmas:.1f} sigma: more time or a larger --network.width lowers it, "
+                "more views the error, unless cameras or sigma are wrong (nerif check)"
             )
         return ""
 
