@@ -1,0 +1,104 @@
+"""The pictures of the page "In the browser": `python docs/browser_screenshots.py docs/browser`.
+
+A small experiment is rendered and taken through the whole road by the command line, in a folder that the app then
+opens: what the command line made it picks up. Chromium and chromedriver are needed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from nerif.app.pages import PAGES
+
+SIZE = (1440, 900)
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--enable-unsafe-swiftshader", "--hide-scrollbars",
+)  # fmt: skip
+SETTLES = 6.0  # seconds until pictures and 3-D views of a page have come
+ROAD = (
+    "render -o pictures --phantom flame --views 4 --arc 0 135 --image-size 96 96 --pixel-pitch 0.043 "
+    "--background-distance 1000 --poses 12 --backgrounds 3",
+    "calibrate pictures --config pictures/calibrate.toml -o calibration.toml",
+    "displacement pictures --calibration calibration.toml --lower -25 -25 -25 --upper 25 25 25 -o measurement.nc",
+    "check measurement.nc",
+    "reconstruct measurement.nc -o results/flame --time-limit 20 --voxels 48 --uncertainty fast",
+    "reconstruct measurement.nc -o results/flame-tv --method tv --voxels 32",
+)
+
+
+def nerif(folder: Path, line: str) -> None:
+    """Run a command of nerif in a folder; a verdict of check is no end."""
+    done = subprocess.run([sys.executable, "-m", "nerif", *line.split()], cwd=folder, check=False)
+    if done.returncode and not line.startswith("check"):
+        sys.exit(done.returncode)
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Start the app on a folder, and give its address."""
+    words = [sys.executable, "-m", "nerif", "app", str(folder), "--no-browser"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment)
+    assert process.stdout is not None
+    try:
+        yield next(found[0] for line in process.stdout if (found := re.search(r"http://\S+token=\S+", line)))
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def chromium(profile: Path) -> Any:
+    """A fresh browser with a window of the size of the pictures."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(shutil.which("chromium"))
+    for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        options.add_argument(flag)
+    service = webdriver.ChromeService(executable_path=shutil.which("chromedriver"))
+    driver = webdriver.Chrome(options=options, service=service)
+    size = {"width": SIZE[0], "height": SIZE[1], "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    return driver
+
+
+def draw(pictures: Path, project: Path) -> None:
+    """Write a picture of every page of a project."""
+    pictures.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as profile, served(project) as link:
+        driver = chromium(Path(profile))
+        try:
+            driver.get(link)
+            base = link.partition("/?")[0]
+            for page in PAGES:
+                driver.get(base + page.path)
+                time.sleep(SETTLES)
+                driver.save_screenshot(str(pictures / f"{page.name}.png"))
+        finally:
+            driver.quit()
+
+
+def main() -> None:
+    """Take the road, and the pictures."""
+    pictures = Path(sys.argv[1]).resolve()
+    with tempfile.TemporaryDirectory() as folder:
+        project = Path(sys.argv[2]).resolve() if len(sys.argv) > 2 else Path(folder)
+        if not (project / "results").exists():
+            for line in ROAD:
+                nerif(project, line)
+        draw(pictures, project)
+
+
+if __name__ == "__main__":
+    main()
