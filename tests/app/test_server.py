@@ -73,7 +73,7 @@ def upgrade(server: Served, *headers: str) -> str:
             "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", *headers, "", "",
         )  # fmt: skip
         wire.sendall("\r\n".join(lines).encode())
-        return wire.recv(4096).decode().splitlines()[0]
+        return wire.recv(4096).decode("latin-1").splitlines()[0]
 
 
 def test_the_websocket_too(server):
