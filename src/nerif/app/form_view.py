@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 from nicegui import ui
 
 from nerif.app.forms import Form, FormField
+from nerif.app.scale import Scale
 
 __all__ = ["FormView"]
 
@@ -111,19 +112,22 @@ class FormView(Generic[T]):
 
     def _slider(self, field: FormField, control: Any, label: str) -> None:
         """The browser's own slider: keys and screen readers know it."""
-        low, high = self.sliders[field.name]
+        scale = Scale(*self.sliders[field.name], whole=field.kind == "integer")
         slider = ui.element("input").classes("range")
-        slider.props(f'type=range min={low} max={high} step={_step(field, low, high)} aria-label="{escape(label)}"')
+        slider.props(f'type=range min=0 max={scale.last} step=1 aria-label="{escape(label)}"')
         by_hand: list[float] = []
 
         def moved(event: Any) -> None:
-            by_hand[:] = [float(event.args)]
+            by_hand[:] = [scale.value(int(event.args))]
             control.set_value(by_hand[0])
 
         def follow() -> None:
             value = control.value
-            if isinstance(value, int | float) and [value] != by_hand:  # one that is being moved is where it should be
-                slider.props(f"value={value}")
+            if not isinstance(value, int | float):
+                return
+            slider.props(f'aria-valuetext="{value:g} {escape(field.unit)}"')
+            if [value] != by_hand:  # one that is being moved is where it should be
+                slider.props(f"value={scale.step(value)}")
 
         slider.on("input", moved, throttle=0.05, js_handler="(event) => emit(event.target.value)")
         control.on_value_change(follow)
@@ -185,9 +189,3 @@ def _number(word: str, field: FormField) -> Any:
         return float(number) if whole else number
     return word
 
-
-def _step(field: FormField, low: float, high: float) -> float:
-    """Step of a slider: a five-hundredth of its way, in round numbers."""
-    if field.kind == "integer":
-        return 1
-    return float(f"{(high - low) / 500:.0e}")
