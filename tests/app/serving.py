@@ -13,8 +13,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-__all__ = ["Served", "served"]
+from report.browsing import wait_for
+
+__all__ = ["Served", "opened", "served"]
 
 
 @dataclass(frozen=True)
@@ -87,3 +90,11 @@ def served(folder: Path, *arguments: str, port: int | None = None) -> Iterator[S
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
+
+
+def opened(driver: Any, server: Served, page: str, ready: str) -> None:
+    """Open a page, and wait until it answers and a script says that all is there; forget what was logged before."""
+    driver.get_log("browser")
+    driver.get_log("performance")
+    driver.get(f"http://127.0.0.1:{server.port}/{page}?token={server.token}")
+    wait_for(driver, f"return ({ready}) && window.socket?.connected")

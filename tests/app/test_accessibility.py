@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from app.serving import Served
-from app.test_pages import folder, server, visit
+from app.serving import opened
+from app.test_pages import folder, visit
 from nerif.app.pages import PAGES
 from report.browsing import errors, needs_browser, requests, wait_for
 
 pytestmark = needs_browser
-__all__ = ["folder", "server"]
+__all__ = ["folder"]
 
 LAPTOP, LARGE = (1280, 800), (3840, 2160)
 RULES = """
@@ -28,14 +28,6 @@ def axe() -> str:
     return importlib.resources.files("axe_core_python").joinpath("axe.min.js").read_text()
 
 
-def opened(driver: Any, server: Served, path: str) -> None:
-    """Open a page, whatever it holds."""
-    driver.get_log("browser")
-    driver.get_log("performance")
-    driver.get(f"http://127.0.0.1:{server.port}{path}?token={server.token}")
-    wait_for(driver, "return document.querySelector('main h1') !== null && window.socket?.connected")
-
-
 def settled(driver: Any) -> None:
     """Wait until the page stands still: nothing is animated, nothing waits."""
     wait_for(driver, "return document.getAnimations().every(a => a.playState !== 'running' || a.effect.getTiming()"
@@ -48,7 +40,7 @@ def test_a_page_breaks_no_rule(browser, server, page, dark):
     scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(*LAPTOP))
-    opened(browser, server, page.path)
+    opened(browser, server, page.path.lstrip("/"), "document.querySelector('main h1') !== null")
     wait_for(browser, f"return document.body.classList.contains('body--dark') === {str(dark).lower()}")
     settled(browser)
     browser.execute_script(axe())
@@ -64,7 +56,7 @@ def test_a_page_breaks_no_rule(browser, server, page, dark):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_fits_the_screen(browser, server, page, size):
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(*size))
-    opened(browser, server, page.path)
+    opened(browser, server, page.path.lstrip("/"), "document.querySelector('main h1') !== null")
     wide = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
     assert wide <= 0
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

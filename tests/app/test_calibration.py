@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from app.serving import Served, served
+from app.serving import Served, opened, served
 from app.test_pages import line, put
 from calibration_pictures import target_pictures
 from nerif.app.pages.calibration import form_of
@@ -43,17 +42,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-@pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Served]:
-    with served(folder) as found:
-        yield found
-
-
 def visit(driver: Any, server: Served) -> None:
     """Open the page and wait until all is drawn."""
-    driver.get_log("browser")
-    driver.get(f"http://127.0.0.1:{server.port}/calibration?token={server.token}")
-    wait_for(driver, "return document.querySelectorAll('.target').length >= 1 && window.socket?.connected")
+    opened(driver, server, "calibration", "document.querySelectorAll('.target').length >= 1")
 
 
 def choose(driver: Any, label: str, option: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from app.serving import Served, served
+from app.serving import opened
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.measurement import Measurement
@@ -21,6 +20,7 @@ from report.browsing import errors, needs_browser, text, wait_for
 pytestmark = needs_browser
 
 BOX = Box.cube(50.0)
+LINE = "document.querySelector('.command code') !== null"
 
 
 @pytest.fixture(scope="module")
@@ -34,19 +34,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     d[3] = d[3].flip(1) * torch.tensor([-1.0, 1.0])
     replace(good, displacement=d).write(found / "bad.nc")
     return found
-
-
-@pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Served]:
-    with served(folder) as found:
-        yield found
-
-
-def opened(driver: Any, server: Served, page: str) -> None:
-    """Open a page."""
-    driver.get_log("browser")
-    driver.get(f"http://127.0.0.1:{server.port}/{page}?token={server.token}")
-    wait_for(driver, "return document.querySelector('.command code') !== null && window.socket?.connected")
 
 
 def click(driver: Any, label: str) -> None:
@@ -67,7 +54,7 @@ def written(path: Path, seconds: float = 60.0) -> Measurement:
 
 @pytest.mark.slow
 def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
-    opened(browser, server, "check")
+    opened(browser, server, "check", LINE)
     click(browser, "Compare the views")
     wait_for(browser, "return document.querySelector('.tabled table') !== null", 120)
     assert "the picture is mirrored left to right" in text(browser, ".tabled table")
@@ -79,7 +66,7 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
 
 @pytest.mark.slow
 def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
-    opened(browser, server, "displacement")
+    opened(browser, server, "displacement", LINE)
     wait_for(browser, "return document.querySelector('.cropper img') !== null")
     for column, row in ((6, 4), (30, 4), (30, 25), (6, 25)):
         for label, value in (("Column", column), ("Row", row)):
@@ -94,7 +81,7 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     wait_for(browser, "return document.querySelector('.over polygon.flow') === null")
     click(browser, "Redo")
     wait_for(browser, "return document.querySelector('.over polygon.flow') !== null")
-    opened(browser, server, "displacement")  # a reload loses nothing
+    opened(browser, server, "displacement", LINE)  # a reload loses nothing
     wait_for(browser, "return document.querySelector('.over polygon.flow') !== null")
     click(browser, "Put the masks in")
     (out,) = [word for word in text(browser, ".command code").split() if word.endswith(".masked.nc")]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from app.serving import Served, served
+from app.serving import Served, opened
 from nerif.cli import main
 from nerif.geometry import Ring
 from nerif.live import read_live, read_look
@@ -28,18 +27,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-@pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Served]:
-    with served(folder) as found:
-        yield found
+LINE = "document.querySelector('.command code') !== null"
 
 
 def visit(driver: Any, server: Served, page: str) -> None:
     """Open a page and wait until the server answers what is done on it."""
-    driver.get_log("browser")
-    driver.get_log("performance")
-    driver.get(f"http://127.0.0.1:{server.port}/{page}?token={server.token}")
-    wait_for(driver, "return document.querySelector('.command code') !== null && window.socket?.connected")
+    opened(driver, server, page, LINE)
 
 
 def put(driver: Any, name: str, value: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from app.serving import Served, served
+from app.serving import Served, opened
 from nerif.app.crop_edits import CropEdits
 from nerif.imaging.crop import Crop
 from nerif.imaging.views import find_views
@@ -54,19 +53,10 @@ def test_steps_are_undone_and_kept():
     assert CropEdits({"b": Crop()}, edits.kept).undo() == ""  # its view has gone
 
 
-@pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Served]:
-    with served(folder) as found:
-        yield found
-
-
 def visit(driver: Any, server: Served) -> None:
     """Open the page and wait until all views have been looked at."""
-    driver.get_log("browser")
-    driver.get_log("performance")
-    driver.get(f"http://127.0.0.1:{server.port}/pictures?token={server.token}")
-    wait_for(driver, "return document.querySelectorAll('.view button').length === 3", 30)
-    wait_for(driver, "return document.querySelector('.both img.flow')?.complete && window.socket?.connected")
+    opened(driver, server, "pictures", "document.querySelectorAll('.view button').length === 3")
+    wait_for(driver, "return document.querySelector('.both img.flow')?.complete")
 
 
 def value(driver: Any, name: str) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from app.serving import Served, served
+from app.serving import Served, opened
 from app.test_pages import line
 from nerif.app.jobs import Jobs
 from nerif.app.project import Project
@@ -99,18 +98,9 @@ def test_sources_follow_the_files(folder, tmp_path):
     assert Still(copy).limits("index_excess")[0] == pytest.approx(2 * before[0])
 
 
-@pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Served]:
-    with served(folder) as found:
-        yield found
-
-
 def visit(driver: Any, server: Served) -> None:
     """Open the page and wait until it answers."""
-    driver.get_log("browser")
-    driver.get_log("performance")
-    driver.get(f"http://127.0.0.1:{server.port}/results?token={server.token}")
-    wait_for(driver, "return document.querySelector('[role=tab]') !== null && window.socket?.connected")
+    opened(driver, server, "results", "document.querySelector('[role=tab]') !== null")
 
 
 def tab(driver: Any, name: str) -> None:
