@@ -104,6 +104,7 @@ def test_a_half_is_kept_out_first_and_the_verdict_goes_by_it(jet_file):
     assert metrics["axis"]["told"] == {"shift_1": True, "shift_2": False, "lean_1": True, "lean_2": False}
 
 
+@pytest.mark.slow
 def test_a_flow_that_is_not_axisymmetric_is_not_to_be_used(tmp_path):
     measured("flame", noise=0.03).write(tmp_path / "flame.nc")
     assert main(["reconstruct", str(tmp_path / "flame.nc"), "-o", str(tmp_path / "r"), *QUICK]) == 0

@@ -244,6 +244,7 @@ def test_the_cone_of_a_rig_of_others_is_known(method):
     assert errors[0] < 0.8 * errors[1]
 
 
+@pytest.mark.slow
 def test_a_check_goes_by_the_lenses_unless_told_otherwise(wide, tmp_path, capsys):
     through = [view.agreement for view in check_consistency(wide, 12).views]
     thin = [view.agreement for view in check_consistency(wide, 12, aperture="off").views]

@@ -197,6 +197,7 @@ def test_a_check_by_a_field_that_does_not_fit_yet_says_so(measured):
     assert re.match(r"the field still leaves [\d.]+ sigma in view \S+ after 1 s", remark)
 
 
+@pytest.mark.slow
 def test_a_result_tells_how_well_its_rig_is_known_and_how_a_view_not_seen_fits_both_ways(measured, tmp_path):
     knocked(measured).write(tmp_path / "m.nc")
     out, held = tmp_path / "r", measured.names[2]

@@ -250,6 +250,7 @@ def test_a_view_that_moved_far_is_named():
     assert line.startswith("view b is not where its calibration says: shift_x 1 mm, 5.0 sigma; it looks")
 
 
+@pytest.mark.slow
 def test_the_command_line_refines_writes_and_evaluates(measured, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("nerif.reconstruction.rig_posterior.VOXELS", 6)
     wrong, _ = spoiled(measured)

@@ -205,6 +205,7 @@ def test_a_drift_of_the_light_is_fitted(balls):
     assert error(balls, NETWORK(drifting)) < 0.16
 
 
+@pytest.mark.slow
 def test_shifts_of_several_pixels_are_found_without_displacements(balls):
     far = GaussianBalls(balls.centres, balls.widths, 8 * balls.amplitudes)
     m = photographed(far)
@@ -213,6 +214,7 @@ def test_shifts_of_several_pixels_are_found_without_displacements(balls):
     assert error(far, replace(NETWORK, max_steps=400)(m)) < 0.15
 
 
+@pytest.mark.slow
 def test_pictures_go_on_from_displacements(balls, taken):
     d = predict(balls, taken.cameras, BOX, 1.00027).displacements
     both = replace(taken, displacement=d + 0.05, sigma=torch.full_like(d, 0.05))
