@@ -29,7 +29,9 @@ METHODS = [NeRIF(max_steps=30, points_per_batch=512), Tikhonov(voxels=10)]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=["nerif", "voxels"])
-@pytest.mark.parametrize("hold_out", [("45deg",), ("auto",)], ids=["held out", "auto"])
+@pytest.mark.parametrize(
+    "hold_out", [pytest.param(("45deg",), marks=pytest.mark.slow), ("auto",)], ids=["held out", "auto"]
+)
 def test_a_run_tells_how_it_goes_on(measurement, method, hold_out, tmp_path, monkeypatch):
     monkeypatch.setattr(nerif.live, "FIRST", 0.0)
     for name, value in {"SHARE": 1e9, "VOXELS": 8, "SAMPLES": 16}.items():

@@ -98,6 +98,7 @@ def test_the_rig_of_a_calibration_that_is_there(browser, server, folder):
     assert rows == [camera.name for camera in read_cameras(folder / "made.toml")]
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_camera_from_a_ruler(browser, server, folder):
     visit(browser, server)

@@ -151,6 +151,7 @@ def test_two_results_side_by_side_move_together(browser, server):
     assert [address for address in requests(browser) if not address.startswith(here)] == []
 
 
+@pytest.mark.slow
 @needs_browser
 def test_surface_report_and_export(browser, server, folder):
     visit(browser, server)  # what was chosen before is still there
