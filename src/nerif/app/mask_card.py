@@ -38,7 +38,6 @@ class MaskCard:
     def __init__(self, work: Workspace, page: str, name: str, measurement: Measurement) -> None:
         self.work, self.page, self.name, self.measurement = work, page, name, measurement
         self.edits = MaskEdits(measurement.names, work.draft(page).get("masks", {}).get(name))
-        self.out = work.project.free_name(f"{name.removesuffix('.nc')}.masked.nc")
         self.view = ui.select(list(measurement.names), label="View", value=measurement.names[0])
         self.view.props('outlined dense options-dense aria-label="View to draw in"').classes("short")
         with ui.element("div").classes("numbers"):
@@ -49,7 +48,7 @@ class MaskCard:
             button.props("flat no-caps dense")
         self.place = ui.element("div").classes("stack")
         self.told = ui.html("", sanitize=False).classes("told").props('aria-live="polite"')
-        record = Mask(Path(name), Path(self.out))
+        record = Mask(Path(name), Path("masked.nc"))
         self.job = JobForm(work, Form(record, only=SETTINGS), self._words, "Put the masks in", SETTINGS[:1])
         self.view.on_value_change(self._edit)
         self._edit()
@@ -57,7 +56,12 @@ class MaskCard:
     @property
     def folder(self) -> str:
         """Where drawn masks are written, relative to the project."""
-        return f"masks/{Path(self.name).stem}"
+        return f"masks/{self.name.removesuffix('.nc')}"
+
+    @property
+    def out(self) -> str:
+        """Measurement that is written: none that is there."""
+        return self.work.project.free_name(f"{self.name.removesuffix('.nc')}.masked.nc")
 
     def _words(self) -> list[str]:
         drawn = ["--drawn", self.folder] if self.edits.drawn else []
@@ -86,15 +90,24 @@ class MaskCard:
         draft = self.work.draft(self.page)
         masks = {**draft.get("masks", {}), self.name: self.edits.kept}
         self.work.keep(self.page, {**draft, "masks": masks})
-        with refusals():
-            for old in self.work.project.path(self.folder).glob("*.png"):
-                if old.stem not in self.edits.drawn:
-                    old.unlink()
-            if self.edits.drawn:
-                sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
-                write_masks(self.work.project.path(self.folder), self.edits.drawn, sizes)
         self.job.show()
         self._tell()
+        ui.timer(0.0, self._write, once=True)
+
+    async def _write(self) -> None:
+        """Write what is drawn as pictures, beside the page."""
+        drawn, folder = self.edits.drawn, self.work.project.path(self.folder)
+        sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
+
+        def work() -> None:
+            for old in folder.glob("*.png"):
+                if old.stem not in drawn:
+                    old.unlink()
+            if drawn:
+                write_masks(folder, drawn, sizes)
+
+        with refusals():
+            await self.work.beside(work)
 
     def _tell(self) -> None:
         views = ", ".join(self.edits.drawn) or "no view"

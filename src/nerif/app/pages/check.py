@@ -85,7 +85,7 @@ class CheckPage:
 
     async def compare(self) -> None:
         """Compare the views and show what was found."""
-        name = str(self.select.value)
+        name, arguments = str(self.select.value), self.arguments
         self.told.clear()
         with self.told:
             bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
@@ -113,9 +113,9 @@ class CheckPage:
             for text in said:
                 text_html(text, classes="told")
             if found is not None:
-                self._show(name, found)
+                self._show(name, arguments, found)
 
-    def _show(self, name: str, found: Consistency) -> None:
+    def _show(self, name: str, compared: Sequence[str], found: Consistency) -> None:
         """The verdicts, and the correction that is offered."""
         ui.html(views_table(found), sanitize=False)
         notes = "".join(f"<li>{escape(text)}</li>" for text in found.remarks)
@@ -128,17 +128,19 @@ class CheckPage:
             ui.html(f"<h3>Notes</h3><ul>{notes}</ul>", sanitize=False)
         if found.corrections:
             out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
-            arguments = [*self.arguments, "--out", out]
+            arguments = [*compared, "--out", out]
             text_html("The mistakes can be undone, in a new file:", "h3")
             line = CommandLine()
             line.show(arguments)
 
             def correct() -> None:
                 with refusals():
+                    button.disable()
                     self.work.jobs.add(arguments, f"Correct {name}")
                     ui.notify(f"It is in the queue; then go on with {out}, and check it again.", type="positive")
 
-            ui.button("Undo what was found", icon="auto_fix_high", on_click=correct).props("unelevated no-caps")
+            button = ui.button("Undo what was found", icon="auto_fix_high", on_click=correct)
+            button.props("unelevated no-caps")
         elif found.views and not found.findings:
             link = "<a href='/reconstruct'>Go on to Reconstruct</a>"
             ui.html(f"<p>{link}</p>", sanitize=False)

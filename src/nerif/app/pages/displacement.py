@@ -46,7 +46,9 @@ class DisplacementPage:
                     self.out.props('outlined dense aria-label="Measurement to write"')
                     record = Displacement(Path("."), Path("."), Path("measurement.nc"))
                     form = Form(record, without=BY_PAGE)
-                    self.job = JobForm(work, form, self._words, "Find all displacements", MAIN)
+                    self.job = JobForm(
+                        work, form, self._words, "Find all displacements", MAIN, lambda: str(self.out.value)
+                    )
                     for control in (self.experiment, self.calibration, self.out):
                         control.on_value_change(self._turned)
                 with card("Preview of one view", "With these settings, before all views are done."):
