@@ -298,9 +298,9 @@ class Jobs:
             [sys.executable, "-m", "nerif.app.runner", str(where)], stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
         )  # fmt: skip
-        threading.Thread(target=runner.wait, daemon=True).start()  # its end is taken note of, by the system at least
         with os.fdopen(claim, "w") as file:
             json.dump({"pid": runner.pid, "began": psutil.Process(runner.pid).create_time()}, file)
+        threading.Thread(target=runner.wait, daemon=True).start()  # only now may its number be given again
 
 
 def _json(path: Path) -> dict[str, Any]:
