@@ -63,7 +63,7 @@ def said_of(look: Look) -> str:
     level = default_level(volume)
     corners = surface_triangles(volume, level).reshape(-1, 3)
     unit = unit_shown(describe(look.quantity)[0])
-    head = f"Isosurface of {name_of(look.quantity)} at {level:.2g}{f' {unit}' if unit != '1' else ''}"
+    head = f"Isosurface of {name_of(look.quantity)} at {level:.2g} {unit}".rstrip()
     if not len(corners):
         return f"{head}: nowhere yet."
     ends = zip("xyz", np.min(corners, axis=0), np.max(corners, axis=0), strict=True)
