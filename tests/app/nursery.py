@@ -1,7 +1,7 @@
 """A process that has imported the app, and forks a server for whoever asks: the second one starts at once.
 
-Lines on standard input ask: {"words": arguments of nerif, "out": a named pipe for what it prints}. The answer is the
-number of its process.
+Lines on standard input ask: {"words": arguments of nerif, "out": a named pipe for what it prints, "by": command
+that starts it instead, if it holds any words}. The answer is the number of its process.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ def main() -> None:
             os.dup2(out, 1)
             os.dup2(out, 2)
             os.close(out)
+            if asked["by"]:
+                os.execvp(asked["by"][0], [*asked["by"], sys.executable, "-m", "nerif", *asked["words"]])
             sys.exit(nerif(asked["words"]))
         print(number, flush=True)
 

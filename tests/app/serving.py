@@ -87,23 +87,23 @@ def nursery() -> subprocess.Popen[str]:
     return process
 
 
-def forked(words: Sequence[str], out: Path) -> tuple[int, IO[str]]:
+def forked(words: Sequence[str], out: Path, by: Sequence[str] = ()) -> tuple[int, IO[str]]:
     """Let the nursery start `nerif ...`: process number, and what it prints."""
     process = nursery()
     assert process.stdin is not None
     assert process.stdout is not None
     os.mkfifo(out)
-    process.stdin.write(json.dumps({"words": list(words), "out": str(out)}) + "\n")
+    process.stdin.write(json.dumps({"words": list(words), "out": str(out), "by": list(by)}) + "\n")
     process.stdin.flush()
     return int(process.stdout.readline()), out.open()
 
 
 @contextmanager
-def served(folder: Path, *arguments: str, port: int | None = None) -> Iterator[Served]:
-    """Start nerif app on a folder, and end it by Ctrl-C."""
+def served(folder: Path, *arguments: str, port: int | None = None, by: Sequence[str] = ()) -> Iterator[Served]:
+    """Start nerif app on a folder, by way of another command if one is given, and end it by Ctrl-C."""
     words = ["app", str(folder), "--no-browser", "--port", str(port or free_port()), *arguments]
     with TemporaryDirectory() as place:
-        pid, printed = forked(words, Path(place) / "out")
+        pid, printed = forked(words, Path(place) / "out", by)
         with printed:
             try:
                 yield answering(pid, printed)
