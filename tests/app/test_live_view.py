@@ -37,18 +37,22 @@ def look(directory: Path, radius: float, seconds: float) -> None:
     part.replace(directory / LIVE_LOOK)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that has ended after two steps."""
-    found = tmp_path_factory.mktemp("project")
-    look(found / OUT, 6.0, 1.0)
+def watched(folder: Path) -> None:
+    """Leave a run that has ended after two steps."""
+    look(folder / OUT, 6.0, 1.0)
     live = {"title": "training", "step": 2, "seconds": 1.0, "progress": 1.0, "losses": {"loss": 0.5}}
     live |= {"written": time.time(), "view": "0", "curve": {"seconds": [0.5, 1.0], "step": [1, 2], "loss": [1, 0.5]}}
-    write_json(found / OUT / LIVE, live)
-    jobs = Jobs(found)
+    write_json(folder / OUT / LIVE, live)
+    jobs = Jobs(folder)
     job = jobs.add(["reconstruct", "m.nc", "--out", OUT, "--live"], "m.nc", OUT)
     write_json(jobs.directory / job.id / "started.json", {"pid": 1, "began": 0.0, "time": 1.0})
     write_json(jobs.directory / job.id / "ended.json", {"code": 0, "time": 2.0})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("project")
+    watched(found)
     return found
 
 
