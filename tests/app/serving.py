@@ -100,7 +100,7 @@ def forked(words: Sequence[str], out: Path, by: Sequence[str] = ()) -> tuple[int
 
 @contextmanager
 def served(folder: Path, *arguments: str, port: int | None = None, by: Sequence[str] = ()) -> Iterator[Served]:
-    """Start nerif app on a folder, by way of another command if one is given, and end it by Ctrl-C."""
+    """Start nerif app on a folder, by way of another command if one is given, and end it by force."""
     words = ["app", str(folder), "--no-browser", "--port", str(port or free_port()), *arguments]
     with TemporaryDirectory() as place:
         pid, printed = forked(words, Path(place) / "out", by)
@@ -122,15 +122,14 @@ def answering(pid: int, printed: Iterable[str]) -> Served:
 
 
 def end(pid: int, printed: IO[str]) -> None:
-    """End a server by Ctrl-C, by force if it does not heed it; one that has ended is left alone."""
-    for wish, seconds in ((signal.SIGINT, 20.0), (signal.SIGKILL, 20.0)):
-        with suppress(ProcessLookupError):
-            os.kill(pid, wish)
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            ready, _, _ = select.select([printed], [], [], 0.2)
-            if ready and not os.read(printed.fileno(), 65536):  # nobody can write into it any more
-                return
+    """End a server at once; one that has ended is left alone."""
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+    until = time.monotonic() + 20
+    while time.monotonic() < until:
+        ready, _, _ = select.select([printed], [], [], 0.2)
+        if ready and not os.read(printed.fileno(), 65536):  # nobody can write into it any more
+            return
     raise AssertionError(f"process {pid} does not end")
 
 

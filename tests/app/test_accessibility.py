@@ -91,7 +91,8 @@ def seen(driver: Any, server: Served, page: Page, size: tuple[int, int], dark: b
 
 
 CASES = [
-    pytest.param(LAPTOP, False, id="laptop, light"), pytest.param(LARGE, True, id="4K, dark"),
+    pytest.param(LAPTOP, False, id="laptop, light"),
+    pytest.param(LARGE, True, id="4K, dark", marks=pytest.mark.slow),
     pytest.param(LAPTOP, True, id="laptop, dark", marks=pytest.mark.slow),
     pytest.param(LARGE, False, id="4K, light", marks=pytest.mark.slow),
 ]  # fmt: skip
