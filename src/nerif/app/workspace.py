@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from nerif.app.jobs import Jobs
+from nerif.app.picture_files import PictureFiles
 from nerif.app.project import Project
 from nerif.json_file import write_json
 
@@ -32,7 +33,7 @@ class Workspace:
     """
 
     def __init__(self, project: Project) -> None:
-        self.project, self.jobs = project, Jobs(project.folder)
+        self.project, self.jobs, self.files = project, Jobs(project.folder), PictureFiles(project)
         self._drafts: dict[str, dict[str, Any]] = {}
 
     @property
