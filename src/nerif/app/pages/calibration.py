@@ -86,7 +86,7 @@ class CalibrationPage:
                     self.told = ui.element("div").props("role=status aria-live=polite")
                 with card("The rig"):
                     self.calibration = self._select("Calibration", list(found.calibrations), None)
-                    self.rig = ui.element("div")
+                    self.rig = ui.element("div").classes("rig")
                 with card("Pictures of the target", "Circles: points found, the first one filled. What is left out is "
                           "part of the command line; calibrate again after it."):  # fmt: skip
                     self.view = self._select("View", [], None)
