@@ -25,6 +25,7 @@ FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--enable-unsafe-swiftshader", "--hide-scrollbars",
 )  # fmt: skip
+LONGEST = 180.0  # seconds that are waited for anything
 SETTLES = 6.0  # seconds until pictures and 3-D views of a page have come
 ROAD = (
     "render -o pictures --phantom flame --views 4 --arc 0 135 --image-size 96 96 --pixel-pitch 0.043 "
@@ -35,6 +36,15 @@ ROAD = (
     "reconstruct measurement.nc -o results/flame --time-limit 20 --voxels 48 --uncertainty fast",
     "reconstruct measurement.nc -o results/flame-tv --method tv --voxels 32",
 )
+
+
+TYPED = {"displacement": {"lower": "-25 -25 -25", "upper": "25 25 25"}}  # by page
+LOOKS = {
+    "displacement": ("Preview", "document.querySelectorAll('.pictures img').length > 2", 4.0, False),
+    "check": ("Compare the views", "document.querySelector('.tabled table')", 1.0, False),
+    "reconstruct": ("Start", "document.querySelector('.live-surface canvas')", 40.0, True),
+}
+"""Pages on which something is done first: the button, what is waited for, seconds more, whether to scroll to it."""
 
 
 def nerif(folder: Path, line: str) -> None:
@@ -73,6 +83,32 @@ def chromium(profile: Path) -> Any:
     return driver
 
 
+def press(driver: Any, label: str) -> None:
+    """Press the first button of a page with these words that is seen."""
+    buttons = driver.find_elements("xpath", f"//main//button[contains(., '{label}')]")
+    driver.execute_script("arguments[0].click()", next(button for button in buttons if button.is_displayed()))
+
+
+def wait_for(driver: Any, script: str) -> None:
+    """Wait until a page says yes."""
+    end = time.monotonic() + LONGEST
+    while not driver.execute_script(f"return Boolean({script})"):
+        if time.monotonic() > end:
+            sys.exit(f"waited in vain for {script}")
+        time.sleep(0.2)
+
+
+def do(driver: Any, button: str, there: str, seconds: float, scroll: bool) -> None:
+    """Press a button and wait for what comes of it."""
+    press(driver, button)
+    wait_for(driver, there)
+    time.sleep(seconds)
+    if scroll:
+        driver.execute_script("document.querySelector('section[aria-label=\"The run\"]').scrollIntoView()")
+        driver.execute_script("scrollBy(0, -70)")
+        time.sleep(1.0)
+
+
 def draw(pictures: Path, project: Path) -> None:
     """Write a picture of every page of a project."""
     pictures.mkdir(parents=True, exist_ok=True)
@@ -84,7 +120,15 @@ def draw(pictures: Path, project: Path) -> None:
             for page in PAGES:
                 driver.get(base + page.path)
                 time.sleep(SETTLES)
+                for name, value in TYPED.get(page.name, {}).items():
+                    driver.find_element("css selector", f"input[name='{name}']").send_keys(value)
+                    time.sleep(1.0)
+                if page.name in LOOKS:
+                    do(driver, *LOOKS[page.name])
                 driver.save_screenshot(str(pictures / f"{page.name}.png"))
+                if page.name == "reconstruct":
+                    press(driver, "Stop")
+                    wait_for(driver, "document.querySelector('.told').textContent.includes('Stopped')")
         finally:
             driver.quit()
 

@@ -25,7 +25,7 @@ def measurement():
     return Simulation(phantom="gaussians", truth_voxels=6)(RING.cameras())[0]
 
 
-METHODS = [NeRIF(max_steps=30, points_per_batch=512), Tikhonov(voxels=10)]
+METHODS = [NeRIF(max_steps=10, points_per_batch=256), Tikhonov(voxels=8, iterations=10)]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=["nerif", "voxels"])

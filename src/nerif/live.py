@@ -22,7 +22,7 @@ import torch
 
 from nerif.atomic import atomic
 from nerif.fields.base import Field
-from nerif.geometry import Grid
+from nerif.geometry import Box, Grid
 from nerif.json_file import write_json
 from nerif.measurement import Measurement
 from nerif.monitor import Monitor
@@ -33,6 +33,7 @@ from nerif.reconstruction.trials import best_covered
 from nerif.result import LIVE, LIVE_LOOK
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import AUTO, forward_model
+from nerif.volume import Volume, describe
 
 __all__ = ["Live", "Look", "read_live", "read_look"]
 
@@ -67,14 +68,20 @@ class Look:
     seconds: float
     quantity: str
     values: np.ndarray
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
     view: str
     held_out: bool
     measured: np.ndarray
     predicted: np.ndarray
     components: tuple[str, ...]
     unit: str
+
+    @property
+    def volume(self) -> Volume:
+        """The field on its voxels."""
+        grid = Grid(Box(self.lower, self.upper), self.values.shape)
+        return Volume(torch.from_numpy(self.values), grid, self.quantity, describe(self.quantity)[0])
 
 
 class Live:

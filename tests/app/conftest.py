@@ -1,4 +1,4 @@
-"""A browser and a server for the tests of the app."""
+"""A browser for the tests of the app, one for all files and as new for each, and a server."""
 
 from __future__ import annotations
 
@@ -12,13 +12,22 @@ from app.serving import Served, served
 from report.browsing import open_browser
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A fresh Chromium with a window of a laptop."""
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A fresh Chromium."""
     driver = open_browser(tmp_path_factory.mktemp("browser"))
-    driver.set_window_size(1440, 900)
     yield driver
     driver.quit()
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: Any) -> Any:
+    """The browser with a window of a laptop, in the light, at rest."""
+    chromium.get("about:blank")
+    chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    chromium.set_window_size(1440, 900)
+    return chromium
 
 
 @pytest.fixture(scope="module")

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import atexit
 import http.client
+import json
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import IO, Any
 
 from report.browsing import wait_for
 
-__all__ = ["Served", "opened", "served"]
+__all__ = ["Served", "answering", "free_port", "opened", "outside", "served"]
 
 
 @dataclass(frozen=True)
@@ -28,13 +34,13 @@ class Served:
     ----------
     link : address with the token
     port : that it listens on
-    process : of the server
+    pid : number of its process
     said : its first lines
     """
 
     link: str
     port: int
-    process: subprocess.Popen[str]
+    pid: int
     said: str
 
     @property
@@ -62,34 +68,69 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-@contextmanager
-def served(folder: Path, *arguments: str, port: int | None = None) -> Iterator[Served]:
-    """Start nerif app on a folder, and end it by Ctrl-C."""
-    words = [sys.executable, "-m", "nerif", "app", str(folder), "--no-browser", "--port", str(port or free_port())]
-    # NiceGUI behaves otherwise where it is told of a test
-    outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-    environment = {**outside, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        [*words, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-    )
+def outside() -> dict[str, str]:
+    """The environment without what tells of a test: NiceGUI behaves otherwise where it is told of one."""
+    known = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    return {**known, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+
+
+@cache
+def nursery() -> subprocess.Popen[str]:
+    """The process that forks servers, as long as these tests go on."""
+    words = [sys.executable, str(Path(__file__).with_name("nursery.py"))]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=outside())
+
+    def end() -> None:
+        process.communicate(timeout=20)
+
+    atexit.register(end)
+    return process
+
+
+def forked(words: Sequence[str], out: Path, by: Sequence[str] = ()) -> tuple[int, IO[str]]:
+    """Let the nursery start `nerif ...`: process number, and what it prints."""
+    process = nursery()
+    assert process.stdin is not None
     assert process.stdout is not None
+    os.mkfifo(out)
+    process.stdin.write(json.dumps({"words": list(words), "out": str(out), "by": list(by)}) + "\n")
+    process.stdin.flush()
+    return int(process.stdout.readline()), out.open()
+
+
+@contextmanager
+def served(folder: Path, *arguments: str, port: int | None = None, by: Sequence[str] = ()) -> Iterator[Served]:
+    """Start nerif app on a folder, by way of another command if one is given, and end it by force."""
+    words = ["app", str(folder), "--no-browser", "--port", str(port or free_port()), *arguments]
+    with TemporaryDirectory() as place:
+        pid, printed = forked(words, Path(place) / "out", by)
+        with printed:
+            try:
+                yield answering(pid, printed)
+            finally:
+                end(pid, printed)
+
+
+def answering(pid: int, printed: Iterable[str]) -> Served:
+    """Wait until a server says that it answers."""
     said = ""
-    try:
-        for line in process.stdout:
-            said += line
-            if found := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
-                yield Served(found[0], int(found[1]), process, said)
-                break
-        else:
-            raise AssertionError(f"it did not start: {said}")
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=20)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
+    for line in printed:
+        said += line
+        if found := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
+            return Served(found[0], int(found[1]), pid, said)
+    raise AssertionError(f"it did not start: {said}")
+
+
+def end(pid: int, printed: IO[str]) -> None:
+    """End a server at once; one that has ended is left alone."""
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+    until = time.monotonic() + 20
+    while time.monotonic() < until:
+        ready, _, _ = select.select([printed], [], [], 0.2)
+        if ready and not os.read(printed.fileno(), 65536):  # nobody can write into it any more
+            return
+    raise AssertionError(f"process {pid} does not end")
 
 
 def opened(driver: Any, server: Served, page: str, ready: str) -> None:

@@ -1,25 +1,53 @@
-"""Every page by the rules of axe-core (WCAG 2 A and AA), light and dark, on a laptop and on a large screen."""
+"""Every page by the rules of axe-core (WCAG 2 A and AA), light and dark, on a laptop and on a large screen.
+
+The project holds something for each page: pictures, a calibration, a measurement, results, and a run that is watched.
+"""
 
 from __future__ import annotations
 
 import importlib.resources
+from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 
-from app.serving import opened
-from app.test_pages import folder, visit
-from nerif.app.pages import PAGES
+from app.serving import Served, opened
+from app.test_calibration import TARGET
+from app.test_live_view import watched
+from app.test_pages import visit
+from app.test_results import result
+from nerif.app.pages import PAGES, Page
+from nerif.geometry import Ring
+from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
+from nerif.simulation import Simulation
 from report.browsing import errors, needs_browser, requests, wait_for
 
 pytestmark = needs_browser
-__all__ = ["folder"]
-
 LAPTOP, LARGE = (1280, 800), (3840, 2160)
 RULES = """
 const done = arguments[arguments.length - 1];
 axe.run(document, {runOnly: ["wcag2a", "wcag2aa"], resultTypes: ["violations"]}).then(
     found => done(found.violations.map(v => [v.id, v.help, v.nodes.map(n => n.html.slice(0, 160)).slice(0, 4)])));
+"""
+
+
+THERE = {
+    "design": "document.querySelector('.drawing svg') !== null",
+    "pictures": "document.querySelectorAll('.view button').length === 3 && document.querySelector('.cropper')",
+    "calibration": "document.querySelector('.target img') !== null && document.querySelector('.tabled') !== null",
+    "displacement": "document.querySelector('.cropper img') !== null",
+    "check": "document.querySelector('.command code') !== null",
+    "reconstruct": "document.querySelector('.live-surface canvas') !== null",
+    "results": "document.querySelectorAll('.cuts img[src]').length === 3",
+}
+"""What a page shows once all of it is there."""
+FOCUS = """
+const e = document.activeElement, own = getComputedStyle(e);
+const box = getComputedStyle(e.closest('.q-field__control') ?? e);
+const ring = own.outlineStyle !== 'none' ? own : box;
+return [e.ariaLabel, `${ring.outlineStyle} ${ring.outlineWidth}`, e.getBoundingClientRect().top];
 """
 
 
@@ -34,32 +62,51 @@ def settled(driver: Any) -> None:
                      ".iterations === Infinity)")  # fmt: skip
 
 
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_page_breaks_no_rule(browser, server, page, dark):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("project")
+    ring = Ring(views=3, arc=(20.0, 100.0), image_size=(24, 30), pixel_pitch=0.2)
+    board = (40 + 170 * TARGET.raster(3.0)).astype(np.uint8)
+    for camera in ring.cameras():
+        for source in ("target", "background", "reference", "flow"):
+            (found / "run" / camera.name / source).mkdir(parents=True)
+            iio.imwrite(found / "run" / camera.name / source / "p.png", board)
+    write_cameras(found / "calibration.toml", [CalibratedCamera.from_camera(camera) for camera in ring.cameras()])
+    Simulation(phantom="gaussians", truth_voxels=6)(ring.cameras())[0].write(found / "m.nc")
+    result(found / "results" / "a", 12, 0.0)
+    watched(found)
+    return found
+
+
+def seen(driver: Any, server: Served, page: Page, size: tuple[int, int], dark: bool) -> list[Any]:
+    """Open a page once all of it is there, and return the rules that it breaks."""
     scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(*LAPTOP))
-    opened(browser, server, page.path.lstrip("/"), "document.querySelector('main h1') !== null")
-    wait_for(browser, f"return document.body.classList.contains('body--dark') === {str(dark).lower()}")
-    settled(browser)
-    browser.execute_script(axe())
-    found = browser.execute_async_script(RULES)
-    assert found == []
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(*size))
+    opened(driver, server, page.path.lstrip("/"), THERE[page.name])
+    wait_for(driver, f"return document.body.classList.contains('body--dark') === {str(dark).lower()}")
+    settled(driver)
+    driver.execute_script(axe())
+    return list(driver.execute_async_script(RULES))
+
+
+CASES = [
+    pytest.param(LAPTOP, False, id="laptop, light"),
+    pytest.param(LARGE, True, id="4K, dark", marks=pytest.mark.slow),
+    pytest.param(LAPTOP, True, id="laptop, dark", marks=pytest.mark.slow),
+    pytest.param(LARGE, False, id="4K, light", marks=pytest.mark.slow),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("size", "dark"), CASES)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_breaks_no_rule_fits_and_asks_nobody_else(browser, server, page, size, dark):
+    assert seen(browser, server, page, size, dark) == []
+    wide = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
+    assert wide <= 0
     assert errors(browser) == []
     here = f"http://127.0.0.1:{server.port}/", f"ws://127.0.0.1:{server.port}/"
     assert [address for address in requests(browser) if not address.startswith(here)] == []
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
-
-
-@pytest.mark.parametrize("size", [LAPTOP, LARGE], ids=["laptop", "4K"])
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_page_fits_the_screen(browser, server, page, size):
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(*size))
-    opened(browser, server, page.path.lstrip("/"), "document.querySelector('main h1') !== null")
-    wide = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
-    assert wide <= 0
-    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def metrics(width: int, height: int) -> dict[str, Any]:
@@ -67,12 +114,30 @@ def metrics(width: int, height: int) -> dict[str, Any]:
     return {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
 
 
-def test_the_first_key_leads_past_the_navigation(browser, server):
+def test_a_broken_rule_is_found(browser, server):
+    visit(browser, server, "design")
+    browser.execute_script("document.querySelector('main').append(document.createElement('button'))")
+    browser.execute_script(axe())
+    assert [rule for rule, *_ in browser.execute_async_script(RULES)] == ["button-name"]
+
+
+def test_a_page_is_used_without_a_mouse(browser, server):
+    """The first key leads past the navigation; then controls come in their order, and are seen to have the focus."""
     from selenium.webdriver.common.keys import Keys
 
     visit(browser, server, "design")
-    body = browser.find_element("tag name", "body")
-    body.send_keys(Keys.TAB)
+    browser.find_element("tag name", "body").send_keys(Keys.TAB)
     assert browser.execute_script("return document.activeElement.className") == "skip"
     browser.switch_to.active_element.send_keys(Keys.ENTER)
     wait_for(browser, "return document.activeElement.id === 'main'")
+    names = []
+    for _ in range(6):
+        browser.switch_to.active_element.send_keys(Keys.TAB)
+        name, outline, top = browser.execute_script(FOCUS)
+        names.append(name)
+        assert outline not in ("", "none 0px"), name
+        assert 0 <= top <= browser.execute_script("return innerHeight"), name
+    assert names == [
+        "Focal length (mm)", "Focal length (mm), slider", "F number", "F number, slider", "Pixel pitch (mm)",
+        "Pixel pitch (mm), slider",
+    ]  # fmt: skip

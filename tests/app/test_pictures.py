@@ -11,6 +11,8 @@ import pytest
 
 from app.serving import Served, opened
 from nerif.app.crop_edits import CropEdits
+from nerif.app.picture_files import PictureFiles
+from nerif.app.project import Project
 from nerif.imaging.crop import Crop
 from nerif.imaging.views import find_views
 from report.browsing import errors, needs_browser, requests, text, wait_for
@@ -134,8 +136,34 @@ def test_a_crop_is_drawn_undone_typed_kept_and_written(browser, server, folder):
     visit(browser, server)  # a reload loses nothing
     assert value(browser, "width") == "20"
     click(browser, "Save to views.toml")
-    wait_for(browser, "return document.querySelector('.closer p[role=status]').textContent.startsWith('The commands')")
+    wait_for(browser, "return document.querySelector('.closer p[role=status]')?.textContent.startsWith('The commands')")
     crops = {view.name: view.crop for view in find_views(folder / "run")}
     assert crops["cam1"] == Crop(row=12, column=16, height=12, width=20)
     assert crops["cam <2>"] is None
+    assert errors(browser) == []
+
+
+def test_pictures_are_kept_until_their_files_change(folder, monkeypatch):
+    files = PictureFiles(Project(folder))
+    view = next(v for v in find_views(folder / "run") if v.name == "cam1")
+    monkeypatch.setattr("nerif.app.picture_files.MOST", 2)
+    first = files.picture(view, "flow", 0, 280, None)
+    assert files.picture(view, "flow", 0, 280, None) is first
+    files.picture(view, "flow", 1, 280, None)
+    assert files.picture(view, "flow", 0, 280, None) is first  # it is the other one that was asked for longer ago
+    files.picture(view, "flow", 0, 32, None)
+    assert files.picture(view, "flow", 0, 280, None) is first
+    iio.imwrite(folder / "run" / "cam1" / "flow" / "p0.png", np.full((HEIGHT, WIDTH), 90, np.uint8))
+    assert files.picture(view, "flow", 0, 280, None) != first
+
+
+@needs_browser
+def test_the_view_that_is_chosen_last_is_the_one_shown_large(browser, server):
+    visit(browser, server)
+    script = "document.querySelectorAll('.view button').forEach(b => b.click())"
+    browser.execute_script(script)
+    wait_for(browser, "return document.querySelector('.closer h2')?.textContent === 'cam3'")
+    wait_for(browser, "return document.querySelectorAll('.closer .cropper').length === 1")
+    box = browser.execute_script("return document.querySelector('.cropper').getBoundingClientRect().toJSON()")
+    assert box["width"] / box["height"] == pytest.approx(WIDTH / HEIGHT, rel=0.02)
     assert errors(browser) == []

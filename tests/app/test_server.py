@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from app.serving import Served, served
+from app.serving import Served, answering, free_port, outside, served
 from nerif.app.command import App
 from nerif.app.guard import cookie_of
 from nerif.app.server import Address
@@ -120,8 +122,11 @@ def test_without_nicegui_the_remedy_is_said(tmp_path, capsys, monkeypatch):
 
 
 def test_ctrl_c_ends_it_cleanly(tmp_path: Path):
-    with served(tmp_path) as server:
-        server.process.send_signal(signal.SIGINT)
-        rest, _ = server.process.communicate(timeout=20)
-        assert server.process.returncode == 0
+    words = [sys.executable, "-m", "nerif", "app", str(tmp_path), "--no-browser", "--port", str(free_port())]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=outside()) as process:
+        assert process.stdout is not None
+        answering(process.pid, process.stdout)
+        process.send_signal(signal.SIGINT)
+        rest, _ = process.communicate(timeout=20)
+        assert process.returncode == 0
         assert "Traceback" not in rest

@@ -15,7 +15,7 @@ from nerif.imaging.crop import Crop
 __all__ = ["CropEditor"]
 
 FLIPS = {"": "None", "horizontal": "Left and right", "vertical": "Top and bottom", "both": "Both"}
-TURNS = {0: "0°", 90: "90°", 180: "180°", 270: "270°"}
+TURNS = {0: "0°", 90: "90° left", 180: "180°", 270: "90° right"}
 LEAST = 4  # px along an edge of what is drawn with the mouse: less is a slip of the hand
 NUMBERS = {"column": "Left", "row": "Top", "width": "Width", "height": "Height"}
 DRAG = """(event) => { const me = event.currentTarget, r = me.getBoundingClientRect(), mark = me.querySelector('.mark');
@@ -49,14 +49,14 @@ class CropEditor:
         self.shape, self.crop, self._changed = shape, crop, changed
         height, width = shape
         with ui.element("div").classes("cropper").on("pointerdown", self._drawn, js_handler=DRAG) as place:
-            place.style(f"aspect-ratio: {width / height:.4f}")
+            place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
             image = ui.element("img").props("draggable=false")
             image.props["src"], image.props["alt"] = address, f"Whole frame of {name}"
             self._mark = ui.element("div").classes("mark")
         with ui.element("div").classes("numbers"):
             self._numbers = {key: self._number(key, text) for key, text in NUMBERS.items()}
             self._flip = self._choice("Flip", FLIPS, "flip")
-            self._rotate = self._choice("Rotate, counter-clockwise", TURNS, "rotate")
+            self._rotate = self._choice("Rotate", TURNS, "rotate")
         self._error = ui.html("", sanitize=False).classes("error")
         self._show()
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from nicegui import ui
 
 from nerif.app.jobs_drawer import JobsDrawer
-from nerif.app.workspace import Workspace
+from nerif.app.workspace import READ_ONLY, Workspace
 
 if TYPE_CHECKING:
     from nerif.app.pages import Page
@@ -62,6 +62,8 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[Frame]
     drawer.build()
     with ui.element("main").props('id="main" tabindex="-1"').classes("page"):
         ui.html(f"<h1>{escape(page.title)}</h1><p class=lead>{escape(page.about)}</p>", sanitize=False)
+        if not work.project.writable:
+            ui.html(f"<ul class=notes><li role=status>{READ_ONLY}</li></ul>", sanitize=False)
         yield Frame(drawer)
 
 

@@ -1,4 +1,4 @@
-"""A run as it goes on: how far it is, its loss, a view as measured and as predicted, three slices of the field."""
+"""A run as it goes on: how far it is, its loss, a view measured and predicted, slices and surface of the field."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from nicegui import ui
 
 from nerif.app.jobs import Job
 from nerif.app.jobs_drawer import film_progress
+from nerif.app.live_surface import LiveSurface, said_of
 from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.conventions import unit_shown
 from nerif.drawing import colour_range, map_range
+from nerif.geometry import Box
 from nerif.live import Look, read_live, read_look
 from nerif.report.view_images import picture_address
 from nerif.result import LIVE, LIVE_LOOK
@@ -51,6 +53,7 @@ class LiveView:
                     for name, (text, icon) in BUTTONS.items()
                 }
             self.chart = ui.echart(curve_options({})).classes("curve").style("height: 260px; width: 100%")
+            self.surface = LiveSurface()
             self.look = ui.html("", sanitize=False)
         self.chart.set_visibility(False)
         ui.timer(EVERY, self._refresh)
@@ -60,6 +63,7 @@ class LiveView:
         if id and id != self.job:
             self.job, self._seen = id, {}
             self.look.set_content("")
+            self.surface.forget()
 
     async def _do(self, action: str) -> None:
         with refusals():
@@ -97,16 +101,22 @@ class LiveView:
             self.chart.options.clear()
             self.chart.options.update(curve_options(live["curve"]))
         if drawn is not None:
-            self.look.set_content(drawn)
+            pictures, box, said = drawn
+            self.look.set_content(pictures)
+            if said:
+                self.surface.show(job.out, self._seen[LIVE_LOOK], box, said)
 
-    def _changed(self, out: Path, job: Job) -> tuple[dict[str, Any], str | None]:
-        """What the run tells, and the pictures of its last look where there is a new one."""
+    def _changed(self, out: Path, job: Job) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
+        """What the run tells; of its last look, where there is a new one, pictures, box, and its surface in words."""
         stamp = _stamp(out / LIVE_LOOK)
         drawn = None
         if stamp and stamp != self._seen.get(LIVE_LOOK):
             self._seen[LIVE_LOOK] = stamp
             look = read_look(out)
-            drawn = None if look is None else look_html(look)
+            if look is not None:
+                volume = look.volume  # a flat one has no surface
+                said = said_of(look) if min(volume.grid.shape) > 1 else ""
+                drawn = look_html(look), volume.grid.box, said
         if (new := _stamp(out / LIVE)) != self._seen.get(LIVE):
             self._seen[LIVE], self._seen["live"] = new, read_live(out)
         return self._seen.get("live", {}), drawn

@@ -47,7 +47,7 @@ class MaskEditor:
             self._width = ui.number("Width of the brush", value=8, min=1, step=1, suffix="px").props("outlined dense")
             self._width.props['aria-label'] = "Width of the brush (px)"
         with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as place:
-            place.style(f"aspect-ratio: {width / height:.4f}")
+            place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
             image = ui.element("img").props("draggable=false")
             image.props["src"], image.props["alt"] = address, f"Size of what was measured in view {name}"
             self._over = ui.html("", sanitize=False).classes("over")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections import OrderedDict
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from nerif.app.project import Project
@@ -28,7 +30,8 @@ class PictureFiles:
 
     def __init__(self, project: Project) -> None:
         self.project = project
-        self._kept: dict[tuple[Any, ...], Any] = {}
+        self._kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()  # what was asked for last at its end
+        self._lock = Lock()  # of what is kept: pages ask in threads
 
     def stamp(self, view: View, source: str) -> tuple[Any, ...]:
         """Return what changes with the files of a source."""
@@ -66,9 +69,13 @@ class PictureFiles:
     def _once(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
         key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, what
         stamp = self.stamp(view, source) if source in view.sources else ()
-        kept = self._kept.get(key)
+        with self._lock:
+            kept = self._kept.get(key)
         if kept is None or kept[0] != stamp:
-            if len(self._kept) > MOST:
-                self._kept.clear()
-            kept = self._kept[key] = (stamp, read())
+            kept = (stamp, read())
+        with self._lock:
+            self._kept[key] = kept
+            self._kept.move_to_end(key)
+            while len(self._kept) > MOST:
+                self._kept.popitem(last=False)
         return kept[1]

@@ -71,6 +71,11 @@ class Project:
         """Name of the folder."""
         return self.folder.name or str(self.folder)
 
+    @property
+    def writable(self) -> bool:
+        """Whether files may be written into the folder; where they may not, everything can still be looked at."""
+        return os.access(self.folder, os.W_OK)
+
     def path(self, name: str | os.PathLike[str]) -> Path:
         """Return the path of something in the folder, whether it is there or not.
 

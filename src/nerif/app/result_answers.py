@@ -1,4 +1,4 @@
-"""Answers of the server beside its pages: the report of a result, and the isosurface of a quantity.
+"""Answers of the server beside its pages: the report of a result, isosurfaces of a quantity and of a run that goes on.
 
 A report is a page that somebody may have been sent: it stands in a sandbox of its own, with no way to this server.
 """
@@ -15,10 +15,11 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from nerif.app.sources import source_of
 from nerif.app.workspace import Workspace
 from nerif.conventions import InputError
-from nerif.report.isosurface import stl_of, surface_triangles
+from nerif.live import read_look
+from nerif.report.isosurface import default_level, stl_of, surface_triangles
 from nerif.result import REPORT
 
-__all__ = ["ROUTES", "report_address", "report_file", "surface_address"]
+__all__ = ["ROUTES", "live_address", "report_address", "report_file", "surface_address"]
 
 SANDBOX = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -43,6 +44,11 @@ def surface_address(name: str, quantity: str, level: float, frame: int, stamp: i
     """Return the address of an isosurface."""
     asked = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
     return "/surface?" + urlencode(asked, quote_via=quote)
+
+
+def live_address(name: str, stamp: int) -> str:
+    """Return the address of the isosurface of a run's last look."""
+    return "/live-surface?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
 
 
 def _report(work: Workspace) -> Answer:
@@ -75,5 +81,23 @@ def _surface(work: Workspace) -> Answer:
     return answer
 
 
-ROUTES: dict[str, Callable[[Workspace], Answer]] = {"/report": _report, "/surface": _surface}
+def _live(work: Workspace) -> Answer:
+    def made(name: str) -> bytes:
+        look = read_look(work.project.path(name))
+        if look is None:
+            raise InputError("There is no look at the field yet.")
+        volume = look.volume
+        return stl_of(surface_triangles(volume, default_level(volume)))
+
+    async def answer(request: Request) -> Response:
+        try:
+            stl = await work.beside(made, request.query_params.get("of", ""))
+        except InputError as error:
+            return PlainTextResponse(str(error), 404)
+        return Response(stl, media_type="model/stl", headers={"cache-control": KEPT})
+
+    return answer
+
+
+ROUTES: dict[str, Callable[[Workspace], Answer]] = {"/report": _report, "/surface": _surface, "/live-surface": _live}
 """Paths, and what makes their answer."""

@@ -21,6 +21,7 @@ __all__ = ["Rig", "read_rig", "show_rig"]
 
 SIZE = 5.0  # of the rig in the scene
 TIP = 0.18  # of the rig: length of the pyramid of a camera
+BEYOND = "#bcc5cd"  # colour of what the camera sees beyond that, as far as its background
 HEAD = ("Camera", "Picture [px]", "Focal length [px]", "Place x, y, z [mm]", "Pictures used", "rms [px]")
 
 
@@ -82,7 +83,8 @@ def show_rig(rig: Rig) -> None:
             outline(tips, colour)
             for start, tip in zip(corners.start, tips, strict=True):
                 line(start, tip, colour)
-            line(corners.start.mean(axis=0), corners.end.mean(axis=0), "#a9b3bc")
+            for tip, end in zip(tips, corners.end, strict=True):
+                line(tip, end, BEYOND)
             if one.background is not None:
                 outline(corners.end, colour)
             at = (corners.start.mean(axis=0) - 0.04 * reach * corners.direction.mean(axis=0) - centre) * scale
@@ -111,7 +113,7 @@ def _table(cameras: Sequence[Camera], errors: Sequence[ImageError]) -> str:
         height, width = camera.image_size
         used = f"{sum(e.used for e in own)} of {len(own)}" if own else "not told"
         rms = f"{rms_of(own):.3f}" if any(e.used for e in own) else "not told"
-        place = ", ".join(f"{float(x):.1f}" for x in camera.centre)
+        place = ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in camera.centre)
         cells = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
         line = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
         rows.append(f"<tr><th scope=row>{escape(camera.name)}</th>{line}</tr>")

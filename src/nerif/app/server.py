@@ -21,7 +21,7 @@ from nerif.app.guard import Guard
 from nerif.app.pages import PAGES, Page
 from nerif.app.project import Project
 from nerif.app.result_answers import ROUTES
-from nerif.app.workspace import Workspace
+from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.commands.output import say
 from nerif.conventions import InputError
 
@@ -95,6 +95,8 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
         If the folder is none.
     """
     work = Workspace(Project(folder))
+    if not work.project.writable:
+        say(f"note: {READ_ONLY}")
     app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
     app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
     for path, answer in ROUTES.items():

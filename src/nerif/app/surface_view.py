@@ -8,6 +8,7 @@ from html import escape
 
 from nicegui import ui
 
+from nerif.app.box_scene import BoxScene
 from nerif.app.range_slider import RangeSlider
 from nerif.app.result_answers import surface_address
 from nerif.geometry import Box
@@ -15,7 +16,6 @@ from nerif.geometry import Box
 __all__ = ["Surface", "SurfaceView"]
 
 STEPS = 100  # of the slider
-SIZE = 4.0  # of the longest edge of the box in the scene
 COLOURS = (("#4aa3dd", 1.0), ("#e8853a", 0.55))  # and how opaque
 
 
@@ -48,7 +48,7 @@ class SurfaceView:
     """
 
     def __init__(self, quantity: str, unit: str, limits: tuple[float, float], level: float, box: Box) -> None:
-        self.quantity, self.box, self.limits = quantity, box, limits
+        self.quantity, self.limits = quantity, limits
         self.surfaces: Sequence[Surface] = ()
         low, high = limits
         step = round((level - low) / ((high - low) or 1.0) * STEPS)
@@ -59,11 +59,8 @@ class SurfaceView:
         label = f"Level{f', {unit}' if unit else ''}"
         self._slider = RangeSlider(label, STEPS, min(max(step, 1), STEPS - 1), self._text, move, settled=True)
         self._named = ui.html("", sanitize=False)
-        camera = ui.scene.perspective_camera(fov=38)
         # named for those who do not see it: what it shows is in the slices too
-        self.scene = ui.scene(width=1080, height=480, grid=False, camera=camera, background_color="#eef1f4")
-        self.scene.classes("surface").props('role=img aria-label="Isosurface; drag to turn, scroll to come nearer"')
-        self.scene.move_camera(6.0, -6.9, 3.9, 0, 0, -0.3, duration=0)
+        self.scene = BoxScene(box, "Isosurface; drag to turn, scroll to come nearer")
 
     @property
     def level(self) -> float:
@@ -81,22 +78,10 @@ class SurfaceView:
         self._draw()
 
     def _draw(self) -> None:
-        scale = SIZE / max(self.box.edges)
         self.scene.clear()
-        with self.scene:
-            lower, upper = self.box.lower, self.box.upper
-            corners = [
-                [(upper if i >> a & 1 else lower)[a] * scale - self.box.centre[a] * scale for a in range(3)]
-                for i in range(8)
-            ]
-            for i in range(8):
-                for a in range(3):
-                    if not i >> a & 1:
-                        self.scene.line(corners[i], corners[i | 1 << a]).material("#76838f")
-            for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False):
-                address = surface_address(surface.name, self.quantity, self.level, surface.frame, surface.stamp)
-                x, y, z = (-c * scale for c in self.box.centre)
-                self.scene.stl(address).material(colour, opacity, side="both").scale(scale).move(x, y, z)
+        for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False):
+            address = surface_address(surface.name, self.quantity, self.level, surface.frame, surface.stamp)
+            self.scene.add(address, colour, opacity)
         names = "".join(
             f"<li><i style='background:{colour};opacity:{opacity}'></i>{escape(surface.name)}</li>"
             for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False)

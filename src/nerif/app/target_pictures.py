@@ -7,7 +7,6 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.app.picture_files import PictureFiles
 from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.conventions import InputError
@@ -27,12 +26,11 @@ class TargetPictures:
     Parameters
     ----------
     work : Workspace
-    files : of its project
     toggled : told the name of a picture that is left out, or taken again
     """
 
-    def __init__(self, work: Workspace, files: PictureFiles, toggled: Callable[[str], None]) -> None:
-        self.work, self.files, self._toggled = work, files, toggled
+    def __init__(self, work: Workspace, toggled: Callable[[str], None]) -> None:
+        self.work, self.files, self._toggled = work, work.files, toggled
         self._turn = 0
         self._place = ui.element("div").classes("stack")
 

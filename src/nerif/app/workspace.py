@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from nerif.app.jobs import Jobs
+from nerif.app.picture_files import PictureFiles
 from nerif.app.project import Project
 from nerif.json_file import write_json
 
-__all__ = ["Workspace"]
+__all__ = ["READ_ONLY", "Workspace"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS)
+READ_ONLY = "This folder may not be written to: everything can be looked at, and nothing kept or started."
+"""What is said of such a folder."""
 
 
 class Workspace:
@@ -27,7 +33,7 @@ class Workspace:
     """
 
     def __init__(self, project: Project) -> None:
-        self.project, self.jobs = project, Jobs(project.folder)
+        self.project, self.jobs, self.files = project, Jobs(project.folder), PictureFiles(project)
         self._drafts: dict[str, dict[str, Any]] = {}
 
     @property
@@ -50,8 +56,9 @@ class Workspace:
         try:
             self._file.parent.mkdir(exist_ok=True)
             write_json(self._file, self._drafts)
-        except PermissionError:
-            return
+        except OSError as error:
+            if error.errno not in NOT_WRITABLE:
+                raise
 
     async def beside(self, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
         """Do blocking work in a thread, while pages go on answering; its InputError comes back as it is."""

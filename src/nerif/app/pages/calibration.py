@@ -12,7 +12,6 @@ from nicegui import ui
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.pages.page import Page
-from nerif.app.picture_files import PictureFiles
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.project import Contents
 from nerif.app.rig_scene import read_rig, show_rig
@@ -54,7 +53,7 @@ class CalibrationPage:
     """The page in one tab."""
 
     def __init__(self, work: Workspace, found: Contents) -> None:
-        self.work, self.found, self.files = work, found, PictureFiles(work.project)
+        self.work, self.found = work, found
         kept = work.draft(PAGE.name)
         self.kept = dict(kept)
         self.left_out: dict[str, list[str]] = {k: list(v) for k, v in kept.get("leave_out", {}).items()}
@@ -87,11 +86,11 @@ class CalibrationPage:
                     self.told = ui.element("div").props("role=status aria-live=polite")
                 with card("The rig"):
                     self.calibration = self._select("Calibration", list(found.calibrations), None)
-                    self.rig = ui.element("div")
+                    self.rig = ui.element("div").classes("rig")
                 with card("Pictures of the target", "Circles: points found, the first one filled. What is left out is "
                           "part of the command line; calibrate again after it."):  # fmt: skip
                     self.view = self._select("View", [], None)
-                    self.pictures = TargetPictures(work, self.files, self._toggled)
+                    self.pictures = TargetPictures(work, self._toggled)
 
     def _select(self, label: str, options: Any, value: Any) -> ui.select:
         select = ui.select(options, label=label, value=value).props("outlined dense options-dense").classes("short")

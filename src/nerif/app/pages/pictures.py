@@ -13,7 +13,6 @@ from nerif.app.crop_editor import CropEditor
 from nerif.app.crop_edits import CropEdits
 from nerif.app.histogram import histogram
 from nerif.app.pages.page import Page
-from nerif.app.picture_files import PictureFiles
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.conventions import InputError
@@ -34,13 +33,14 @@ class PicturesPage:
     """The page in one tab."""
 
     def __init__(self, work: Workspace, experiments: Sequence[str]) -> None:
-        self.work, self.experiments, self.files = work, experiments, PictureFiles(work.project)
+        self.work, self.experiments, self.files = work, experiments, work.files
         kept = work.draft(PAGE.name)
         known = str(kept.get("experiment", ""))
         self.experiment = known if known in experiments else experiments[0]
         self.chosen, self.kept, self.most = str(kept.get("view", "")), dict(kept.get("edits", {})), MOST
         self.views: dict[str, View] = {}
-        self.turn = 0  # of building
+        self.turn, self.closer_turn = 0, 0  # of building, and of showing a view large
+        self.first: dict[str, int] = {}
         self.editor: CropEditor | None = None
         with ui.element("div").classes("stack"):
             with card("Folder of pictures"):
@@ -144,21 +144,25 @@ class PicturesPage:
 
     async def _closer(self) -> None:
         """Show the chosen view large, with what it is cropped to."""
-        view = self.views.get(self.chosen)
+        self.closer_turn += 1
+        turn, view = self.closer_turn, self.views.get(self.chosen)
         self.closer.clear()
         self.editor = None
         if view is None:
             return
         said: list[str] = []
-        self.first: dict[str, int] = {}
+        first: dict[str, int] = {}
         frame, address = (0, 0), ""
         for source in SOURCES:
             with refusals(said.append):
                 look = await self.work.beside(self.files.look, view, source, self.most)
-                self.first[source] = look.first
+                first[source] = look.first
                 if not address:
                     address = await self.work.beside(self.files.picture, view, source, look.first, LARGE, None)
                     frame = look.frame_shape
+        if turn != self.closer_turn:  # another view has been chosen meanwhile
+            return
+        self.first = first
         with self.closer, card(view.name, "Drag over the whole frame to crop it, or type; the result is on the right."):
             self.closer.classes("closer")
             if not address:
@@ -225,7 +229,7 @@ class PicturesPage:
         for source, first in self.first.items():
             with refusals():
                 shown[source] = await self.work.beside(self.files.picture, view, source, first, LARGE, crop)
-        if shown:
+        if shown and (view, crop) == (self.views.get(self.chosen), self.edits.now.get(self.chosen)):
             one = next(iter(shown.values()))
             self.blink.show(shown.get("reference", one), shown.get("flow", one))
 

@@ -1,0 +1,63 @@
+"""A box in three dimensions with surfaces in it, to be turned with the mouse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nicegui import ui
+
+from nerif.geometry import Box
+
+__all__ = ["BoxScene"]
+
+SIZE = 4.0  # of the longest edge of the box in the scene
+GROUND = "#eef1f4"
+EDGE = "#76838f"
+
+
+class BoxScene:
+    """A scene, where the page is being built.
+
+    Parameters
+    ----------
+    box : mm
+    label : for those who do not see it
+    size : width and height, px
+    """
+
+    def __init__(self, box: Box, label: str, size: tuple[int, int] = (1080, 480)) -> None:
+        self.box, self._scale = box, SIZE / max(box.edges)
+        camera = ui.scene.perspective_camera(fov=38)
+        self.scene = ui.scene(width=size[0], height=size[1], grid=False, camera=camera, background_color=GROUND)
+        self.scene.classes("surface").props("role=img")
+        self.name(label)
+        self.scene.move_camera(6.0, -6.9, 3.9, 0, 0, -0.3, duration=0)
+        self._edges()
+
+    def name(self, label: str) -> None:
+        """Say what is seen."""
+        if self.scene.props.get("aria-label") != label:
+            self.scene.props["aria-label"] = label
+            self.scene.update()
+
+    def clear(self) -> None:
+        """Leave the box alone."""
+        self.scene.clear()
+        self._edges()
+
+    def add(self, address: str, colour: str, opacity: float = 1.0) -> Any:
+        """Put in a surface, an STL file in mm, and return it: `delete` takes it out."""
+        with self.scene:
+            surface = self.scene.stl(address).material(colour, opacity, side="both").scale(self._scale)
+            return surface.move(*(-c * self._scale for c in self.box.centre))
+
+    def _edges(self) -> None:
+        lower, upper, centre = self.box.lower, self.box.upper, self.box.centre
+        corners = [
+            [((upper if i >> a & 1 else lower)[a] - centre[a]) * self._scale for a in range(3)] for i in range(8)
+        ]
+        with self.scene:
+            for i in range(8):
+                for a in range(3):
+                    if not i >> a & 1:
+                        self.scene.line(corners[i], corners[i | 1 << a]).material(EDGE)

@@ -1,0 +1,44 @@
+"""A process that has imported the app, and forks a server for whoever asks: the second one starts at once.
+
+Lines on standard input ask: {"words": arguments of nerif, "out": a named pipe for what it prints, "by": command
+that starts it instead, if it holds any words}. The answer is the number of its process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import sys
+
+WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux
+
+
+def main() -> None:
+    """Fork until nobody asks any more."""
+    import nerif.app.server
+    from nerif.cli import main as nerif
+
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # whoever has ended is not waited for
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the servers
+    for line in iter(sys.stdin.readline, ""):
+        asked = json.loads(line)
+        number = os.fork()
+        if number == 0:
+            ctypes.CDLL(None).prctl(WITH_PARENT, signal.SIGKILL)  # it does not outlive tests that were broken off
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            out = os.open(asked["out"], os.O_WRONLY)
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            os.dup2(out, 1)
+            os.dup2(out, 2)
+            os.close(out)
+            if asked["by"]:
+                os.execvp(asked["by"][0], [*asked["by"], sys.executable, "-m", "nerif", *asked["words"]])
+            sys.exit(nerif(asked["words"]))
+        print(number, flush=True)
+
+
+if __name__ == "__main__":
+    main()
