@@ -64,8 +64,10 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     assert errors(browser) == []
 
 
-@pytest.mark.slow
 def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
+    own = folder / "masks" / "good" / "0deg.png"  # drawn elsewhere, with another program
+    own.parent.mkdir(parents=True)
+    own.write_bytes(b"of the user")
     opened(browser, server, "displacement", LINE)
     wait_for(browser, "return document.querySelector('.cropper img') !== null")
     for column, row in ((6, 4), (30, 4), (30, 25), (6, 25)):
@@ -88,4 +90,5 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     mask = written(folder / out).flow_mask
     assert bool(mask[0, 4:25, 6:30].all())
     assert not bool(mask[0, :3].any())
+    assert own.read_bytes() == b"of the user"
     assert errors(browser) == []

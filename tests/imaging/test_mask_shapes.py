@@ -35,6 +35,14 @@ def test_nothing_and_everything_are_refused(tmp_path, drawn):
         write_masks(tmp_path, {"a": drawn or erased}, {"a": (12, 20)})
 
 
+@pytest.mark.parametrize("name", ["../../outside", "/tmp/outside", "a/b", "a\\b", "..", ""])
+def test_a_view_whose_name_leads_elsewhere_is_refused_before_anything_is_written(tmp_path, name):
+    folder = tmp_path / "project" / "masks"
+    with pytest.raises(InputError, match="view: expected names that files can have"):
+        write_masks(folder, {"a": [SQUARE], name: [SQUARE]}, {"a": (12, 20), name: (12, 20)})
+    assert list(tmp_path.rglob("*")) == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

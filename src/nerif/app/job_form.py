@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 from nicegui import ui
@@ -26,13 +26,15 @@ class JobForm:
     button : what it says
     main : names of the fields that are seen at once
     out : what is written, relative to the project; its folder is made
+    first : done before the run is put into the queue, which it is not where this raises InputError
     """
 
     def __init__(
         self, work: Workspace, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
+        first: Callable[[], Awaitable[None]] | None = None,
     ) -> None:  # fmt: skip
-        self.work, self.words, self.out = work, words, out
+        self.work, self.words, self.out, self.first = work, words, out, first
         self.view = FormView(form, self.show, main=main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
@@ -49,9 +51,11 @@ class JobForm:
             self.command.show(self.arguments)
             self.button.set_enabled(self.view.right)
 
-    def _start(self) -> None:
+    async def _start(self) -> None:
         with refusals():
             self.view.made()
+            if self.first is not None:
+                await self.first()
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from html import escape
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from nerif.app.job_form import JobForm
 from nerif.app.mask_editor import MaskEditor
 from nerif.app.mask_edits import MaskEdits
 from nerif.app.pieces import refusals, text_html
+from nerif.app.project import OWN
 from nerif.app.view_maps import magnitude_address, threshold_address
 from nerif.app.workspace import Workspace
 from nerif.commands.mask import Mask
@@ -49,14 +51,16 @@ class MaskCard:
         self.place = ui.element("div").classes("stack")
         self.told = ui.html("", sanitize=False).classes("told").props('aria-live="polite"')
         record = Mask(Path(name), Path("masked.nc"))
-        self.job = JobForm(work, Form(record, only=SETTINGS), self._words, "Put the masks in", SETTINGS[:1])
+        self._writing = asyncio.Lock()
+        form = Form(record, only=SETTINGS)
+        self.job = JobForm(work, form, self._words, "Put the masks in", SETTINGS[:1], first=self._write)
         self.view.on_value_change(self._edit)
         self._edit()
 
     @property
     def folder(self) -> str:
-        """Where drawn masks are written, relative to the project."""
-        return f"masks/{self.name.removesuffix('.nc')}"
+        """Where drawn masks are written, relative to the project: a place of the app alone."""
+        return f"{OWN}/masks/{self.name.removesuffix('.nc')}"
 
     @property
     def out(self) -> str:
@@ -92,21 +96,24 @@ class MaskCard:
         self.work.keep(self.page, {**draft, "masks": masks})
         self.job.show()
         self._tell()
-        ui.timer(0.0, self._write, once=True)
+        ui.timer(0.0, self._written, once=True)
+
+    async def _written(self) -> None:
+        with refusals():
+            await self._write()
 
     async def _write(self) -> None:
-        """Write what is drawn as pictures, beside the page."""
-        drawn, folder = self.edits.drawn, self.work.project.path(self.folder)
-        sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
+        """Write what is drawn as pictures, beside the page, one state after the other."""
+        async with self._writing:
+            drawn, folder = self.edits.drawn, self.work.project.path(self.folder)
+            sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
 
-        def work() -> None:
-            for old in folder.glob("*.png"):
-                if old.stem not in drawn:
+            def work() -> None:
+                for old in folder.glob("*.png"):  # first, so that none is taken for what is drawn now
                     old.unlink()
-            if drawn:
-                write_masks(folder, drawn, sizes)
+                if drawn:
+                    write_masks(folder, drawn, sizes)
 
-        with refusals():
             await self.work.beside(work)
 
     def _tell(self) -> None:

@@ -13,7 +13,7 @@ from nerif.conventions import InputError
 from nerif.imaging.views import View, find_views
 from nerif.result import LIVE, RUN
 
-__all__ = ["Contents", "Project"]
+__all__ = ["OWN", "Contents", "Project"]
 
 DEEP = 3  # folders below the project in which is looked
 MANY = 20_000  # entries that are looked at

@@ -88,10 +88,14 @@ def write_masks(
     Raises
     ------
     InputError
-        If what was drawn covers nothing of a view, or all of it.
+        If what was drawn covers nothing of a view, or all of it, or the name of a view can be no file's name: nothing
+        is written then.
     """
     from PIL import Image
 
+    for name in drawn:
+        if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
+            raise InputError(f"view: expected names that files can have, without / and \\, got {name!r}; rename it")
     masks = {name: mask_of(own, shapes[name]) for name, own in drawn.items() if own}
     for name, mask in masks.items():
         if mask.all() or not mask.any():

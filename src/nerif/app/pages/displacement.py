@@ -133,7 +133,8 @@ class MeasurementCard:
             self.select = ui.select(list(measurements), label="Measurement")
             self.select.set_value(kept if kept in measurements else measurements[-1])
             self.select.props('outlined dense options-dense aria-label="Measurement"').classes("short")
-            with ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide"):
+            self.fold = ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide")
+            with self.fold:
                 self.maps = ui.element("div")
         with card("Where the flow is", "A mask tightens the visual hull. Views without a drawing go by the threshold."):
             self.place = ui.element("div").classes("stack")
@@ -151,10 +152,12 @@ class MeasurementCard:
     async def _turned(self) -> None:
         self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.name})
         self.maps.clear()
+        await self._maps()
         await self._masks()
 
-    async def _maps(self, event: object) -> None:
-        if not getattr(event, "value", False) or list(self.maps):
+    async def _maps(self) -> None:
+        """Show the maps where they are asked for and not there yet."""
+        if not self.fold.value or list(self.maps):
             return
         with refusals():
             html = await self.work.beside(lambda: maps_html(self._read()))
