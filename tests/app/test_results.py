@@ -146,6 +146,8 @@ def test_two_results_side_by_side_move_together(browser, server):
     wait_for(browser, f"return /z = 8.75 mm/.test({alt})")
     after = pictures(browser)
     assert [a != b for a, b in zip(after, before, strict=True)] == [True] * 3 + [False] * 6
+    visit(browser, server)  # what was chosen before is still there
+    wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 9")
     assert errors(browser) == []
     here = f"http://127.0.0.1:{server.port}/", f"ws://127.0.0.1:{server.port}/"
     assert [address for address in requests(browser) if not address.startswith(here)] == []
@@ -154,7 +156,9 @@ def test_two_results_side_by_side_move_together(browser, server):
 @pytest.mark.slow
 @needs_browser
 def test_surface_report_and_export(browser, server, folder):
-    visit(browser, server)  # what was chosen before is still there
+    visit(browser, server)
+    wait_for(browser, "return document.querySelector('.cuts img[src]') !== null")
+    pick(browser, "Compare with", "results/other")
     wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 9")
     tab(browser, "In 3-D")
     wait_for(browser, "return document.querySelectorAll('.legend li').length === 2")
