@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from app.serving import opened
+from app.test_pages import put
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.measurement import Measurement
@@ -20,6 +21,7 @@ from report.browsing import errors, needs_browser, text, wait_for
 pytestmark = needs_browser
 
 BOX = Box.cube(50.0)
+COMPARISON = "document.querySelector('[aria-label^=\"The same on\"] .command code').textContent"
 LINE = "document.querySelector('.command code') !== null"
 
 
@@ -61,6 +63,8 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     click(browser, "Undo what was found")
     found, good = written(folder / "bad.corrected.nc", 120), Measurement.read(folder / "good.nc")
     torch.testing.assert_close(found.displacement, good.displacement)
+    click(browser, "Go on with bad.corrected.nc")
+    wait_for(browser, f"return {COMPARISON}.includes('bad.corrected.nc')")
     assert errors(browser) == []
 
 
@@ -91,4 +95,20 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     assert bool(mask[0, 4:25, 6:30].all())
     assert not bool(mask[0, :3].any())
     assert own.read_bytes() == b"of the user"
+    wait_for(browser, f"return document.querySelector('input[aria-label=Measurement]').value === {out!r}")
+    assert errors(browser) == []
+
+
+def test_what_is_typed_for_a_run_survives_a_reload(browser, server):
+    opened(browser, server, "check", LINE)
+    put(browser, "voxels", "16")
+    wait_for(browser, f"return {COMPARISON}.includes('--voxels 16')")
+    opened(browser, server, "displacement", LINE)
+    wait_for(browser, "return document.querySelector('input[name=threshold]') !== null")
+    put(browser, "threshold", "4.5")
+    wait_for(browser, "return document.querySelector('.command code').textContent.includes('--threshold 4.5')")
+    opened(browser, server, "check", LINE)
+    wait_for(browser, f"return {COMPARISON}.includes('--voxels 16')")
+    opened(browser, server, "displacement", LINE)
+    wait_for(browser, "return document.querySelector('.command code')?.textContent.includes('--threshold 4.5')")
     assert errors(browser) == []

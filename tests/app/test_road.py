@@ -145,6 +145,10 @@ def displacement(driver: Any, folder: Path) -> None:
     click(driver, "Find all displacements")
     runs_done(driver, 2)
     assert (folder / "measurement.nc").is_file()
+    wait_for(driver, "return document.querySelector('.cropper img') !== null", 30)  # shown without a reload
+    value = "return document.querySelector('input[aria-label={}]').value"
+    assert driver.execute_script(value.format("Measurement")) == "measurement.nc"
+    assert driver.execute_script(value.format('"Measurement to write"')) != "measurement.nc"  # of the next
 
 
 def check(driver: Any) -> None:
@@ -155,7 +159,7 @@ def check(driver: Any) -> None:
     wait_for(driver, f"return {lines}.some(line => line.endsWith('--voxels 8'))")
     click(driver, "Compare the views")
     wait_for(driver, "return document.querySelectorAll('.tabled tbody tr').length === 4", 90)
-    assert "Nothing odd found" in text(driver, "main [aria-live=polite]")
+    assert "Nothing odd found" in text(driver, 'section[aria-label="What was found"]')
     driver.find_element("xpath", "//main//a[contains(., 'Go on to Reconstruct')]").click()
 
 

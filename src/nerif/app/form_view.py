@@ -78,7 +78,7 @@ class FormView(Generic[T]):
         for name, said in self._said.items():
             error = self.errors.get(name, "")
             said.set_content(f"<span role=alert>{escape(error)}</span>" if error else "")
-            self._controls[name].props(f'aria-invalid={"true" if error else "false"}')
+            self._controls[name].props(f"aria-invalid={'true' if error else 'false'}")
             self._controls[name].classes(**{"add" if error else "remove": "wrong"})
 
     # -- how it is made ------------------------------------------------------------------------------------------
@@ -188,4 +188,3 @@ def _number(word: str, field: FormField) -> Any:
         whole = kind is int and any(isinstance(v, float) for v in field.default or ())
         return float(number) if whole else number
     return word
-

@@ -1,4 +1,4 @@
-"""A form whose settings become a run of nerif, with its command line and a button that puts it into the queue."""
+"""A form whose settings become a run of nerif: its command line, a button that queues it, and how the run goes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from nicegui import ui
 
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
+from nerif.app.job_told import JobTold
+from nerif.app.jobs import Job
 from nerif.app.pieces import CommandLine, refusals
 from nerif.app.workspace import Workspace
 
@@ -21,23 +23,27 @@ class JobForm:
     Parameters
     ----------
     work : Workspace
+    name : under which what is typed, and the run that goes on, are kept over a reload
     form : settings, all but those that `words` gives
     words : the verb, and what stands before the settings of the form
     button : what it says
     main : names of the fields that are seen at once
     out : what is written, relative to the project; its folder is made
     first : done before the run is put into the queue, which it is not where this raises InputError
+    ended : done when the run has ended
     """
 
     def __init__(
-        self, work: Workspace, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
+        self, work: Workspace, name: str, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
-        first: Callable[[], Awaitable[None]] | None = None,
+        first: Callable[[], Awaitable[None]] | None = None, ended: Callable[[Job], Awaitable[None]] | None = None,
     ) -> None:  # fmt: skip
-        self.work, self.words, self.out, self.first = work, words, out, first
-        self.view = FormView(form, self.show, main=main)
+        self.work, self.name, self.words, self.out, self.first = work, name, words, out, first
+        kept = work.draft(name)
+        self.view = FormView(form, self._changed, kept.get("values"), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
+        self.told = JobTold(work, self._keep, ended, str(kept.get("job", "")))
         self.show()
 
     @property
@@ -51,6 +57,13 @@ class JobForm:
             self.command.show(self.arguments)
             self.button.set_enabled(self.view.right)
 
+    def _changed(self) -> None:
+        self._keep(self.told.job)
+        self.show()
+
+    def _keep(self, job: str) -> None:
+        self.work.keep(self.name, {"values": self.view.form.changed(self.view.values), "job": job})
+
     async def _start(self) -> None:
         with refusals():
             self.view.made()
@@ -59,5 +72,4 @@ class JobForm:
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments
-            self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}")
-            ui.notify("It is in the queue: Runs, above, tells how it goes.", type="positive")
+            self.told.follow(self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}"))

@@ -23,6 +23,7 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,11 @@ class Job:
     def line(self) -> str:
         """The command line of its present start."""
         return command_line(self.attempt)
+
+    @property
+    def file(self) -> str:
+        """The file that its line says it writes; empty if it names none."""
+        return next((b for a, b in pairwise(self.arguments) if a in ("-o", "--out")), "")
 
     @property
     def resumable(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from html import escape
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from nicegui import ui
 
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
+from nerif.app.jobs import Job
 from nerif.app.mask_editor import MaskEditor
 from nerif.app.mask_edits import MaskEdits
 from nerif.app.pieces import refusals, text_html
@@ -35,9 +37,12 @@ class MaskCard:
     page : name of the page, whose draft keeps what is drawn
     name : of the measurement
     measurement : Measurement
+    ended : done when a run that puts masks in has ended
     """
 
-    def __init__(self, work: Workspace, page: str, name: str, measurement: Measurement) -> None:
+    def __init__(
+        self, work: Workspace, page: str, name: str, measurement: Measurement, ended: Callable[[Job], Awaitable[None]]
+    ) -> None:
         self.work, self.page, self.name, self.measurement = work, page, name, measurement
         self.edits = MaskEdits(measurement.names, work.draft(page).get("masks", {}).get(name))
         self.view = ui.select(list(measurement.names), label="View", value=measurement.names[0])
@@ -53,7 +58,9 @@ class MaskCard:
         record = Mask(Path(name), Path("masked.nc"))
         self._writing = asyncio.Lock()
         form = Form(record, only=SETTINGS)
-        self.job = JobForm(work, form, self._words, "Put the masks in", SETTINGS[:1], first=self._write)
+        self.job = JobForm(
+            work, f"{page}.mask", form, self._words, "Put the masks in", SETTINGS[:1], first=self._write, ended=ended
+        )
         self.view.on_value_change(self._edit)
         self._edit()
 
@@ -132,4 +139,3 @@ class MaskCard:
                 picture.props["src"], picture.props["alt"] = address, "Mask by the threshold"
                 ui.button("Close", on_click=dialog.close).props("flat no-caps")
             dialog.open()
-

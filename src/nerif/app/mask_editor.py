@@ -45,7 +45,7 @@ class MaskEditor:
             self._tool = ui.toggle(TOOLS, value="polygon").props('no-caps aria-label="Tool"')
             self._inside = ui.toggle(EFFECTS, value=True).props('no-caps aria-label="What the shape means"')
             self._width = ui.number("Width of the brush", value=8, min=1, step=1, suffix="px").props("outlined dense")
-            self._width.props['aria-label'] = "Width of the brush (px)"
+            self._width.props["aria-label"] = "Width of the brush (px)"
         with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as place:
             place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
             image = ui.element("img").props("draggable=false")

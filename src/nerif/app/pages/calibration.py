@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -11,6 +10,8 @@ from nicegui import ui
 
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
+from nerif.app.job_told import JobTold
+from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.project import Contents
@@ -61,9 +62,7 @@ class CalibrationPage:
         self.views: dict[str, View] = {}
         self.errors: dict[str, ImageError] = {}
         self.turn = 0  # of drawing the rig
-        self.shown: tuple[Any, ...] = ()
         self.seen: tuple[Any, ...] = ()
-        self.job = str(kept.get("job", ""))
         experiments = list(found.experiments)
         known = kept.get("experiment")
         with ui.element("div").classes("columns"):
@@ -83,7 +82,7 @@ class CalibrationPage:
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                    self.told = ui.element("div").props("role=status aria-live=polite")
+                    self.told = JobTold(work, self._keep_job, self._ended, str(kept.get("job", "")))
                 with card("The rig"):
                     self.calibration = self._select("Calibration", list(found.calibrations), None)
                     self.rig = ui.element("div").classes("rig")
@@ -107,7 +106,6 @@ class CalibrationPage:
         self.way.on_value_change(self._turned)
         self.calibration.on_value_change(self._draw)
         self.view.on_value_change(self._pictures)
-        ui.timer(EVERY, self._follow)
         await self._draw()
         ui.timer(EVERY, self._look_again)
 
@@ -172,7 +170,7 @@ class CalibrationPage:
         self.values["ruler" if self.simple else "target"] = self.form.form.changed(self.form.values)
         self.kept = {
             "experiment": self.experiment.value, "simple": self.simple, "out": self.out.value, "view": self.view.value,
-            "leave_out": self.left_out, "job": self.job, "calibration": self.calibration.value, **self.values,
+            "leave_out": self.left_out, "job": self.told.job, "calibration": self.calibration.value, **self.values,
         }  # fmt: skip
         self.work.keep(PAGE.name, self.kept)
         self.command.show(self.arguments())
@@ -198,42 +196,17 @@ class CalibrationPage:
         with refusals():
             self.form.made()
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
-            job = self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}")
-            self.job = job.id
-            self._show()
-            self._say("It waits in the queue.")
+            self.told.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
-    def _say(self, text: str, log: Sequence[str] = ()) -> None:
-        self.told.clear()
-        with self.told:
-            text_html(text, classes="told")
-            if log:
-                text_html("\n".join(log), "pre", "said")
+    def _keep_job(self, job: str) -> None:
+        self.kept["job"] = job
+        self.work.keep(PAGE.name, self.kept)
 
-    async def _follow(self) -> None:
-        """Tell how the run goes; show what it wrote."""
-        if not self.job:
-            return
-        try:
-            job = await self.work.beside(self.work.jobs.get, self.job)
-        except InputError:  # forgotten in another tab
-            self.job = ""
-            return
-        if job.state in ("queued", "running"):
-            log = await self.work.beside(self.work.jobs.log, job.id, 1)
-            text = "It waits in the queue." if job.state == "queued" else "It runs."
-            if self.shown != (job.state, *log):
-                self.shown = (job.state, *log)
-                self._say(text, [line.rpartition("\r")[2] for line in log])
-            return
-        log = await self.work.beside(self.work.jobs.log, job.id, 30)
-        self.job = ""
-        said = {"done": "It is done.", "failed": "It failed; what it said:"}.get(job.state, "It was stopped.")
-        self._say(said, [line.rpartition("\r")[2] for line in log])
+    async def _ended(self, job: Job) -> None:
+        """Show what the run wrote."""
         if job.state == "done":
             self.found = await self.work.beside(self.work.project.contents)
-            wrote = job.arguments[job.arguments.index("-o") + 1]
-            await self._choose_calibration(wrote)
+            await self._choose_calibration(job.file)
             await self._draw()
         self._show()
 

@@ -8,9 +8,12 @@ from html import escape
 
 from nicegui import ui
 
+from nerif.app.file_choice import FileChoice
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
+from nerif.app.job_told import JobTold
+from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
@@ -21,7 +24,7 @@ from nerif.measurement import Measurement
 __all__ = ["PAGE"]
 
 AGREE = "Each is predicted by a quick reconstruction from the others."
-REFINE = "Cameras are refined with a quick field: which one is off? Runs, above, shows what it says."
+REFINE = "Cameras are refined with a quick field: which one is off?"
 COMPARED = ("voxels", "aperture")
 REFINED = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
 
@@ -37,19 +40,21 @@ class CheckPage:
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        known = str(work.draft(PAGE.name).get("measurement", ""))
-        chosen = known if known in measurements else measurements[0]
+        kept = work.draft(PAGE.name)
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("stack"):
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
-                    self.select = ui.select(list(measurements), label="Measurement", value=chosen)
-                    self.select.props('outlined dense options-dense aria-label="Measurement"')
-                    self.form = FormView(Form(self._record(), only=COMPARED), self.show)
+                    self.choice = FileChoice(
+                        "Measurement", measurements, kept.get("measurement"), self._there, self._turned
+                    )
+                    self.form = FormView(Form(self._record(), only=COMPARED), self._changed, kept.get("values"))
                     self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
                     self.button.props("unelevated no-caps")
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
                     record = replace(self._record(), refine=("cameras",))
-                    self.rig = JobForm(work, Form(record, only=REFINED), self._refine_words, "Refine and tell")
+                    self.rig = JobForm(
+                        work, f"{PAGE.name}.rig", Form(record, only=REFINED), self._refine_words, "Refine and tell"
+                    )
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
@@ -57,35 +62,49 @@ class CheckPage:
                     self.told = ui.element("div").classes("stack").props('aria-live="polite"')
                     with self.told:
                         text_html("Nothing has been compared yet.", classes="told")
-        self.select.on_value_change(self._turned)
+                with card("Undone") as self.correction:
+                    self.undone = ui.element("div").classes("stack")
+                    self.correcting = JobTold(work, self._keep, self._corrected, str(kept.get("job", "")))
+        self.correction.set_visibility(bool(self.correcting.job))
         self.show()
 
+    async def _there(self) -> Sequence[str]:
+        return (await self.work.beside(self.work.project.contents)).measurements
+
+    def _keep(self, job: str) -> None:
+        values = self.form.form.changed(self.form.values)
+        self.work.keep(PAGE.name, {"measurement": self.choice.name, "values": values, "job": job})
+
     def _record(self) -> Check:
-        return Check(self.work.project.path(str(self.select.value)))
+        return Check(self.work.project.path(self.choice.name))
 
     def _refine_words(self) -> list[str]:
-        return ["check", str(self.select.value), "--refine", "cameras"]
+        return ["check", self.choice.name, "--refine", "cameras"]
 
     def show(self) -> None:
         """Show the command line as it is now."""
-        if hasattr(self, "command"):
-            self.command.show(self.arguments)
-            self.button.set_enabled(self.form.right)
+        self.command.show(self.arguments)
+        self.button.set_enabled(self.form.right)
+
+    def _changed(self) -> None:
+        self._keep(self.correcting.job)
+        self.show()
 
     @property
     def arguments(self) -> list[str]:
         """Arguments of nerif that compare the views."""
-        return ["check", str(self.select.value), *self.form.arguments]
+        return ["check", self.choice.name, *self.form.arguments]
 
     def _turned(self) -> None:
-        self.work.keep(PAGE.name, {"measurement": self.select.value})
+        self._keep(self.correcting.job)
+        self.correction.set_visibility(bool(self.correcting.job))
         self.told.clear()
         self.show()
         self.rig.show()
 
     async def compare(self) -> None:
         """Compare the views and show what was found."""
-        name, arguments = str(self.select.value), self.arguments
+        name, arguments = self.choice.name, self.arguments
         self.told.clear()
         with self.told:
             bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
@@ -136,14 +155,22 @@ class CheckPage:
             def correct() -> None:
                 with refusals():
                     button.disable()
-                    self.work.jobs.add(arguments, f"Correct {name}")
-                    ui.notify(f"It is in the queue; then go on with {out}, and check it again.", type="positive")
+                    self.undone.clear()
+                    self.correction.set_visibility(True)
+                    self.correcting.follow(self.work.jobs.add(arguments, f"Correct {name}"))
 
             button = ui.button("Undo what was found", icon="auto_fix_high", on_click=correct)
             button.props("unelevated no-caps")
         elif found.views and not found.findings:
             link = "<a href='/reconstruct'>Go on to Reconstruct</a>"
             ui.html(f"<p>{link}</p>", sanitize=False)
+
+    async def _corrected(self, job: Job) -> None:
+        """Offer to go on with the corrected measurement."""
+        if job.state == "done":
+            with self.undone:
+                button = ui.button(f"Go on with {job.file}", icon="arrow_forward")
+                button.on_click(lambda: self.choice.choose(job.file)).props("unelevated no-caps")
 
 
 def views_table(found: Consistency) -> str:

@@ -8,8 +8,10 @@ from pathlib import Path
 
 from nicegui import ui
 
+from nerif.app.file_choice import FileChoice
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
+from nerif.app.jobs import Job
 from nerif.app.mask_card import MaskCard
 from nerif.app.pages.page import Page
 from nerif.app.pieces import card, refusals, text_html
@@ -37,6 +39,7 @@ class DisplacementPage:
 
     def __init__(self, work: Workspace, contents: Contents) -> None:
         self.work, kept = work, work.draft(PAGE.name)
+        self.measured: MeasurementCard | None = None
         if contents.experiments and contents.calibrations:
             with ui.element("div").classes("columns"):
                 with card("Pictures to displacements"), ui.element("div").classes("form"):
@@ -47,8 +50,9 @@ class DisplacementPage:
                     record = Displacement(Path("."), Path("."), Path("measurement.nc"))
                     form = Form(record, without=BY_PAGE)
                     self.job = JobForm(
-                        work, form, self._words, "Find all displacements", MAIN, lambda: str(self.out.value)
-                    )
+                        work, f"{PAGE.name}.run", form, self._words, "Find all displacements", MAIN,
+                        lambda: str(self.out.value), ended=self._ended,
+                    )  # fmt: skip
                     for control in (self.experiment, self.calibration, self.out):
                         control.on_value_change(self._turned)
                 with card("Preview of one view", "With these settings, before all views are done."):
@@ -59,10 +63,25 @@ class DisplacementPage:
                     self.shown = ui.element("div").props('aria-live="polite"')
             self._views()
         else:
-            lacking = "pictures of an experiment" if not contents.experiments else "a calibration"
-            text_html(f"There is no {lacking} in the folder yet; the pages before this one help.", classes="told")
-        if contents.measurements:
-            MeasurementCard(work, contents.measurements)
+            lacking = "are no pictures of an experiment" if not contents.experiments else "is no calibration"
+            text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="told")
+        self.below = ui.element("div").classes("stack")
+        self._show(contents.measurements)
+
+    def _show(self, measurements: Sequence[str]) -> None:
+        if measurements and self.measured is None:
+            with self.below:
+                self.measured = MeasurementCard(self.work, measurements)
+
+    async def _ended(self, job: Job) -> None:
+        """Show what a run has written, and offer a new name for the next."""
+        if job.state != "done":
+            return
+        self._show((await self.work.beside(self.work.project.contents)).measurements)
+        if self.measured is not None:
+            await self.measured.choice.choose(job.file)
+        if self.out.value == job.file:
+            self.out.set_value(self.work.project.free_name("measurement.nc"))
 
     def _select(self, label: str, names: Sequence[str], kept: object) -> ui.select:
         control = ui.select(list(names), label=label, value=kept if kept in names else names[0])
@@ -76,9 +95,8 @@ class DisplacementPage:
         ]  # fmt: skip
 
     def _turned(self) -> None:
-        draft = self.work.draft(PAGE.name)
         chosen = {"experiment": self.experiment.value, "calibration": self.calibration.value}
-        self.work.keep(PAGE.name, {**draft, **chosen})
+        self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), **chosen})
         self.job.show()
         self._views()
 
@@ -130,21 +148,29 @@ class MeasurementCard:
         self.work = work
         kept = work.draft(PAGE.name).get("measurement")
         with card("What was measured"):
-            self.select = ui.select(list(measurements), label="Measurement")
-            self.select.set_value(kept if kept in measurements else measurements[-1])
-            self.select.props('outlined dense options-dense aria-label="Measurement"').classes("short")
+            first = kept if kept in measurements else measurements[-1]
+            self.choice = FileChoice("Measurement", measurements, first, self._there, self._turned)
+            self.choice.select.classes("short")
             self.fold = ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide")
             with self.fold:
                 self.maps = ui.element("div")
         with card("Where the flow is", "A mask tightens the visual hull. Views without a drawing go by the threshold."):
             self.place = ui.element("div").classes("stack")
-        self.select.on_value_change(self._turned)
         ui.timer(0.05, self._masks, once=True)
 
     @property
     def name(self) -> str:
         """Of the measurement that is chosen."""
-        return str(self.select.value)
+        return self.choice.name
+
+    async def _there(self) -> Sequence[str]:
+        return (await self.work.beside(self.work.project.contents)).measurements
+
+    async def _masked(self, job: Job) -> None:
+        """Go on with the measurement that has the masks."""
+        if job.state == "done":
+            ui.notify(f"The masks are in {job.file}.", type="positive")
+            await self.choice.choose(job.file)
 
     def _read(self) -> Measurement:
         return self.work.project.cached(self.name, "measurement", Measurement.read)
@@ -169,7 +195,7 @@ class MeasurementCard:
         with refusals():
             measurement = await self.work.beside(self._read)
             with self.place:
-                MaskCard(self.work, PAGE.name, self.name, measurement)
+                MaskCard(self.work, PAGE.name, self.name, measurement, self._masked)
 
 
 async def build(work: Workspace) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import tyro
 from nicegui import ui
 
+from nerif.app.file_choice import FileChoice
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.live_view import LiveView
@@ -58,17 +59,14 @@ class ReconstructPage:
         self.work = work
         kept = work.draft(PAGE.name)
         self.measurements = tuple(measurements)
-        known = str(kept.get("measurement", ""))
-        first = self.measurements[0] if self.measurements else None
+        known = kept.get("measurement")
         self.values: dict[str, dict[str, Any]] = {name: dict(kept.get(name, {})) for name in VALUES.values()}
         with ui.element("div").classes("columns"):
             with card("A run"), ui.element("div").classes("form"):
                 if not self.measurements:
                     text = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
                     ui.html(f"<p class=note>{text}</p>", sanitize=False)
-                self.measurement = self._select(
-                    "Measurement", list(self.measurements), known if known in self.measurements else first
-                )
+                self.measurement = FileChoice("Measurement", self.measurements, known, self._there, self._chosen)
                 self.method = self._select("Method", LABELS, kept.get("method", "nerif"))
                 self.preset = self._select("Preset", ["auto", *PRESETS], kept.get("preset", "auto"))
                 self.out = ui.input("Result directory", value=self._free()).props("outlined dense debounce=250")
@@ -91,13 +89,16 @@ class ReconstructPage:
             self.out.set_value(self._free())
             self._build_form()
 
+    async def _there(self) -> tuple[str, ...]:
+        return await _measurements(self.work)
+
     @property
     def film(self) -> bool:
         """Whether what is chosen has many instants."""
-        return bool(self.measurement.value) and self.measurement.value.endswith(FILM)
+        return self.measurement.name.endswith(FILM)
 
     def _free(self) -> str:
-        stem = PurePosixPath(self.measurement.value or "run").stem
+        stem = PurePosixPath(self.measurement.name or "run").stem
         taken = [job.out for job in self.work.jobs.all()]
         ending = FILM if self.film else f"-{self.method.value}"
         return self.work.project.free_name(f"results/{stem}{ending}", taken)
@@ -120,7 +121,7 @@ class ReconstructPage:
     def arguments(self) -> list[str]:
         """Return the arguments of nerif that the page is set to."""
         verb = "sequence" if self.film else "reconstruct"
-        words = [verb, self.measurement.value or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
+        words = [verb, self.measurement.name or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
         if self.film:
             chosen = ["--preset", self.preset.value] if self.preset.value != "auto" else []
             return [*words, *chosen, *self.view.arguments]
@@ -132,17 +133,17 @@ class ReconstructPage:
 
     def _show(self) -> None:
         self.values[VALUES[self.film]] = dict(self.view.values)
-        kept = {name: getattr(self, name).value for name in ("measurement", "method", "preset")}
+        kept = {"measurement": self.measurement.name, "method": self.method.value, "preset": self.preset.value}
         self.work.keep(PAGE.name, {**kept, **self.values})
         self.command.show(self.arguments())
-        self.start.set_enabled(bool(self.measurement.value and self.out.value) and self.view.right)
+        self.start.set_enabled(bool(self.measurement.name and self.out.value) and self.view.right)
 
     def _start(self) -> None:
         with refusals():
             self.view.made()
-            self.work.project.path(self.measurement.value)
+            self.work.project.path(self.measurement.name)
             out = self.work.project.relative(self.out.value)
-            job = self.work.jobs.add(self.arguments(), f"{self.measurement.value} → {out}", out)
+            job = self.work.jobs.add(self.arguments(), f"{self.measurement.name} → {out}", out)
             (self.work.project.folder / out).parent.mkdir(parents=True, exist_ok=True)
             self.out.set_value(self._free())
             self.live.follow(job.id)
@@ -150,9 +151,14 @@ class ReconstructPage:
 
 async def build(work: Workspace) -> None:
     """Build the page."""
+    ReconstructPage(work, await _measurements(work))
+
+
+async def _measurements(work: Workspace) -> tuple[str, ...]:
+    """What can be reconstructed: measurements, and films of them."""
     found = await work.beside(work.project.contents)
     films = [name for name in found.films if await work.beside(_measured, work, name)]
-    ReconstructPage(work, (*found.measurements, *films))
+    return (*found.measurements, *films)
 
 
 def _measured(work: Workspace, name: str) -> bool:

@@ -168,8 +168,8 @@ class ResultsPage:
         with ui.element("div").classes("form"):
             _, name = self._named("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
             made = JobForm(
-                self.work, form, lambda: ["export", self.row.name, "-o", name.value or "FILE"], "Export",
-                ("voxels", "quantities"), lambda: name.value,
+                self.work, f"{PAGE.name}.export", form, lambda: ["export", self.row.name, "-o", name.value or "FILE"],
+                "Export", ("voxels", "quantities"), lambda: name.value,
             )  # fmt: skip
         name.on_value_change(made.show)
 
@@ -178,7 +178,7 @@ class ResultsPage:
         form = Form(record, without=("config", "result", "out"), choices={"journal": tuple(JOURNALS)})
         with ui.element("div").classes("form"):
             text_html(f"They are written to {self.row.name}/figures.", classes="note")
-            JobForm(self.work, form, lambda: ["figures", self.row.name], "Draw the figures")
+            JobForm(self.work, f"{PAGE.name}.figures", form, lambda: ["figures", self.row.name], "Draw the figures")
 
     def _movie(self) -> None:
         record = MovieCommand(tyro.MISSING, tyro.MISSING)
@@ -186,8 +186,8 @@ class ResultsPage:
         with ui.element("div").classes("form"):
             _, name = self._named("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
             made = JobForm(
-                self.work, form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"], "Make the movie",
-                ("style", "every"), lambda: name.value,
+                self.work, f"{PAGE.name}.movie", form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"],
+                "Make the movie", ("style", "every"), lambda: name.value,
             )  # fmt: skip
         name.on_value_change(made.show)
 
