@@ -106,6 +106,7 @@ def test_field_from_pictures_alone_is_that_which_was_rendered(experiment):
     assert json.loads((experiment / "r/metrics.json").read_text())["cc"] > 0.9
 
 
+@pytest.mark.slow
 def test_a_network_goes_by_pictures_and_the_page_shows_them(experiment, tmp_path, capsys):
     out = tmp_path / "result"
     held = Measurement.read(experiment / "m.nc").names[1]

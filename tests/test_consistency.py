@@ -195,7 +195,8 @@ def test_binning_keeps_rays_and_displacements(clean):
     assert float(error) < 0.05 * float(truth.displacement.square().mean().sqrt())
 
 
-@pytest.mark.parametrize("name", ["mirrored", pytest.param("exchanged", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mirrored", "exchanged"])
 def test_what_was_found_is_undone(clean, tmp_path, capsys, name):
     """Values, sigma and masks are as they were, and a measurement without mistakes is not written again."""
     mask = torch.rand(clean.usable.shape, generator=torch.Generator().manual_seed(0)) > 0.05

@@ -33,6 +33,7 @@ def test_it_is_the_field_around_the_axis():
     assert line[0] == pytest.approx(float(phantom(torch.tensor([[0.0, 0.0, 3.1]], dtype=torch.float64))), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_result_has_it_as_files_and_in_the_report(tmp_path):
     cameras, box = paper_rig(24)
     measured = simulate(make_phantom("gaussian-jet", box, 0), cameras[:1], box, 1.00027, 0.03, 0)

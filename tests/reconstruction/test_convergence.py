@@ -121,6 +121,7 @@ def test_the_longest_time_ends_it(measurement):
     assert 0.4 < result.seconds < 10
 
 
+@pytest.mark.slow
 def test_more_time_goes_on_with_the_next_cycle(measurement):
     short = replace(ENDLESS, longest=0.5, first_cycle=10**6)(measurement)
     again = replace(ENDLESS, longest=2.0, first_cycle=10**6)(measurement, resume=short.state)

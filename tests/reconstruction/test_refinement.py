@@ -59,7 +59,7 @@ def spoiled(measurement, seed=0):
     return replace(measurement, cameras=calibrated, displacement=measurement.displacement + shift), true
 
 
-@pytest.mark.parametrize("lens", [None, Lens(5.0)])
+@pytest.mark.parametrize("lens", [None, pytest.param(Lens(5.0), marks=pytest.mark.slow)])
 def test_what_a_number_changes_is_what_other_cameras_see(measured, lens):
     """Each derivative against finite differences of the cameras themselves, traced anew."""
     cameras = tuple(replace(camera, lens=lens) for camera in measured.cameras)

@@ -171,7 +171,7 @@ class Sheet(Field):
         return value, -2 / 40 * value[..., None] * off
 
 
-@pytest.mark.parametrize("method", [Tikhonov(voxels=32), NeRIF(max_steps=100)])
+@pytest.mark.parametrize("method", [Tikhonov(voxels=32), pytest.param(NeRIF(max_steps=100), marks=pytest.mark.slow)])
 def test_a_planar_flow_from_the_view_along_it(method):
     box = Box.around_origin((50.0, 20.0, 50.0))
     camera = paper_rig(32)[0][4:5]  # the one that looks along y
@@ -191,6 +191,7 @@ def test_what_cannot_be_is_refused(jet):
         Tikhonov(symmetry="axis", axis_point=(99.0, 0.0, 0.0), voxels=16)(one_view(jet))
 
 
+@pytest.mark.slow
 def test_a_run_resumes_as_if_it_had_not_stopped(jet):
     whole = NeRIF(symmetry="axis", max_steps=40)
     half = replace(whole, max_steps=40)

@@ -200,6 +200,7 @@ def test_networks_and_voxels_find_the_field_in_pictures(balls, taken):
     assert error(balls, Tikhonov(voxels=24)(taken)) < 0.25
 
 
+@pytest.mark.slow
 def test_a_drift_of_the_light_is_fitted(balls):
     drifting = photographed(balls, gain=0.05)
     assert error(balls, NETWORK(drifting)) < 0.16
@@ -245,6 +246,7 @@ def test_a_run_from_pictures_resumes_bit_for_bit(taken):
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.slow
 def test_without_a_limit_a_run_is_judged_by_pixels_held_back(taken):
     settings = replace(NETWORK, max_steps=0, first_cycle=120)
     result = settings(taken, lambda step: step.step > 121)

@@ -38,6 +38,7 @@ from nerif.reconstruction.some_pixels import some_pixels
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target
+from nerif.reconstruction.threads import Cores
 from nerif.reconstruction.weight import FIRST, choose_weight
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ class Descent:
         )
         self.settings, self.measurement, self.on_step, self.field_before = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
+        self.cores = Cores(self.device)
         self.faces = ambient_faces(measurement, settings.ambient_faces)
         check_gauge(measurement, self.faces, settings.hull)
         self.axis = axis_of(settings, measurement)
@@ -121,6 +123,10 @@ class Descent:
 
     def __call__(self) -> Reconstruction:
         """Solve on one level after the other, and return what there is when something says stop."""
+        with self.cores:
+            return self._go()
+
+    def _go(self) -> Reconstruction:
         try:
             while True:
                 problem, judge = self._problems(self.here)
@@ -240,6 +246,7 @@ class Descent:
             if not math.isfinite(objective):
                 message = "the objective turned non-finite, the field before that was kept"
                 raise _Stop("diverged", f"{message}; look for extreme values or sigma in the measurement")
+            self.cores.look()
             self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
             before, past = past[0], [*past[1:], objective]
             self._tell(problem, judge, iterate, weight)

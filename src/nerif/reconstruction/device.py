@@ -12,9 +12,7 @@ import torch
 
 from nerif.conventions import InputError
 
-__all__ = [
-    "autocast_dtype", "available_memory", "keep_freed_memory", "peak_memory", "resolve_device", "share_threads",
-]  # fmt: skip
+__all__ = ["autocast_dtype", "available_memory", "keep_freed_memory", "peak_memory", "resolve_device"]
 
 
 def resolve_device(name: str) -> torch.device:
@@ -83,13 +81,6 @@ def peak_memory(device: torch.device) -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(peak if sys.platform == "darwin" else peak * 1024)
-
-
-def share_threads() -> None:
-    """Give what Numba compiles as many threads as torch has."""
-    import numba
-
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
 
 
 def keep_freed_memory() -> None:

@@ -24,10 +24,11 @@ from numba import njit, prange
 from torch import Tensor
 
 from nerif.fields.mlp import Network
-from nerif.reconstruction.device import share_threads
+from nerif.reconstruction.threads import share_threads
 
 __all__ = ["value_and_gradient"]
 
+share_threads()  # before Numba compiles
 TILE = 4096  # points
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 

@@ -34,6 +34,7 @@ from nerif.reconstruction.order import shuffled
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.settings import TrainingSettings
+from nerif.reconstruction.threads import Cores
 from nerif.reconstruction.training_data import TrainingData
 from nerif.reconstruction.warm_start import adopt, fit_network
 from nerif.reconstruction.watch import Watch
@@ -69,6 +70,7 @@ class Training:
         self.settings, self.data, self.device = settings, data, data.device
         self.ranks = Ranks.from_environment()
         self.ranks.join(self.device)
+        self.cores = Cores(self.device)
         if len(data) < self.ranks.size:
             raise InputError(f"torchrun: expected at least a ray a process, got {len(data)} rays for {self.ranks.size}")
         self.generator = torch.Generator().manual_seed(settings.seed)
@@ -101,6 +103,10 @@ class Training:
 
     def run(self, on_step: OnStep | None = None) -> Reconstruction:
         """Train until something says stop, and return what there is."""
+        with self.cores:
+            return self._run(on_step)
+
+    def _run(self, on_step: OnStep | None) -> Reconstruction:
         settings, budget = self.settings, self.budget
         budget.agree()
         outcome = budget.exhausted() or self._fit(on_step)
@@ -148,7 +154,8 @@ class Training:
         return self._result(outcome)
 
     def _agree(self) -> None:
-        """Let all processes go by the clock of the first (on GPUs now and then: it waits for them)."""
+        """Take the cores there are; let all processes go by the clock of the first (on GPUs now and then: it waits)."""
+        self.cores.look()
         if self.device.type == "cpu" or self.budget.step % LOG_EVERY == 0:
             self.budget.agree()
 
