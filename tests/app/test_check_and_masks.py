@@ -95,6 +95,7 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     assert bool(mask[0, 4:25, 6:30].all())
     assert not bool(mask[0, :3].any())
     assert own.read_bytes() == b"of the user"
+    click(browser, f"Go on with {out}")
     wait_for(browser, f"return document.querySelector('input[aria-label=Measurement]').value === {out!r}")
     assert errors(browser) == []
 

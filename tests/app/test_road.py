@@ -145,7 +145,8 @@ def displacement(driver: Any, folder: Path) -> None:
     click(driver, "Find all displacements")
     runs_done(driver, 2)
     assert (folder / "measurement.nc").is_file()
-    wait_for(driver, "return document.querySelector('.cropper img') !== null", 30)  # shown without a reload
+    click(driver, "Go on with measurement.nc")
+    wait_for(driver, "return document.querySelector('.cropper img') !== null", 30)
     value = "return document.querySelector('input[aria-label={}]').value"
     assert driver.execute_script(value.format("Measurement")) == "measurement.nc"
     assert driver.execute_script(value.format('"Measurement to write"')) != "measurement.nc"  # of the next

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerif.reconstruction import threads
-from nerif.reconstruction.threads import Cores, free_threads
+from nerif.reconstruction.threads import Cores, Used, free_threads
 
 NUMBA_STARTS = """
 import torch
@@ -30,7 +30,9 @@ print(torch.get_num_threads())
         (1.0, 1.0, 2, 2),  # it has ended
         (0.0, 0.6, 2, 1),  # two others
         (30.0, 8.0, 8, 8),  # of a node with many cores
-        (0.0, 14.7, 16, 15),
+        (0.0, 8 / 3, 8, 2),  # two other runs on eight cores
+        (0.0, 14.8, 16, 15),
+        (0.3, 15.5, 16, 16),
     ],
 )
 def test_threads_are_taken_where_cores_are_free(idle, own, most, found):
@@ -49,42 +51,62 @@ class Machine:
     """A clock and what two cores have done by then, in place of the machine's own."""
 
     def __init__(self) -> None:
-        self.clock, self.idle, self.own = 0.0, 0.0, 0.0
+        self.used = Used(0.0, 0.0, 0.0, 0.0)
+        self.silent = False
 
     def spend(self, seconds: float, idle: float, own: float) -> None:
-        self.clock += seconds
-        self.idle += idle * seconds
-        self.own += own * seconds
-
-    def used(self) -> tuple[float, float, float]:
-        return self.clock, self.idle, self.own
+        more = (seconds, idle * seconds, 0.0 if self.silent else 2 * seconds, own * seconds)
+        self.used = Used(*(a + b for a, b in zip(self.used, more, strict=True)))
 
     def perf_counter(self) -> float:
-        return self.clock
+        return self.used.clock
 
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
     found = Machine()
-    monkeypatch.setattr(threads, "_used", found.used)
+    monkeypatch.setattr(threads, "_used", lambda: found.used)
     monkeypatch.setattr(threads.time, "perf_counter", found.perf_counter)
+    monkeypatch.setattr(threads, "_quota", lambda: 64)
     return found
 
 
 @pytest.mark.usefixtures("two_threads")
 def test_a_core_is_left_to_another_program_and_taken_back_after_it(machine):
+    def after(seconds: float, idle: float, own: float) -> int:
+        machine.spend(seconds, idle, own)
+        cores.look()
+        return torch.get_num_threads()
+
     with Cores(torch.device("cpu")) as cores:
-        machine.spend(0.4, 0.0, 1.0)
-        cores.look()  # too early to tell
-        assert torch.get_num_threads() == 2
-        machine.spend(0.4, 0.0, 1.0)
-        cores.look()
-        assert torch.get_num_threads() == 1
-        machine.spend(3.0, 1.0, 1.0)
-        cores.look()
-        assert torch.get_num_threads() == 2
+        assert after(0.4, 0.0, 1.0) == 2  # too early to tell
+        assert after(0.4, 0.0, 1.0) == 1
+        assert after(3.0, 1.0, 1.0) == 1
+        assert after(3.0, 1.0, 1.0) == 2  # there is room for good
+        assert after(3.0, 0.0, 1.0) == 1  # there was not
+        assert [after(3.0, 1.0, 1.0) for _ in range(4)] == [1, 1, 1, 2]  # so more has to be seen
+        assert after(3.0, 0.0, 1.0) == 1
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_threads_stay_where_the_machine_does_not_tell(machine, monkeypatch):
+    with Cores(torch.device("cpu")) as cores:
+        machine.silent = True
         machine.spend(3.0, 0.0, 1.0)
         cores.look()
+        assert torch.get_num_threads() == 2
+        monkeypatch.setattr(threads, "_used", lambda: None)
+        for _ in range(2):
+            machine.spend(3.0, 0.0, 1.0)
+            cores.look()
+        assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_container_has_the_cores_it_may_use(machine, monkeypatch):
+    monkeypatch.setattr(threads, "_quota", lambda: 1)
+    with Cores(torch.device("cpu")):
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == 2
 
@@ -99,11 +121,10 @@ def test_no_more_threads_are_taken_than_were_given(machine):
 
 
 def test_what_the_machine_does_can_be_read():
-    clock, idle, own = threads._used()
-    later = threads._used()
-    assert later[0] >= clock
-    assert later[1] >= idle >= 0
-    assert later[2] >= own > 0
+    first, later = threads._used(), threads._used()
+    assert first is not None
+    assert later is not None
+    assert all(b >= a > 0 for a, b in zip(first, later, strict=True))
 
 
 def test_numba_leaves_torch_the_threads_it_has():

@@ -9,8 +9,7 @@ from nicegui import ui
 
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_told import JobTold
-from nerif.app.jobs import Job
+from nerif.app.job_told import LINES, JobTold
 from nerif.app.pieces import CommandLine, refusals
 from nerif.app.workspace import Workspace
 
@@ -23,27 +22,29 @@ class JobForm:
     Parameters
     ----------
     work : Workspace
-    name : under which what is typed, and the run that goes on, are kept over a reload
+    name : under which what is typed is kept over a reload
     form : settings, all but those that `words` gives
     words : the verb, and what stands before the settings of the form
     button : what it says
     main : names of the fields that are seen at once
     out : what is written, relative to the project; its folder is made
     first : done before the run is put into the queue, which it is not where this raises InputError
-    ended : done when the run has ended
+    about : what the run that goes on is about, by which it is kept over a reload
+    offer : done by a button that goes on with what the run has written; None for no button
+    lines : of what the run has said, that are shown when it has ended well
     """
 
     def __init__(
         self, work: Workspace, name: str, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
-        first: Callable[[], Awaitable[None]] | None = None, ended: Callable[[Job], Awaitable[None]] | None = None,
+        first: Callable[[], Awaitable[None]] | None = None, about: str = "",
+        offer: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
         self.work, self.name, self.words, self.out, self.first = work, name, words, out, first
-        kept = work.draft(name)
-        self.view = FormView(form, self._changed, kept.get("values"), main)
+        self.view = FormView(form, self._changed, work.draft(name), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
-        self.told = JobTold(work, self._keep, ended, str(kept.get("job", "")))
+        self.told = JobTold(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
         self.show()
 
     @property
@@ -58,11 +59,8 @@ class JobForm:
             self.button.set_enabled(self.view.right)
 
     def _changed(self) -> None:
-        self._keep(self.told.job)
+        self.work.keep(self.name, self.view.form.changed(self.view.values))
         self.show()
-
-    def _keep(self, job: str) -> None:
-        self.work.keep(self.name, {"values": self.view.form.changed(self.view.values), "job": job})
 
     async def _start(self) -> None:
         with refusals():

@@ -1,4 +1,4 @@
-"""How one run goes, told where it was asked for: it waits, what it says, how it ended."""
+"""How one run goes, told where it was asked for: it waits, what it says, how it ended, what to go on with."""
 
 from __future__ import annotations
 
@@ -11,38 +11,42 @@ from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.conventions import InputError
 
-__all__ = ["JobTold"]
+__all__ = ["LINES", "JobTold"]
 
 EVERY = 0.7  # seconds
-LINES = {"done": 3, "failed": 30, "stopped": 3}  # of the log, by the state in which it ended
+LINES = 3  # of the log
 SAID = {"done": "It is done.", "failed": "It failed; what it said:", "stopped": "It was stopped."}
 
 
 class JobTold:
-    """A few lines about one run, where the page is being built.
+    """A few lines about one run, where the page is being built; a page that is loaded again goes on with it.
 
     Parameters
     ----------
     work : Workspace
-    keep : told the number of the run that is followed, or an empty text once it has ended
+    name : under which the run is kept over a reload
     ended : done when it has
-    job : number of the run to begin with; empty if there is none
+    offer : done by a button that goes on with the file that the run has written; None for no button
+    lines : of what it has said, that are shown when it has ended well
     """
 
     def __init__(
-        self, work: Workspace, keep: Callable[[str], None], ended: Callable[[Job], Awaitable[None]] | None = None,
-        job: str = "",
+        self, work: Workspace, name: str, ended: Callable[[Job], Awaitable[None]] | None = None,
+        offer: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
-        self.work, self.job, self._keep, self._ended = work, job, keep, ended
+        self.work, self.name, self.job = work, name, str(work.draft(name).get("job", ""))
+        self._ended, self._offer, self._lines = ended, offer, {"done": lines, "failed": 30}
         self._shown: tuple[str, ...] = ()
         self.place = ui.element("div").props("role=status aria-live=polite")
+        self.further = ui.element("div")
         with ui.element("div"):
             ui.timer(EVERY, self._look)
 
     def follow(self, job: Job) -> None:
         """Tell of that run from now on."""
         self.job = job.id
-        self._keep(self.job)
+        self.work.keep(self.name, {"job": job.id})
+        self.further.clear()
         self._say("It waits in the queue.")
 
     def _say(self, text: str, log: Sequence[str] = ()) -> None:
@@ -55,24 +59,37 @@ class JobTold:
             if log:
                 text_html("\n".join(log), "pre", "said")
 
+    def _forget(self) -> None:
+        """Follow nothing; a run that another tab has started meanwhile stays kept."""
+        if self.work.draft(self.name).get("job") == self.job:
+            self.work.keep(self.name, {})
+        self.job = ""
+
     async def _look(self) -> None:
-        if not self.job:
+        if not (id := self.job):
             return
         try:
-            job = await self.work.beside(self.work.jobs.get, self.job)
+            job = await self.work.beside(self.work.jobs.get, id)
+            log = await self.work.beside(self.work.jobs.log, id, self._lines.get(job.state, LINES))
         except InputError:  # forgotten in another tab
-            self.job = ""
-            self._keep("")
+            if id == self.job:
+                self._forget()
             return
-        log = await self.work.beside(self.work.jobs.log, job.id, LINES.get(job.state, 1))
+        if id != self.job:  # another one has been started meanwhile
+            return
         lines = [line.rpartition("\r")[2] for line in log]  # of a progress bar, as it stands
-        if job.id != self.job:  # another one has been started meanwhile
-            return
         if job.state not in SAID:
-            self._say("It waits in the queue." if job.state == "queued" else f"It is {job.state}.", lines)
+            self._say("It waits in the queue." if job.state == "queued" else f"It is {job.state}.", lines[-1:])
             return
         self._say(SAID[job.state], lines)
-        self.job = ""
-        self._keep("")
+        self._forget()
+        if self._offer is not None and job.state == "done" and job.file:
+            self._go_on(self._offer, self.work.project.relative(job.file))
         if self._ended is not None:
             await self._ended(job)
+
+    def _go_on(self, offer: Callable[[str], Awaitable[None]], file: str) -> None:
+        self.further.clear()
+        with self.further:
+            button = ui.button(f"Go on with {file}", icon="arrow_forward", on_click=lambda: offer(file))
+            button.props("unelevated no-caps")

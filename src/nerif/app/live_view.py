@@ -93,7 +93,10 @@ class LiveView:
             self.bar.set_value(share)
             self.chart.set_visibility(False)
             return
-        live, drawn = await self.work.beside(self._changed, out, job)
+        seen = self._seen
+        live, drawn = await self.work.beside(_changed, out, seen)
+        if seen is not self._seen:  # another run has been chosen meanwhile
+            return
         self.told.set_content(told(job, live))
         self.bar.set_value(float(live.get("progress") or 0.0) if live else float(job.state == "done"))
         if live and live.get("curve"):
@@ -104,22 +107,23 @@ class LiveView:
             pictures, box, said = drawn
             self.look.set_content(pictures)
             if said:
-                self.surface.show(job.out, self._seen[LIVE_LOOK], box, said)
+                self.surface.show(job.out, seen[LIVE_LOOK], box, said)
 
-    def _changed(self, out: Path, job: Job) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
-        """What the run tells; of its last look, where there is a new one, pictures, box, and its surface in words."""
-        stamp = _stamp(out / LIVE_LOOK)
-        drawn = None
-        if stamp and stamp != self._seen.get(LIVE_LOOK):
-            self._seen[LIVE_LOOK] = stamp
-            look = read_look(out)
-            if look is not None:
-                volume = look.volume  # a flat one has no surface
-                said = said_of(look) if min(volume.grid.shape) > 1 else ""
-                drawn = look_html(look), volume.grid.box, said
-        if (new := _stamp(out / LIVE)) != self._seen.get(LIVE):
-            self._seen[LIVE], self._seen["live"] = new, read_live(out)
-        return self._seen.get("live", {}), drawn
+
+def _changed(out: Path, seen: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
+    """What the run tells; of its last look, where it is not in `seen` yet, pictures, box, and its surface in words."""
+    stamp = _stamp(out / LIVE_LOOK)
+    drawn = None
+    if stamp and stamp != seen.get(LIVE_LOOK):
+        seen[LIVE_LOOK] = stamp
+        look = read_look(out)
+        if look is not None:
+            volume = look.volume  # a flat one has no surface
+            said = said_of(look) if min(volume.grid.shape) > 1 else ""
+            drawn = look_html(look), volume.grid.box, said
+    if (new := _stamp(out / LIVE)) != seen.get(LIVE):
+        seen[LIVE], seen["live"] = new, read_live(out)
+    return seen.get("live", {}), drawn
 
 
 def _stamp(path: Path) -> int:

@@ -11,7 +11,6 @@ from nicegui import ui
 
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
-from nerif.app.jobs import Job
 from nerif.app.mask_editor import MaskEditor
 from nerif.app.mask_edits import MaskEdits
 from nerif.app.pieces import refusals, text_html
@@ -37,11 +36,11 @@ class MaskCard:
     page : name of the page, whose draft keeps what is drawn
     name : of the measurement
     measurement : Measurement
-    ended : done when a run that puts masks in has ended
+    offer : goes on with a measurement that masks have been put into
     """
 
     def __init__(
-        self, work: Workspace, page: str, name: str, measurement: Measurement, ended: Callable[[Job], Awaitable[None]]
+        self, work: Workspace, page: str, name: str, measurement: Measurement, offer: Callable[[str], Awaitable[None]]
     ) -> None:
         self.work, self.page, self.name, self.measurement = work, page, name, measurement
         self.edits = MaskEdits(measurement.names, work.draft(page).get("masks", {}).get(name))
@@ -59,8 +58,9 @@ class MaskCard:
         self._writing = asyncio.Lock()
         form = Form(record, only=SETTINGS)
         self.job = JobForm(
-            work, f"{page}.mask", form, self._words, "Put the masks in", SETTINGS[:1], first=self._write, ended=ended
-        )
+            work, f"{page}.mask", form, self._words, "Put the masks in", SETTINGS[:1], first=self._write, about=name,
+            offer=offer,
+        )  # fmt: skip
         self.view.on_value_change(self._edit)
         self._edit()
 

@@ -1,7 +1,7 @@
 """How many threads compute: the same of torch and Numba, and no more than there are cores that nobody else uses.
 
 Threads that share a step wait for one another in a loop. Where one of them has to share its core with another program
-all of them wait for it, many times in a step: two threads on two cores, one of which is taken, are ten times slower
+all of them wait for it, many times in a step: two threads on two cores, one of which is taken, are eight times slower
 than one (benchmarks/results/busy-cpu.md).
 """
 
@@ -9,15 +9,20 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
+from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 import torch
 
 __all__ = ["Cores", "free_threads", "share_threads"]
 
 FIRST, EVERY = 0.5, 2.0  # seconds until the first look at what the cores do, and between looks
-SPARED = 0.4  # share of a core that others may use before it is left to them
+LEAST, SHARED = 0.25, 0.8  # of a core others may use before it is left to them: the least, and what all threads share
+CALM, MOST_CALM = 2, 64  # looks in a row with cores free before they are taken, at first and at most
+KNOWN = 0.5  # of the time of the cores that their counters have to tell
 
 
 def share_threads() -> None:
@@ -29,12 +34,11 @@ def share_threads() -> None:
 
     threads = torch.get_num_threads()
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    if torch.get_num_threads() != threads:
-        torch.set_num_threads(threads)
+    _set(threads)
 
 
 def free_threads(idle: float, own: float, most: int) -> int:
-    """Return how many threads to compute with.
+    """Return how many threads to compute with: as many as have a core for themselves, or nearly.
 
     Parameters
     ----------
@@ -42,14 +46,25 @@ def free_threads(idle: float, own: float, most: int) -> int:
     own : mean number of cores that this process used
     most : threads that it may have
     """
-    return max(1, min(most, math.floor(idle + own + SPARED)))
+    fit = (k for k in range(most, 1, -1) if idle + own + max(LEAST, SHARED / k) >= k)
+    return next(fit, 1)
+
+
+class Used(NamedTuple):
+    """Seconds: a clock, what the cores that this process may use were idle, what they did in all, what it used."""
+
+    clock: float
+    idle: float
+    counted: float
+    own: float
 
 
 class Cores:
     """Within it, torch has as many threads as there are cores that are idle or its own, looked at every two seconds.
 
-    It never has more threads than when it was entered, which is what it has again afterwards. On a machine with nothing
-    else to do the number stays, and with it the order in which numbers are added.
+    It never has more threads than when it was entered, or than a container may use, and afterwards what it had before.
+    On a machine with nothing else to do the number stays, and with it the order in which numbers are added. Threads
+    are left at once, and taken when there has been room for a while: a longer one, each time it was in vain.
 
     Parameters
     ----------
@@ -57,42 +72,77 @@ class Cores:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.most = torch.get_num_threads()
+        self.before = torch.get_num_threads()
+        self.most = min(self.before, _quota()) if device.type == "cpu" else self.before
         self._watching = device.type == "cpu" and self.most > 1
-        self._next, self._then = 0.0, (0.0, 0.0, 0.0)
+        self._next, self._then = 0.0, Used(0.0, 0.0, 0.0, 0.0)
+        self._calm, self._patience, self._taken = 0, CALM, False
 
     def __enter__(self) -> Cores:
-        if self._watching:
-            self._begin(FIRST)
+        _set(self.most)
+        self._begin(FIRST)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._watching:
-            torch.set_num_threads(self.most)
+        _set(self.before)
 
     def look(self) -> None:
         """Take the threads that there are cores for; to be called often."""
         if not self._watching or time.perf_counter() < self._next:
             return
-        now, idle, own = (b - a for a, b in zip(self._then, _used(), strict=True))
-        threads = free_threads(idle / now, own / now, self.most)
-        if threads != torch.get_num_threads():
-            torch.set_num_threads(threads)
+        then = self._then
         self._begin(EVERY)
+        spent = Used(*(b - a for a, b in zip(then, self._then, strict=True)))
+        if self._watching and spent.counted >= KNOWN * self.most * spent.clock:
+            self._settle(free_threads(spent.idle / spent.clock, spent.own / spent.clock, self.most))
+
+    def _settle(self, free: int) -> None:
+        threads = torch.get_num_threads()
+        self._calm = self._calm + 1 if free > threads else 0
+        if free < threads:
+            if self._taken:
+                self._patience = min(2 * self._patience, MOST_CALM)
+            _set(free)
+        elif self._calm >= self._patience:
+            self._calm, self._taken = 0, True
+            _set(free)
 
     def _begin(self, seconds: float) -> None:
-        self._then = _used()
-        self._next = time.perf_counter() + seconds
+        if self._watching:
+            used = _used()
+            self._watching = used is not None
+            self._then = self._then if used is None else used
+            self._next = time.perf_counter() + seconds
 
 
-def _used() -> tuple[float, float, float]:
-    """Return a clock, and what the cores that this process may use have been idle, and what it has used, in seconds."""
+def _set(threads: int) -> None:
+    if torch.get_num_threads() != threads:
+        torch.set_num_threads(threads)
+
+
+def _used() -> Used | None:
+    """Return what has been used so far; None where the system does not tell."""
     import psutil
 
-    cores = psutil.cpu_times(percpu=True)
-    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(len(cores))
-    idle = sum(cores[i].idle + getattr(cores[i], "iowait", 0.0) for i in allowed if i < len(cores))
-    own = psutil.Process().cpu_times()
-    return time.perf_counter(), idle, own.user + own.system
+    try:
+        cores = psutil.cpu_times(percpu=True)
+        allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(len(cores))
+        if not cores or max(allowed) >= len(cores):  # rows that are not those of the numbers
+            return None
+        own = psutil.Process().cpu_times()
+    except (OSError, psutil.Error):
+        return None
+    idle = sum(cores[i].idle + getattr(cores[i], "iowait", 0.0) for i in allowed)
+    counted = sum(sum(cores[i]) for i in allowed)
+    return Used(time.perf_counter(), idle, counted, own.user + own.system)
+
+
+def _quota() -> int:
+    """Return how many cores a container may use, by the kernel's rule for its group; many where there is none."""
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        return sys.maxsize if quota == "max" else max(1, math.floor(int(quota) / int(period) + LEAST))
+    except (OSError, ValueError):
+        return sys.maxsize

@@ -82,7 +82,7 @@ class CalibrationPage:
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                    self.told = JobTold(work, self._keep_job, self._ended, str(kept.get("job", "")))
+                    self.told = JobTold(work, f"{PAGE.name}.run", self._ended)
                 with card("The rig"):
                     self.calibration = self._select("Calibration", list(found.calibrations), None)
                     self.rig = ui.element("div").classes("rig")
@@ -170,7 +170,7 @@ class CalibrationPage:
         self.values["ruler" if self.simple else "target"] = self.form.form.changed(self.form.values)
         self.kept = {
             "experiment": self.experiment.value, "simple": self.simple, "out": self.out.value, "view": self.view.value,
-            "leave_out": self.left_out, "job": self.told.job, "calibration": self.calibration.value, **self.values,
+            "leave_out": self.left_out, "calibration": self.calibration.value, **self.values,
         }  # fmt: skip
         self.work.keep(PAGE.name, self.kept)
         self.command.show(self.arguments())
@@ -198,15 +198,11 @@ class CalibrationPage:
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
             self.told.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
-    def _keep_job(self, job: str) -> None:
-        self.kept["job"] = job
-        self.work.keep(PAGE.name, self.kept)
-
     async def _ended(self, job: Job) -> None:
         """Show what the run wrote."""
         if job.state == "done":
             self.found = await self.work.beside(self.work.project.contents)
-            await self._choose_calibration(job.file)
+            await self._choose_calibration(self.work.project.relative(job.file))
             await self._draw()
         self._show()
 

@@ -13,7 +13,6 @@ from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
 from nerif.app.job_told import JobTold
-from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
@@ -26,6 +25,7 @@ __all__ = ["PAGE"]
 AGREE = "Each is predicted by a quick reconstruction from the others."
 REFINE = "Cameras are refined with a quick field: which one is off?"
 COMPARED = ("voxels", "aperture")
+REFINED_LINES = 60  # of what it finds: a table of the views, and what is odd
 REFINED = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
 
 
@@ -53,8 +53,9 @@ class CheckPage:
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
                     record = replace(self._record(), refine=("cameras",))
                     self.rig = JobForm(
-                        work, f"{PAGE.name}.rig", Form(record, only=REFINED), self._refine_words, "Refine and tell"
-                    )
+                        work, f"{PAGE.name}.rig", Form(record, only=REFINED), self._refine_words, "Refine and tell",
+                        lines=REFINED_LINES,
+                    )  # fmt: skip
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
@@ -63,17 +64,16 @@ class CheckPage:
                     with self.told:
                         text_html("Nothing has been compared yet.", classes="told")
                 with card("Undone") as self.correction:
-                    self.undone = ui.element("div").classes("stack")
-                    self.correcting = JobTold(work, self._keep, self._corrected, str(kept.get("job", "")))
+                    self.correcting = JobTold(work, f"{PAGE.name}.undone", offer=self.choice.choose)
         self.correction.set_visibility(bool(self.correcting.job))
         self.show()
 
     async def _there(self) -> Sequence[str]:
         return (await self.work.beside(self.work.project.contents)).measurements
 
-    def _keep(self, job: str) -> None:
+    def _keep(self) -> None:
         values = self.form.form.changed(self.form.values)
-        self.work.keep(PAGE.name, {"measurement": self.choice.name, "values": values, "job": job})
+        self.work.keep(PAGE.name, {"measurement": self.choice.name, "values": values})
 
     def _record(self) -> Check:
         return Check(self.work.project.path(self.choice.name))
@@ -87,7 +87,7 @@ class CheckPage:
         self.button.set_enabled(self.form.right)
 
     def _changed(self) -> None:
-        self._keep(self.correcting.job)
+        self._keep()
         self.show()
 
     @property
@@ -96,7 +96,7 @@ class CheckPage:
         return ["check", self.choice.name, *self.form.arguments]
 
     def _turned(self) -> None:
-        self._keep(self.correcting.job)
+        self._keep()
         self.correction.set_visibility(bool(self.correcting.job))
         self.told.clear()
         self.show()
@@ -154,23 +154,15 @@ class CheckPage:
 
             def correct() -> None:
                 with refusals():
-                    button.disable()
-                    self.undone.clear()
-                    self.correction.set_visibility(True)
                     self.correcting.follow(self.work.jobs.add(arguments, f"Correct {name}"))
+                    self.correction.set_visibility(True)
+                    button.disable()
 
             button = ui.button("Undo what was found", icon="auto_fix_high", on_click=correct)
             button.props("unelevated no-caps")
         elif found.views and not found.findings:
             link = "<a href='/reconstruct'>Go on to Reconstruct</a>"
             ui.html(f"<p>{link}</p>", sanitize=False)
-
-    async def _corrected(self, job: Job) -> None:
-        """Offer to go on with the corrected measurement."""
-        if job.state == "done":
-            with self.undone:
-                button = ui.button(f"Go on with {job.file}", icon="arrow_forward")
-                button.on_click(lambda: self.choice.choose(job.file)).props("unelevated no-caps")
 
 
 def views_table(found: Consistency) -> str:

@@ -11,7 +11,6 @@ from nicegui import ui
 from nerif.app.file_choice import FileChoice
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
-from nerif.app.jobs import Job
 from nerif.app.mask_card import MaskCard
 from nerif.app.pages.page import Page
 from nerif.app.pieces import card, refusals, text_html
@@ -51,7 +50,7 @@ class DisplacementPage:
                     form = Form(record, without=BY_PAGE)
                     self.job = JobForm(
                         work, f"{PAGE.name}.run", form, self._words, "Find all displacements", MAIN,
-                        lambda: str(self.out.value), ended=self._ended,
+                        lambda: str(self.out.value), offer=self._go_on,
                     )  # fmt: skip
                     for control in (self.experiment, self.calibration, self.out):
                         control.on_value_change(self._turned)
@@ -73,15 +72,12 @@ class DisplacementPage:
             with self.below:
                 self.measured = MeasurementCard(self.work, measurements)
 
-    async def _ended(self, job: Job) -> None:
-        """Show what a run has written, and offer a new name for the next."""
-        if job.state != "done":
-            return
+    async def _go_on(self, file: str) -> None:
+        """Show a measurement that a run has written, and give the next one a new name."""
         self._show((await self.work.beside(self.work.project.contents)).measurements)
         if self.measured is not None:
-            await self.measured.choice.choose(job.file)
-        if self.out.value == job.file:
-            self.out.set_value(self.work.project.free_name("measurement.nc"))
+            await self.measured.choice.choose(file)
+        self.out.set_value(self.work.project.free_name("measurement.nc"))
 
     def _select(self, label: str, names: Sequence[str], kept: object) -> ui.select:
         control = ui.select(list(names), label=label, value=kept if kept in names else names[0])
@@ -166,14 +162,8 @@ class MeasurementCard:
     async def _there(self) -> Sequence[str]:
         return (await self.work.beside(self.work.project.contents)).measurements
 
-    async def _masked(self, job: Job) -> None:
-        """Go on with the measurement that has the masks."""
-        if job.state == "done":
-            ui.notify(f"The masks are in {job.file}.", type="positive")
-            await self.choice.choose(job.file)
-
-    def _read(self) -> Measurement:
-        return self.work.project.cached(self.name, "measurement", Measurement.read)
+    def _read(self, name: str) -> Measurement:
+        return self.work.project.cached(name, "measurement", Measurement.read)
 
     async def _turned(self) -> None:
         self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.name})
@@ -181,21 +171,34 @@ class MeasurementCard:
         await self._maps()
         await self._masks()
 
+    async def _measurement(self) -> tuple[str, Measurement] | None:
+        """Read what is chosen; None if another one has been chosen meanwhile."""
+        name = self.name
+        measurement = await self.work.beside(self._read, name)
+        return (name, measurement) if name == self.name else None
+
     async def _maps(self) -> None:
         """Show the maps where they are asked for and not there yet."""
         if not self.fold.value or list(self.maps):
             return
         with refusals():
-            html = await self.work.beside(lambda: maps_html(self._read()))
+            if (chosen := await self._measurement()) is None:
+                return
+            html = await self.work.beside(maps_html, chosen[1])
+            if chosen[0] != self.name:
+                return
+            self.maps.clear()
             with self.maps:
                 ui.html(html, sanitize=False)
 
     async def _masks(self) -> None:
         self.place.clear()
         with refusals():
-            measurement = await self.work.beside(self._read)
+            if (chosen := await self._measurement()) is None:
+                return
+            self.place.clear()
             with self.place:
-                MaskCard(self.work, PAGE.name, self.name, measurement, self._masked)
+                MaskCard(self.work, PAGE.name, *chosen, self.choice.choose)
 
 
 async def build(work: Workspace) -> None:

@@ -15,7 +15,7 @@ from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.live_view import LiveView
 from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals
+from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.commands.methods import RECORDS, Reconstruct
 from nerif.commands.sequence import Sequence
@@ -63,10 +63,10 @@ class ReconstructPage:
         self.values: dict[str, dict[str, Any]] = {name: dict(kept.get(name, {})) for name in VALUES.values()}
         with ui.element("div").classes("columns"):
             with card("A run"), ui.element("div").classes("form"):
-                if not self.measurements:
-                    text = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
-                    ui.html(f"<p class=note>{text}</p>", sanitize=False)
+                text = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
+                note = text_html(text, classes="note")
                 self.measurement = FileChoice("Measurement", self.measurements, known, self._there, self._chosen)
+                note.bind_visibility_from(self.measurement.select, "options", lambda names: not names)
                 self.method = self._select("Method", LABELS, kept.get("method", "nerif"))
                 self.preset = self._select("Preset", ["auto", *PRESETS], kept.get("preset", "auto"))
                 self.out = ui.input("Result directory", value=self._free()).props("outlined dense debounce=250")

@@ -11,6 +11,8 @@ from nicegui import ui
 
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
+from nerif.app.job_told import JobTold
+from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, figures, refusals, text_html
 from nerif.app.result_answers import report_address, report_file
@@ -130,11 +132,15 @@ class ResultsPage:
 
         def write() -> None:
             with refusals():
-                self.work.jobs.add(["report", name], f"Report {name}")
-                ui.notify("It is in the queue; load this page again when it is done.", type="positive")
+                writing.follow(self.work.jobs.add(["report", name], f"Report {name}"))
+
+        async def written(job: Job) -> None:
+            if job.state == "done":
+                await self.build()
 
         button = "Write it anew" if file.is_file() else "Write the report"
         ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
+        writing = JobTold(self.work, f"{PAGE.name}.report {name}", written)
 
     # -- for others ----------------------------------------------------------------------------------------------
 
@@ -169,7 +175,7 @@ class ResultsPage:
             _, name = self._named("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
             made = JobForm(
                 self.work, f"{PAGE.name}.export", form, lambda: ["export", self.row.name, "-o", name.value or "FILE"],
-                "Export", ("voxels", "quantities"), lambda: name.value,
+                "Export", ("voxels", "quantities"), lambda: name.value, about=self.row.name,
             )  # fmt: skip
         name.on_value_change(made.show)
 
@@ -178,7 +184,10 @@ class ResultsPage:
         form = Form(record, without=("config", "result", "out"), choices={"journal": tuple(JOURNALS)})
         with ui.element("div").classes("form"):
             text_html(f"They are written to {self.row.name}/figures.", classes="note")
-            JobForm(self.work, f"{PAGE.name}.figures", form, lambda: ["figures", self.row.name], "Draw the figures")
+            JobForm(
+                self.work, f"{PAGE.name}.figures", form, lambda: ["figures", self.row.name], "Draw the figures",
+                about=self.row.name,
+            )  # fmt: skip
 
     def _movie(self) -> None:
         record = MovieCommand(tyro.MISSING, tyro.MISSING)
@@ -187,7 +196,7 @@ class ResultsPage:
             _, name = self._named("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
             made = JobForm(
                 self.work, f"{PAGE.name}.movie", form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"],
-                "Make the movie", ("style", "every"), lambda: name.value,
+                "Make the movie", ("style", "every"), lambda: name.value, about=self.row.name,
             )  # fmt: skip
         name.on_value_change(made.show)
 
