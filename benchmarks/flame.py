@@ -40,6 +40,7 @@ def main() -> None:
     parser.add_argument("--preset", nargs="+", default=["auto"], choices=["auto", *PRESETS])
     parser.add_argument("--device", default="auto")
     parser.add_argument("--time-limit", type=float, nargs="+", default=[60.0], help="seconds of training")
+    parser.add_argument("--points-per-batch", type=int, default=0, help="0 for that of the preset")
     parser.add_argument("--voxels", type=int, default=100, help="of the truth the error is taken on")
     add_write(parser)
     arguments = parser.parse_args()
@@ -69,6 +70,8 @@ def main() -> None:
         if torch.cuda.is_available():
             torch.cuda.reset_peak_memory_stats()
         settings = replace(preset(name), time_limit=seconds, epochs=0, device=arguments.device)
+        if arguments.points_per_batch:
+            settings = replace(settings, points_per_batch=arguments.points_per_batch)
         result = settings(measurement, tell)
         m = evaluate_volume(result.field, truth, N_AMBIENT, result.device)
         last = result.history[-1]

@@ -38,7 +38,7 @@ from nerif.volume import Volume, describe
 __all__ = ["Live", "Look", "read_live", "read_look"]
 
 EVERY = 0.5  # seconds between two writings of live.json
-SHARE = 0.03  # of the time that looks at the field take
+SHARE = 0.02  # of the time that looks at the field take
 FIRST = 1.0  # seconds before the first
 VOXELS = 32  # along the longest edge of the box
 PIXELS = 40  # along the longest edge of the view
