@@ -124,6 +124,7 @@ def test_interrupted_in_the_short_run(measurement, whole, tmp_path):
     assert not any(v["held_out"] for v in broken.metrics()["views"])
 
 
+@pytest.mark.slow
 def test_interrupted_after_the_short_run(measurement, whole, tmp_path):
     broken = ResultDirectory(tmp_path / "broken")
     stopped = reconstruct_into(broken.path, measurement, NETWORK, SILENT, on_step=lambda step: step.step == 30)

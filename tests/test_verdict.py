@@ -101,6 +101,7 @@ def test_the_first_screen_has_it():
     assert headline(gone).text.startswith("Cannot tell: metrics.json")
 
 
+@pytest.mark.slow
 def test_a_mirrored_view_is_not_to_be_used(tmp_path):
     """And where nothing is wrong the same rig does not condemn."""
     box = Box.cube(50.0)

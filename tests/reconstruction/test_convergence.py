@@ -78,6 +78,7 @@ def test_pixels_held_back_are_of_most_views_and_in_no_batch(measurement):
     assert len(data) + len(data.held_back) == len(FrameData(ENDLESS, measurement))
 
 
+@pytest.mark.slow
 def test_a_single_pixel_is_held_back_of_a_few_and_none_of_single_ones(measurement):
     valid = torch.zeros_like(measurement.usable)
     valid[:, 10, 10] = True

@@ -62,6 +62,7 @@ def test_finds_the_balls_without_seeing_them(measurement, ball):
     assert result.outcome.reason == "steps"
 
 
+@pytest.mark.slow
 def test_three_terms_of_the_paper_agree_on_a_fitted_field(measurement):
     """After training with all of them, gradient heads, autograd and central differences predict the same."""
     settings = replace(

@@ -184,12 +184,14 @@ def test_a_check_that_cannot_be_is_refused(measured, tmp_path, capsys, words, to
     assert told in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_check_in_python_gives_the_table(measured):
     found = check_rig(measured, ["shift"], 2.0)
     assert [row["name"] for row in found.table] == list(measured.names)
     assert set(found.table[0]["values"]) == set(NAMES[8:])
 
 
+@pytest.mark.slow
 def test_a_check_by_a_field_that_does_not_fit_yet_says_so(measured):
     noise = 0.02 * measured.sigma * torch.randn(measured.sigma.shape, generator=torch.Generator().manual_seed(0))
     exact = replace(measured, displacement=measured.displacement + noise, sigma=measured.sigma / 50)

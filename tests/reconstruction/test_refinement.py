@@ -105,6 +105,7 @@ def test_what_a_number_changes_is_what_other_cameras_see(measured, lens):
     assert float(((right - pull) / size)[:, clear].abs().max()) < 0.02 * float((pull / size).abs().max())
 
 
+@pytest.mark.slow
 def test_cameras_and_shifts_are_found_where_the_field_is_known(measured):
     wrong, _ = spoiled(measured)
     refinement = Refinement.asked(wrong, ["cameras,shift"], 0.5, 0.03, 0.03, gauged=False)

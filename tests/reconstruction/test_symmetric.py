@@ -76,7 +76,7 @@ def test_the_operator_is_the_path_integral_of_its_field_and_has_its_adjoint(jet,
 @pytest.mark.parametrize(
     ("method", "most"),
     [(Tikhonov(voxels=40), 0.03), (TotalVariation(voxels=40), 0.03), (Landweber(voxels=40), 0.06),
-     (NeRIF(max_steps=120), 0.03)],
+     pytest.param(NeRIF(max_steps=120), 0.03, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_one_view_is_enough(jet, method, most):
     result = replace(method, symmetry="axis")(one_view(jet))
@@ -118,6 +118,7 @@ def test_the_axis_is_found_in_the_picture_and_left_where_it_cannot_be_seen(jet, 
     assert one.sigma_after[1] == one.sigma[1]
 
 
+@pytest.mark.slow
 def test_two_views_apart_tell_the_axis_whole():
     cameras, box = paper_rig(40)
     measured = simulate(make_phantom("gaussian-jet", box, 0), [cameras[0], cameras[4]], box, 1.00027, 0.03, 0)

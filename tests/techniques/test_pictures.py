@@ -195,6 +195,7 @@ def test_outliers_pull_by_their_size_alone(taken):
 # -- reconstructions -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_networks_and_voxels_find_the_field_in_pictures(balls, taken):
     assert error(balls, NETWORK(taken)) < 0.15
     assert error(balls, Tikhonov(voxels=24)(taken)) < 0.25

@@ -251,6 +251,7 @@ def test_every_method_finds_the_field(kind, measured, balls):
             assert float(result.field.sample(Grid.of_resolution(BOX, 16)).min()) >= 0, name
 
 
+@pytest.mark.slow
 def test_two_techniques_of_one_index_are_weighed_by_their_noise(balls):
     field = Scaled(balls, 1e-3)
     kinds = [Deflection, Interferometry]
