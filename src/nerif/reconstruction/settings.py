@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import NetworkShape
-from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS
 from nerif.reconstruction.shared_settings import SharedSettings
@@ -25,7 +24,6 @@ CHOICES = {
 }
 
 
-SAMPLES, SAMPLES_AROUND = (12, 24), (24, 48)  # of a ray, and of one through a symmetric flow
 FIRST = 0.2  # of the limits, in a first run of two
 
 
@@ -43,9 +41,8 @@ class TrainingSettings(SharedSettings):
     """Forward model: of displacements lever_arm (auto), paraxial, or curved (along the ray as the present field bends
     it); of absorption absorbance (auto), or, where little light is left and its logarithm skewed, intensity (noise of
     the detector, which is even) or poisson (counted quanta)."""
-    samples: tuple[int, int] = (0, 0)
-    """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray. 0 0: 12 to 24, of
-    a symmetric flow, of which there are fewer rays, twice as many."""
+    samples: tuple[int, int] = (12, 24)
+    """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
     sample_jitter: int = 4
     """Half-range of the random number of samples a ray, see samples."""
     sampling: str = "adaptive"
@@ -119,15 +116,15 @@ class TrainingSettings(SharedSettings):
         for name in ("epochs", "max_steps", "stop_ratio", "sample_jitter"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if not (len(self.samples) == 2 and min(self.ray_samples) > self.sample_jitter):
+        if not (len(self.samples) == 2 and min(self.samples) > self.sample_jitter):
             raise InputError(
-                f"samples: expected two counts above sample_jitter ({self.sample_jitter}), or 0 0, got {self.samples}"
+                f"samples: expected two counts above sample_jitter ({self.sample_jitter}), got {self.samples}"
             )
         if self.lens_rays < 0 or self.lens_rays % 2:
             raise InputError(f"lens_rays: expected an even number, or 0 for as many as it takes, got {self.lens_rays}")
-        if self.points_per_batch < max(self.ray_samples) + self.sample_jitter:
+        if self.points_per_batch < max(self.samples) + self.sample_jitter:
             raise InputError(
-                f"points_per_batch: expected room for one ray ({max(self.ray_samples) + self.sample_jitter} points), "
+                f"points_per_batch: expected room for one ray ({max(self.samples) + self.sample_jitter} points), "
                 f"got {self.points_per_batch}"
             )
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
@@ -144,13 +141,6 @@ class TrainingSettings(SharedSettings):
         else:
             first = replace(self, max_steps=self.first_cycle)
         return first, replace(self, rate_after_fit=1.0)  # a field found in haste is no end to start from
-
-    @property
-    def ray_samples(self) -> tuple[int, int]:
-        """Samples of a ray at the start and at the end."""
-        if any(self.samples):
-            return self.samples
-        return SAMPLES if self.symmetry == NO_SYMMETRY else SAMPLES_AROUND
 
     @property
     def limited(self) -> bool:
