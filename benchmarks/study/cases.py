@@ -207,7 +207,7 @@ def _all(scale: Scale) -> Iterator[Case]:
 
     for octaves in scale.octaves:
         key = as_is if octaves == base.network.octaves else f"octaves-{octaves}"
-        changed = replace(base, network=replace(base.network, octaves=octaves))
+        changed = replace(base, network=replace(base.network, octaves=octaves), wave_pixels=0)
         yield case(key, {"encoding": f"N = {octaves}" if octaves else "no encoding"}, changed)
 
     for sampling in ("random", "shifted", "regular"):

@@ -233,6 +233,12 @@ class Measurement:
             mask[i, : camera.image_size[0], : camera.image_size[1]] = True
         return mask
 
+    @property
+    def pixel_sizes(self) -> tuple[float, ...]:
+        """Width of a pixel of each view in the middle of the box, mm."""
+        middle = torch.tensor(self.box.centre, dtype=torch.float64)
+        return tuple(float(camera.pixel_size(middle)) for camera in self.cameras)
+
     @cached_property
     def sees_box(self) -> Bool[Tensor, "view row column"]:
         """Pixels whose rays cross the box on the way to the background."""

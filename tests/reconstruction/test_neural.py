@@ -12,7 +12,8 @@ import torch
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.mlp import Network, NetworkShape
-from nerif.geometry import Grid
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Grid, paper_rig
 from nerif.measurement import Measurement
 from nerif.reconstruction import bins, objective, training
 from nerif.reconstruction.base import Reconstruction, Step
@@ -23,6 +24,7 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
+from nerif.simulation import simulate
 from nerif.techniques.base import Weights
 from nerif.volume import Volume
 
@@ -208,9 +210,38 @@ def test_a_field_that_is_lost_is_taken_back(measurement, monkeypatch):
 )
 def test_sixty_steps_serve_every_shape(measurement, octaves, width, depth):
     shape = NetworkShape(depth=depth, width=width, octaves=octaves)
-    result = replace(NeRIF(device="cpu", precision="float32"), network=shape, max_steps=60)(measurement)
+    settings = NeRIF(network=shape, wave_pixels=0, max_steps=60, device="cpu", precision="float32")
+    result = settings(measurement)
     assert result.history[-1]["loss"] < 0.5 or "not explained" in result.outcome.message
     assert not result.outcome.failed
+
+
+@pytest.mark.parametrize(("pixels", "octaves"), [(16, 3), (24, 4), (40, 4), (48, 5), (200, 5)])
+def test_waves_that_pixels_cannot_tell_apart_are_left_out(pixels, octaves):
+    cameras, box = paper_rig(pixels)
+    seen = simulate(make_phantom("gaussians", box, 0), cameras[:2], box, 1.00027, 0.02, 0)
+    (edge,) = {float(e) for e in box.edges}
+    found = NeRIF().resolved_by(seen).network
+    assert found.octaves == octaves
+    assert edge / 2 ** (octaves - 1) >= 2.5 * max(seen.pixel_sizes)
+    assert octaves == 5 or edge / 2**octaves < 2.5 * max(seen.pixel_sizes)
+    assert NeRIF(wave_pixels=0).resolved_by(seen).network == NeRIF().network
+    assert NeRIF().resolved_by(seen).resolved_by(seen) == NeRIF().resolved_by(seen)
+
+
+@pytest.mark.slow
+def test_a_few_pixels_are_not_taken_for_waves_between_them():
+    """With the waves that 16 pixels cannot tell apart the same flow is found with 1.4 times the error and more."""
+    cameras, box = paper_rig(16)
+    phantom = make_phantom("flame", box, 5)
+    seen = simulate(phantom, cameras[:9], box, 1.00027, 0.05, 1)
+    grid = Grid.of_resolution(box, 32)
+    settings = NeRIF(max_steps=150, samples=(24, 48), device="cpu")
+    off = [
+        float((one(seen).field.sample(grid) - phantom.sample(grid)).norm())
+        for one in (settings, replace(settings, wave_pixels=0))
+    ]
+    assert off[1] > 1.4 * off[0]
 
 
 def test_networks_kept_without_gains_have_octaves_that_count_alike():

@@ -184,6 +184,13 @@ def test_a_planar_flow_from_the_view_along_it(method):
     assert float((result.field.sample(grid) - truth).norm() / truth.norm()) < 0.05
 
 
+def test_a_ray_through_a_symmetric_flow_seen_by_one_camera_has_more_samples(jet):
+    alone = one_view(jet)
+    assert NeRIF(symmetry="axis").resolved_by(alone).samples == (24, 48)
+    assert NeRIF(symmetry="axis").resolved_by(jet).samples == NeRIF().resolved_by(alone).samples == (12, 24)
+    assert NeRIF(symmetry="axis", samples=(16, 20)).resolved_by(alone).samples == (16, 20)
+
+
 def test_what_cannot_be_is_refused(jet):
     for wrong in ({"symmetry": "round"}, {"axis_sigma_mm": -1.0}, {"axis_sigma_deg": -1.0}):
         with pytest.raises(InputError, match=next(iter(wrong))):

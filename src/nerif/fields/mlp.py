@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -95,6 +95,11 @@ class NetworkShape:
             if getattr(self, name) < least:
                 raise InputError(f"{name}: expected at least {least}, got {getattr(self, name)}")
         check_directions(self.directions)
+
+    def without_waves_below(self, length: float) -> NetworkShape:
+        """Return it without octaves whose waves, 2^(1 - k) long in coordinates in [-1, 1], are shorter; one stays."""
+        finest = sum(2.0 ** (1 - k) >= length for k in range(self.octaves))
+        return replace(self, octaves=min(self.octaves, max(finest, 1)))
 
     @classmethod
     def of(cls, kept: dict[str, Any]) -> NetworkShape:

@@ -104,7 +104,7 @@ class Objective:
     def draw(self, progress: float) -> Draw:
         """Draw how a pixel is sampled in a step at that progress."""
         settings = self.settings
-        samples = sample_count(progress, *settings.samples, settings.sample_jitter, self.generator)
+        samples = sample_count(progress, *self.data.samples, settings.sample_jitter, self.generator)
         last = self.data.lens_rays
         if last == 1:
             return Draw(1, samples)

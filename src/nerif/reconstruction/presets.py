@@ -26,6 +26,7 @@ PRESETS: dict[str, NeRIF] = {
     # the paper to the letter: three terms, lengths of residuals, constant learning rate, its stopping rule
     "paper": NeRIF(
         network=NetworkShape(depth=7, width=256, octaves=5, directions=3, skip=4, head_width=64, gradient_head=True),
+        wave_pixels=0,
         weights=LossWeights(consistency=1, numerical=1, head=1, automatic=0),
         norm="l2",
         optimiser="adam",

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from nerif.conventions import InputError
 from nerif.fields.mlp import NetworkShape
+from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.techniques.registry import AUTO, check_model
+
+if TYPE_CHECKING:
+    from nerif.measurement import Measurement
 
 __all__ = ["TrainingSettings"]
 
@@ -33,6 +38,9 @@ class TrainingSettings(SharedSettings):
 
     network: NetworkShape = field(default_factory=NetworkShape)
     """Size of the network."""
+    wave_pixels: float = 2.5
+    """Waves of the encoding that are shorter than so many pixels in the middle of the box are left out, since pixels
+    cannot tell them from longer ones (paper: 0)."""
     weights: LossWeights = field(default_factory=LossWeights)
     """Weights of the terms of the loss."""
     norm: str = "squared"
@@ -41,8 +49,9 @@ class TrainingSettings(SharedSettings):
     """Forward model: of displacements lever_arm (auto), paraxial, or curved (along the ray as the present field bends
     it); of absorption absorbance (auto), or, where little light is left and its logarithm skewed, intensity (noise of
     the detector, which is even) or poisson (counted quanta)."""
-    samples: tuple[int, int] = (12, 24)
-    """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray."""
+    samples: tuple[int, int] = (0, 0)
+    """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray. 0 0: 12 to 24,
+    twice as many of a symmetric flow seen by one camera."""
     sample_jitter: int = 4
     """Half-range of the random number of samples a ray, see samples."""
     sampling: str = "adaptive"
@@ -113,24 +122,37 @@ class TrainingSettings(SharedSettings):
         ):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("epochs", "max_steps", "stop_ratio", "sample_jitter"):
+        for name in ("epochs", "max_steps", "stop_ratio", "sample_jitter", "wave_pixels"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if not (len(self.samples) == 2 and min(self.samples) > self.sample_jitter):
+        if not (len(self.samples) == 2 and min(self._samples()) > self.sample_jitter):
             raise InputError(
-                f"samples: expected two counts above sample_jitter ({self.sample_jitter}), got {self.samples}"
+                f"samples: expected two counts above sample_jitter ({self.sample_jitter}), or 0 0, got {self.samples}"
             )
         if self.lens_rays < 0 or self.lens_rays % 2:
             raise InputError(f"lens_rays: expected an even number, or 0 for as many as it takes, got {self.lens_rays}")
-        if self.points_per_batch < max(self.samples) + self.sample_jitter:
+        if self.points_per_batch < max(self._samples()) + self.sample_jitter:
             raise InputError(
-                f"points_per_batch: expected room for one ray ({max(self.samples) + self.sample_jitter} points), "
+                f"points_per_batch: expected room for one ray ({max(self._samples()) + self.sample_jitter} points), "
                 f"got {self.points_per_batch}"
             )
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
             raise InputError("weights: the head and consistency terms need gradient_head = true")
         check_model(self.model)
         check_source(self.source)
+
+    def resolved_by(self, measurement: Measurement) -> TrainingSettings:
+        """Return them with what they leave to a measurement: the waves of the encoding, and the samples of a ray."""
+        pixel = min(measurement.pixel_sizes) / (max(measurement.box.edges) / 2)
+        network = self.network.without_waves_below(self.wave_pixels * pixel)
+        samples = self._samples(self.symmetry != NO_SYMMETRY and len(measurement.cameras) == 1)
+        return replace(self, network=network, wave_pixels=0.0, samples=samples)
+
+    def _samples(self, steep: bool = False) -> tuple[int, int]:
+        """Samples of a ray at the start and at the end; more where fronts are as steep as one camera sees them."""
+        if any(self.samples):
+            return self.samples
+        return (24, 48) if steep else (12, 24)
 
     def in_two(self) -> tuple[TrainingSettings, TrainingSettings]:
         if self.limited:

@@ -76,7 +76,7 @@ class Training:
         self.generator = torch.Generator().manual_seed(settings.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
-            self.field = data.untrained(settings.network)
+            self.field = data.untrained()
         network = self.field.network
         self.optimiser = NetworkOptimiser(
             settings.optimiser, network, settings.betas, settings.momentum, settings.rates_by_shape

@@ -63,6 +63,10 @@ class TrainingData(ABC):
     noise: float = 0.0
     """Mean square of the noise over that of what was measured; 0 where it is not known."""
 
+    shape: NetworkShape
+    """Of the network: without the waves that pixels cannot tell from longer ones."""
+    samples: tuple[int, int]
+    """Of a ray at the start and at the end of a run."""
     lens_rays: int = 1
     """Rays through the lens of a pixel at the end of a run; 1 for a thin one."""
 
@@ -131,7 +135,7 @@ class TrainingData(ABC):
         """A few instants that stand for all."""
 
     @abstractmethod
-    def untrained(self, shape: NetworkShape) -> NeuralField:
+    def untrained(self) -> NeuralField:
         """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
 
 
@@ -159,6 +163,8 @@ class FrameData(TrainingData):
             resolve_device(settings.device), measurement.box, measurement.n_ambient,
             fingerprint(final, settings.open_faces), is_open(measurement), measurement.quantity,
         )  # fmt: skip
+        settings = settings.resolved_by(measurement)
+        self.shape, self.samples = settings.network, settings.samples
         self.settings, self.measurement = settings, measurement
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
         self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
@@ -251,13 +257,13 @@ class FrameData(TrainingData):
     def instants(self) -> list[Float[Tensor, " 1"] | None]:
         return [None]
 
-    def untrained(self, shape: NetworkShape) -> NeuralField:
+    def untrained(self) -> NeuralField:
         bounds = in_units(self.bounds, self.target.scale)
         if self.axis is None:
-            network = Network(shape, bounds=bounds)
+            network = Network(self.shape, bounds=bounds)
         else:
             own = self.axis.symmetry.in_units(self.box.centre, max(self.box.edges) / 2)
-            network = SymmetricNetwork(shape, own, bounds)
+            network = SymmetricNetwork(self.shape, own, bounds)
         return NeuralField(network.to(self.device), self.box, self.target.scale)
 
 

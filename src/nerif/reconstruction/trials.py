@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import mean
 
 import numpy as np
 import torch
@@ -130,7 +131,8 @@ def _detail(found: Found) -> Volume | None:
     if not known:
         return None
     volume = _sampled(found.result)
-    width = [max(1.0, DETAIL * _footprint(measurement) / h) for h in volume.grid.spacing[::-1]]
+    pixel = mean(measurement.pixel_sizes)
+    width = [max(1.0, DETAIL * pixel / h) for h in volume.grid.spacing[::-1]]
     values = volume.values.double()
 
     def smooth(x: Tensor) -> Tensor:
@@ -153,19 +155,6 @@ def _detail(found: Found) -> Volume | None:
     if not (count and shown > 0 and beyond > 0):
         return None
     return replace(volume, values=(math.sqrt(beyond / shown) * fine).to(volume.values))
-
-
-def _footprint(measurement: Measurement) -> float:
-    """How wide a pixel sees in the middle of the box, mm, on the mean of the cameras."""
-    middle = torch.tensor(measurement.box.centre, dtype=torch.float64)
-    apart = []
-    for camera in measurement.cameras:
-        rows, columns = camera.image_size
-        pixels = torch.tensor([[columns / 2, rows / 2], [columns / 2 + 1, rows / 2]], dtype=torch.float64)
-        rays = camera.rays(pixels)
-        along = ((middle - rays.origin) * rays.direction).sum(-1, keepdim=True)
-        apart.append(float((rays.origin + along * rays.direction).diff(dim=0).norm()))
-    return sum(apart) / len(apart)
 
 
 def _signs(like: Float[Tensor, "view row column c"], drawn: torch.Generator) -> Float[Tensor, "view row column c"]:

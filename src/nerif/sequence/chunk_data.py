@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerif.conventions import InputError
-from nerif.fields.mlp import UNBOUNDED, NetworkShape
+from nerif.fields.mlp import UNBOUNDED
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Rays
 from nerif.geometry.symmetry import NO_SYMMETRY
@@ -65,7 +65,7 @@ class ChunkData(TrainingData):
         like = frames[0]
         device = resolve_device(settings.device)
         super().__init__(device, like.box, like.n_ambient, parts, like.open, like.quantity)
-        self.bounds, self.lens_rays = like.bounds, like.lens_rays
+        self.bounds, self.shape, self.samples, self.lens_rays = like.bounds, like.shape, like.samples, like.lens_rays
         self.tau, self.time_octaves = tau, time_octaves
         self.regions = [frame.ambient for frame in frames]
         targets = [frame.target for frame in frames]
@@ -109,8 +109,8 @@ class ChunkData(TrainingData):
     def instants(self) -> list[Float[Tensor, " 1"] | None]:
         return [*torch.linspace(-1, 1, INSTANTS, device=self.device)[:, None]]
 
-    def untrained(self, shape: NetworkShape) -> SpaceTimeField:
-        network = SpaceTimeNetwork(shape, self.time_octaves, in_units(self.bounds, self.scale)).to(self.device)
+    def untrained(self) -> SpaceTimeField:
+        network = SpaceTimeNetwork(self.shape, self.time_octaves, in_units(self.bounds, self.scale)).to(self.device)
         return SpaceTimeField(network, self.box, 0.0, self.scale)
 
     @torch.no_grad()

@@ -77,11 +77,12 @@ def reconstruct_sequence(
             "refine: expected nothing to refine in a sequence; refine one frame with nerif reconstruct, and give its "
             "calibration.toml to the measurement"
         )
-    reconstructor = replace(reconstructor, source="displacements")
     sequence = MeasurementSequence.read(measurement)
     like = seen_through(sequence.first_good(), reconstructor.aperture)
     like.without(settings.hold_out)
     settings = settings.for_measurement(like)
+    shape = reconstructor.resolved_by(like).network
+    reconstructor = replace(reconstructor, network=shape, wave_pixels=0, source="displacements")
     plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)
     store = _store(plan, sequence, force)
     if retry:
