@@ -18,7 +18,7 @@ from pathlib import Path
 from bench import N_AMBIENT, Table, add_write, alone
 
 WAYS = ("not watched", "--live", "--live, looked at")
-EVERY = 0.7  # seconds, as the page of a run does
+EVERY = 1.0  # seconds, as the page of a run does
 
 
 def look(directory: str) -> None:

@@ -1,10 +1,10 @@
 """How a run goes on, for whoever looks at its directory meanwhile.
 
-    live.json    the title of the work, step, seconds, progress, losses, and their curve: twice a second at most
+    live.json    the title of the work, step, seconds, progress, losses, and their curve: once a second at most
     live.npz     the field on a few voxels, one view as measured and predicted: as often as SHARE of the time allows
 
-Both appear whole or not at all. A look at the field costs a tenth of a second or so; after it, so much time passes that
-all looks together take no more than SHARE of the run.
+Both appear whole or not at all. A look at the field costs a twentieth of a second or so; after it, so much time passes
+that all looks together take no more than SHARE of the run.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from nerif.volume import Volume, describe
 
 __all__ = ["Live", "Look", "read_live", "read_look"]
 
-EVERY = 0.5  # seconds between two writings of live.json
-SHARE = 0.02  # of the time that looks at the field take
+EVERY = 1.0  # seconds between two writings of live.json
+SHARE = 0.01  # of the time that looks at the field take
 FIRST = 1.0  # seconds before the first
-VOXELS = 32  # along the longest edge of the box
+VOXELS = 28  # along the longest edge of the box
 PIXELS = 40  # along the longest edge of the view
-SAMPLES = 48  # a ray
+SAMPLES = 24  # a ray
 POINTS = 400  # of the curve: of more, every second is left out
 
 

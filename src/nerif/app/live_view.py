@@ -25,7 +25,7 @@ from nerif.volume import name_of
 
 __all__ = ["LiveView", "curve_options", "look_html", "told"]
 
-EVERY = 0.7  # seconds
+EVERY = 1.0  # seconds
 CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
 SHOWN = {"pause": ("running",), "stop": ("running", "queued"), "resume": ("paused", "stopped", "failed")}  # in states
 GREY, COLOURS = "#76838f", ["#2f86c9", "#d9721f"]  # seen on light and dark
