@@ -206,7 +206,7 @@ def test_a_run_through_lenses_is_repeated_exactly_and_resumed(wide):
 def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
     path, out = tmp_path / "m.nc", tmp_path / "r"
     wide.write(path)
-    quick = ["--max-steps", "2", "--network.width", "8", "--voxels", "8", "--no-report"]
+    quick = ["--max-steps", "20", "--network.width", "16", "--voxels", "8", "--no-report"]
     assert main(["info", str(path)]) == 0
     assert "aperture       12.5 mm, focused on their backgrounds" in capsys.readouterr().out
     assert main(["reconstruct", str(path), "-o", str(out), "--aperture", "off", *quick]) == 0

@@ -403,7 +403,7 @@ def test_bounds_cannot_be_left(measured):
     m = measured["deflection"]
     bounded = replace(NETWORK, max_steps=30, lower=-1e-5, upper=0.0)(m)
     values = bounded.field.sample(Grid.of_resolution(BOX, 30))
-    assert float(values.min()) >= -1e-5
+    assert float(values.min()) >= -1e-5 * (1 + 1e-6)  # as float32 rounds
     assert float(values.max()) <= 0
     with pytest.raises(InputError, match="lower, upper: expected bounds of the field around 0"):
         NeRIF(lower=1e-5)
