@@ -89,13 +89,13 @@ def press(driver: Any, label: str) -> None:
     driver.execute_script("arguments[0].click()", next(button for button in buttons if button.is_displayed()))
 
 
-def wait_for(driver: Any, script: str) -> None:
-    """Wait until a page says yes."""
+def wait_for(driver: Any, script: str, pause: float = 0.2) -> None:
+    """Wait until a page says yes, asking it after every pause, s."""
     end = time.monotonic() + LONGEST
     while not driver.execute_script(f"return Boolean({script})"):
         if time.monotonic() > end:
             sys.exit(f"waited in vain for {script}")
-        time.sleep(0.2)
+        time.sleep(pause)
 
 
 def do(driver: Any, button: str, there: str, seconds: float, scroll: bool) -> None:
@@ -111,6 +111,8 @@ def do(driver: Any, button: str, there: str, seconds: float, scroll: bool) -> No
 
 def draw(pictures: Path, project: Path) -> None:
     """Write a picture of every page of a project."""
+    from selenium.webdriver.common.keys import Keys
+
     pictures.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as profile, served(project) as link:
         driver = chromium(Path(profile))
@@ -121,7 +123,9 @@ def draw(pictures: Path, project: Path) -> None:
                 driver.get(base + page.path)
                 time.sleep(SETTLES)
                 for name, value in TYPED.get(page.name, {}).items():
-                    driver.find_element("css selector", f"input[name='{name}']").send_keys(value)
+                    field = driver.find_element("css selector", f"input[name='{name}']")
+                    field.send_keys(Keys.CONTROL + "a")  # what was typed before is kept with the project
+                    field.send_keys(value)
                     time.sleep(1.0)
                 if page.name in LOOKS:
                     do(driver, *LOOKS[page.name])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 from app.serving import Served, answering, free_port, outside, served
 from nerif.app.command import App
 from nerif.app.guard import cookie_of
-from nerif.app.server import Address
+from nerif.app.server import Address, told_of
 from nerif.cli import main
 from nerif.conventions import InputError
 
@@ -130,3 +131,13 @@ def test_ctrl_c_ends_it_cleanly(tmp_path: Path):
         rest, _ = process.communicate(timeout=20)
         assert process.returncode == 0
         assert "Traceback" not in rest
+
+
+@pytest.mark.parametrize(("error", "shown"), [("No response returned.", False), ("out of tune", True)])
+def test_a_browser_that_goes_on_is_no_error_and_all_else_is(error, shown):
+    try:
+        raise RuntimeError(error)
+    except RuntimeError:
+        entry = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Exception", (), sys.exc_info())
+    assert told_of(entry) is shown
+    assert told_of(logging.LogRecord("uvicorn.error", logging.INFO, "", 0, "ready", (), None))

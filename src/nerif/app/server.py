@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import logging
 import secrets
 import socket
 import webbrowser
@@ -25,7 +26,7 @@ from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.commands.output import say
 from nerif.conventions import InputError
 
-__all__ = ["Address", "serve"]
+__all__ = ["Address", "serve", "told_of"]
 
 TRIED = 20  # ports
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
@@ -97,6 +98,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     work = Workspace(Project(folder))
     if not work.project.writable:
         say(f"note: {READ_ONLY}")
+    logging.getLogger("uvicorn.error").addFilter(told_of)
     app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
     app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
     for path, answer in ROUTES.items():
@@ -129,6 +131,15 @@ FAVICON = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><rect width="32" height="32" rx="6" fill="#0b5a9c"/>'
     '<path d="M6 22c5-12 8 6 13-6 2-4 4-6 7-6" fill="none" stroke="#fff" stroke-width="3"/></svg>'
 )
+
+
+def told_of(record: logging.LogRecord) -> bool:
+    """Whether an entry of the server's log is shown: of answers that were given up, since the browser went on, none is.
+
+    Starlette's BaseHTTPMiddleware, by which NiceGUI answers, raises RuntimeError for them.
+    """
+    error = record.exc_info[1] if record.exc_info else None
+    return not (isinstance(error, RuntimeError) and str(error) == "No response returned.")
 
 
 def _built(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:

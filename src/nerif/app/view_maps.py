@@ -27,7 +27,8 @@ def maps_html(measurement: Measurement) -> str:
     sigma = None if observation.sigma is None else observation.sigma[..., 0].where(usable, torch.tensor(float("nan")))
     noisiest = 1.0 if sigma is None else _largest(sigma)
     unit = escape(observation.technique.unit)
-    scale = f"Colours from {least:.3g} to {most:.3g} {unit} in all views; grey: not valid."
+    scale = f"Colours from {least:.3g} to {most:.3g} {unit} in all views"
+    scale += "; grey: not valid." if sigma is None else f", of sigma from 0 to {noisiest:.3g} {unit}; grey: not valid."
     parts.append(f"<p class=note>{scale}</p>")
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
