@@ -89,13 +89,13 @@ def press(driver: Any, label: str) -> None:
     driver.execute_script("arguments[0].click()", next(button for button in buttons if button.is_displayed()))
 
 
-def wait_for(driver: Any, script: str, pause: float = 0.2) -> None:
-    """Wait until a page says yes, asking it after every pause, s."""
+def wait_for(driver: Any, script: str) -> None:
+    """Wait until a page says yes."""
     end = time.monotonic() + LONGEST
     while not driver.execute_script(f"return Boolean({script})"):
         if time.monotonic() > end:
             sys.exit(f"waited in vain for {script}")
-        time.sleep(pause)
+        time.sleep(0.2)
 
 
 def do(driver: Any, button: str, there: str, seconds: float, scroll: bool) -> None:
