@@ -18,13 +18,15 @@ from nerif.reconstruction.target import Part, Target
 
 __all__ = ["refit"]
 
-STEPS, EACH, SAMPLES = 6, 600, 64  # steps, pixels a view, samples of a ray
+STEPS, EACH = 6, 600  # and pixels of a view for each
+SAMPLES = 64  # of a ray
 
 
 @torch.no_grad()
 def refit(
-    field: Field, measurement: Measurement, settings: Mapping[str, Any], device: torch.device | str = "cpu"
-) -> list[dict[str, Any]]:
+    field: Field, measurement: Measurement, settings: Mapping[str, Any], device: torch.device | str = "cpu",
+    steps: int = STEPS, each: int = EACH,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Return the table of the refined numbers of views (Refinement.table) that fit a given field best.
 
     Views of which there are but pictures, whose brightness is not known, have none.
@@ -34,6 +36,7 @@ def refit(
     field : which does not follow
     measurement : of these views
     settings : of the reconstruction
+    steps, each : of Gauss and Newton, and the pixels of a view that each is taken from
     """
     if "pictures" in of_source(measurement, "auto", preferred="displacements").maps:
         return []
@@ -44,6 +47,6 @@ def refit(
     def predict(part: Part, rays: Rays) -> Tensor:
         return project(PathIntegral(part.model.integral, SAMPLES), field, rays, device)
 
-    for i in range(STEPS):
-        rig.step(drawn(target, len(measurement.names), i, EACH), predict, target.sigma_known, momentum=0.0)
+    for i in range(steps):
+        rig.step(drawn(target, len(measurement.names), i, each), predict, target.sigma_known, momentum=0.0)
     return rig.table()
