@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.fields.grid import VoxelField
@@ -16,7 +15,7 @@ from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.repetition import Found, Member
-from nerif.reconstruction.trials import BLOCK, VOXELS, WIDTH, Deviations, Trials, best_covered
+from nerif.reconstruction.trials import BEYOND, BLOCK, LOST, VOXELS, WIDTH, Deviations, Trials, best_covered
 from nerif.volume import Volume
 
 AMBIENT = 1.00027
@@ -72,55 +71,32 @@ def test_pixels_that_were_not_measured_stay_so(found):
     data = Trials("fast").member(1, holes, []).measurement
     assert torch.equal(data.usable, holes.measurement.usable)
     assert int(holes.measurement.usable.sum()) < int(found.measurement.usable.sum())
-    main = Volume.of(torch.zeros(4, 4, 4), Grid(found.result.box, (4, 4, 4)), "index_excess", AMBIENT)
-    detail = Trials("fast").taken(holes, main, GasSettings()).detail
-    assert detail is not None
-    assert bool(torch.isfinite(detail.values).all())
 
 
-def noisy(found: Found, more: Tensor, sigma: float) -> Found:
-    """Measured: what the field found shows, more of it, and noise of that sigma; for one view as for many."""
-    seen = found.seen(found.result.field)["deflection"]
-    noise = sigma * torch.randn(seen.shape, generator=torch.Generator().manual_seed(3))
-    measured = (seen + noise + more).to(seen)
-    data = replace(found.measurement, displacement=measured, sigma=torch.full_like(seen, sigma), valid=None)
-    return replace(found, measurement=data)
+def test_what_trials_lose_of_the_detail_tells_what_was_lost_before(measurement):
+    """Deviations grow with the share of detail that trials do not keep, and stay where they have more of it."""
+    box = Box.cube(40.0)
+    grid = Grid.of_resolution(box, 24)
+    bare = Volume.of(hot(box, 0.1).sample(grid), grid, "index_excess", AMBIENT)
+    for kept in (1.02, 0.98, 0.9):
+        deviations = Deviations(bare, GasSettings(), 40.0 / 24)
+        for _ in range(2):
+            trial = result_of(VoxelField.through(kept * bare.values.double(), grid), box)
+            deviations.add(Member(NeRIF(), measurement, (), bare), trial)
+        assert deviations.lost == pytest.approx(max(1 - kept**2, 0), abs=1e-4)
+        ratio = float(deviations.std().values.norm() / (abs(1 - kept) * bare.values.norm()))
+        assert ratio == pytest.approx(BEYOND + LOST * deviations.lost**0.5, rel=0.02)
 
 
-def test_what_no_field_has_taken_up_is_told_by_residuals_beyond_the_noise(found):
-    """In proportion to it, where the field has detail; nothing is where they are the noise or that is not known."""
-    box = found.measurement.box
-    main = Volume.of(torch.zeros(4, 4, 4), Grid(box, (4, 4, 4)), "index_excess", AMBIENT)
-    seen = found.seen(found.result.field)["deflection"]
-    size = float(seen.square().mean().sqrt())
-    pattern = torch.randn(seen.shape, generator=torch.Generator().manual_seed(4))
-    lacking = []
-    for share in (0.3, 0.6):
-        detail = Trials("fast").taken(noisy(found, share * size * pattern, 0.01 * size), main, GasSettings()).detail
-        assert detail is not None
-        lacking.append(detail.values.double())
-    torch.testing.assert_close(lacking[1], 2 * lacking[0], rtol=0.05, atol=0)
-    grid = Grid.of_resolution(box, 16)
-    distance = (grid.points() - torch.tensor(box.centre)).norm(dim=-1).reshape(grid.shape)
-    inside = distance < 0.4 * min(box.edges)
-    assert float(lacking[0][inside].abs().mean()) > 5 * float(lacking[0][~inside].abs().mean())
-    quiet = noisy(found, torch.zeros_like(seen), 0.2 * size)
-    quiet = replace(quiet, measurement=replace(quiet.measurement, sigma=1.1 * quiet.measurement.sigma))
-    assert Trials("fast").taken(quiet, main, GasSettings()).detail is None
-    unknown = replace(found, measurement=replace(quiet.measurement, sigma=None))
-    assert Trials("fast").taken(unknown, main, GasSettings()).detail is None
-
-
-def test_it_adds_to_the_errors_of_trials(measurement):
+def test_a_field_without_detail_has_lost_none(measurement):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 16)
-    main = Volume.of(torch.full(grid.shape, -1e-4), grid, "index_excess", AMBIENT)
-    detail = Volume.of(torch.full(grid.shape, 4e-6), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings(), detail)
-    plain = result_of(VoxelField.through(torch.full(grid.shape, -1e-4).double(), grid), box)
-    expected = Volume.of(torch.full(grid.shape, -1.03e-4), grid, "index_excess", AMBIENT)
-    deviations.add(Member(NeRIF(), measurement, (), expected), plain)
-    torch.testing.assert_close(deviations.std().values, torch.full(grid.shape, 5e-6), rtol=1e-3, atol=0)
+    main = Volume.of(torch.full(grid.shape, -1e-4, dtype=torch.float64), grid, "index_excess", AMBIENT)
+    deviations = Deviations(main, GasSettings(), 1.0)
+    flat = result_of(VoxelField.through(torch.full(grid.shape, -1.05e-4).double(), grid), box)
+    deviations.add(Member(NeRIF(), measurement, (), main), flat)
+    std = deviations.std().values
+    torch.testing.assert_close(std, torch.full_like(std, BEYOND * 5e-6), rtol=1e-3, atol=0)
 
 
 def test_views_are_covered_by_those_beside_them_and_opposite():
@@ -134,19 +110,19 @@ def test_standard_deviations_average_the_squares_of_known_errors_around_each_vox
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 32)
     main = Volume.of(torch.full(grid.shape, -1e-4), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings())
+    deviations = Deviations(main, GasSettings(), 1.0)
     drawn = torch.Generator().manual_seed(0)
     coarse = Grid.of_resolution(box, 16)
     for size in (3e-6, 4e-6):
         error = size * torch.randn(coarse.shape, generator=drawn, dtype=torch.float64)
-        expected = Volume.of(torch.full(coarse.shape, -1e-4).double() - error, coarse, "index_excess", AMBIENT)
-        plain = result_of(VoxelField.through(torch.full(coarse.shape, -1e-4).double(), coarse), box)
+        expected = Volume.of(torch.full(coarse.shape, -1e-4).double(), coarse, "index_excess", AMBIENT)
+        plain = result_of(VoxelField.through(expected.values + error, coarse), box)
         deviations.add(Member(NeRIF(), measurement, (), expected), plain)
     deviations.add(Member(NeRIF(), measurement, ("a",)), plain)  # of which no error is known
     found = {v.quantity: v for v in deviations.volumes()}
     assert deviations.count == 2
     std = found["index_excess_std"].values
-    rms = (0.5 * (3e-6**2 + 4e-6**2)) ** 0.5
+    rms = BEYOND * (0.5 * (3e-6**2 + 4e-6**2)) ** 0.5
     assert float(std.square().mean().sqrt()) == pytest.approx(rms, rel=0.05)
     assert float(std.std() / std.mean()) < 0.5 * (2 * 2 * 1.1) ** -0.5 + 0.3  # smooth, where one error is not
     k = found["density_std"].attributes["gladstone_dale_m3_kg-1"]
@@ -166,13 +142,13 @@ def test_temperatures_beyond_the_relation_are_masked_and_counted(measurement):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 8)
     main = Volume.of(torch.full(grid.shape, -2.6e-4), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings())
+    deviations = Deviations(main, GasSettings(), 1.0)
     plain = result_of(VoxelField.through(torch.full(grid.shape, -2.6e-4).double(), grid), box)
     expected = Volume.of(torch.full(grid.shape, -2.3e-4), grid, "index_excess", AMBIENT)
     deviations.add(Member(NeRIF(), measurement, (), expected), plain)
     found = {v.quantity: v for v in deviations.volumes()}
     assert found["temperature_p95"].notes["masked_voxels"] == grid.shape[0] ** 3
-    assert float(found["index_excess_std"].values.mean()) == pytest.approx(3e-5, rel=1e-3)
+    assert float(found["index_excess_std"].values.mean()) == pytest.approx(BEYOND * 3e-5, rel=1e-3)
 
 
 @pytest.mark.parametrize(("kind", "members"), [("off", 0), ("fast", 2), ("full", 8)])

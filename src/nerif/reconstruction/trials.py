@@ -1,16 +1,15 @@
-"""How far off a reconstruction may be, from more of them whose errors are known, and from what it leaves unexplained.
+"""How far off a reconstruction may be, from more of them whose errors are known.
 
-    std(x)^2 = G * (mean_j (q'_j - q)^2 + t^2) (x)
+    std(x) = (B + C sqrt(1 - k^2)) (G * mean_j (q'_j - q)^2)^(1/2) (x),    k^2 = <(q'_j - g * q'_j)^2> / <(q - g * q)^2>
 
 Trial q'_j is of a field that is known, the one that was found, q, seen by the same cameras. What it looks like is
 predicted, with what the reconstruction left unexplained added in blocks of random sign: whatever noise there is, of the
 right size and correlated as it is. How far the reconstruction of it is off is an error as q may have it.
 
-What q has not taken up at all, no trial of q can miss. It shows in the residuals, where they are larger than sigma. It
-is taken for detail t = a (q - g * q) as large as q has it at each place, g as wide as pixels see, but incoherent: a is
-such that t, with its size multiplied by noise r that g has smoothed, would leave what is more than the noise:
-
-    a^2 mean |F (|q - g * q| r)|^2 / sigma^2 = max(mean |d - F q|^2 / sigma^2 - 1, 0)
+But q is smoother than the truth: what a reconstruction cannot take up, no trial of q can miss. Trials tell how much
+that is by the detail of q that they keep themselves, the share k^2 of its squares, with g as wide as pixels see. Where
+they keep all of it errors are those of noise; where they do not, q has lost more of the truth than they of q. B and C
+were fitted to phantoms (docs/architecture.md).
 
 One error is noisy, so squares are averaged around each voxel by a Gaussian G, WIDTH wide. No trial sees a truth.
 """
@@ -19,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import mean
 
 import numpy as np
@@ -43,7 +42,9 @@ KINDS = {"off": 0, "fast": 2, "full": 8}
 
 WIDTH = 0.04  # of the box edge, standard deviation
 VOXELS = 64  # along the longest edge, on which errors are compared
-DETAIL = 1.6  # px, as wide as they see in the middle of the box: what a smaller thing is, is no longer resolved
+DETAIL = 1.1  # px in the middle of the box, standard deviation of g
+BEYOND, LOST = 1.05, 1.5  # B and C
+NONE = 1e-10  # of the squares of a field: less than that is rounding, and no detail
 BLOCK = 8  # px, in which what is left unexplained keeps its sign
 TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations at which percentiles lie
 
@@ -87,7 +88,7 @@ class Trials:
         return Member(other_seed(found.reconstructor, number), simulated, (), volume, ", of a field that is known")
 
     def taken(self, found: Found, main: Volume, gas: GasSettings) -> Deviations:
-        return Deviations(main, gas, _detail(found))
+        return Deviations(main, gas, mean(found.measurement.pixel_sizes))
 
 
 def _sampled(result: Reconstruction) -> Volume:
@@ -122,41 +123,6 @@ def _spline(volume: Volume) -> VoxelField:
     return VoxelField.through(volume.values.double(), volume.grid)
 
 
-def _detail(found: Found) -> Volume | None:
-    """What the field lacks, by what is left beyond the noise: t; None where nothing is, or the noise is not known."""
-    from scipy.ndimage import gaussian_filter
-
-    measurement = found.measurement
-    known = [o for o in measurement.observations if o.sigma is not None]
-    if not known:
-        return None
-    volume = _sampled(found.result)
-    pixel = mean(measurement.pixel_sizes)
-    width = [max(1.0, DETAIL * pixel / h) for h in volume.grid.spacing[::-1]]
-    values = volume.values.double()
-
-    def smooth(x: Tensor) -> Tensor:
-        return torch.from_numpy(gaussian_filter(x.numpy(), width, mode="nearest"))
-
-    fine = values - smooth(values)
-    drawn = smooth(torch.randn(fine.shape, generator=torch.Generator().manual_seed(0), dtype=fine.dtype))
-    texture = smooth(fine.square()).sqrt() * drawn / drawn.std()
-    with_it = found.seen(VoxelField.through(values + texture, volume.grid))
-    without, explained = found.seen(_spline(volume)), found.seen(found.result.field)
-    beyond, shown, count = 0.0, 0.0, 0
-    for o in known:
-        name, used = o.technique.name, measurement.usable_for(o) & measurement.sees_box
-        assert o.sigma is not None
-        sigma = o.sigma[used].double()
-        left, more = o.values - explained[name].to(o.values), with_it[name] - without[name]
-        beyond += float((left[used].double() / sigma).square().sum()) - sigma.numel()
-        shown += float((more[used].double() / sigma).square().sum())
-        count += sigma.numel()
-    if not (count and shown > 0 and beyond > 0):
-        return None
-    return replace(volume, values=(math.sqrt(beyond / shown) * fine).to(volume.values))
-
-
 def _signs(like: Float[Tensor, "view row column c"], drawn: torch.Generator) -> Float[Tensor, "view row column c"]:
     """1 or -1 by chance, the same in blocks of pixels."""
     views, height, width, channels = like.shape
@@ -166,6 +132,14 @@ def _signs(like: Float[Tensor, "view row column c"], drawn: torch.Generator) -> 
     return fine[:, :height, :width].to(like)
 
 
+def _blurred(values: Tensor, grid: Grid, mm: float) -> Tensor:
+    """The mean over a Gaussian of that standard deviation, at least a voxel."""
+    from scipy.ndimage import gaussian_filter
+
+    width = [max(1.0, mm / h) for h in grid.spacing[::-1]]  # voxels along z, y, x
+    return torch.from_numpy(gaussian_filter(values.double().numpy(), width, mode="nearest"))
+
+
 class Deviations:
     """Standard deviation of every quantity from the errors of trials.
 
@@ -173,12 +147,14 @@ class Deviations:
     ----------
     main : (z, y, x) the field that was found, as it is written
     gas : what density and temperature are computed for
-    detail : what the field lacks, or None
+    pixel : edge of one in the middle of the box, mm
     """
 
-    def __init__(self, main: Volume, gas: GasSettings, detail: Volume | None = None) -> None:
-        self.main, self.gas, self.detail = main, gas, detail
+    def __init__(self, main: Volume, gas: GasSettings, pixel: float) -> None:
+        self.main, self.gas, self.pixel = main, gas, pixel
         self.squares: list[Tensor] = []
+        self.detail: list[tuple[float, float]] = []
+        """Mean squares of the detail that a trial has, and of that of the field it is of, where that has some."""
         self.grid: Grid | None = None
 
     @property
@@ -190,21 +166,27 @@ class Deviations:
         """Take in what one more has found, if it is known what it should have."""
         if member.expected is not None:
             self.grid = member.expected.grid
-            error = result.volume(self.grid).values.double() - member.expected.values.double()
-            self.squares.append(error.square())
+            both = result.volume(self.grid).values.double(), member.expected.values.double()
+            self.squares.append((both[0] - both[1]).square())
+            fine = [float((v - _blurred(v, self.grid, DETAIL * self.pixel)).square().mean()) for v in both]
+            if fine[1] > NONE * float(both[1].square().mean()):
+                self.detail.append((fine[0], fine[1]))
+
+    @property
+    def lost(self) -> float:
+        """The share of the squares of detail that trials have lost, 1 - k^2."""
+        if not self.detail:
+            return 0.0
+        kept, there = (sum(squares) for squares in zip(*self.detail, strict=True))
+        return max(1 - kept / there, 0.0)
 
     def std(self) -> Volume:
         """Return the standard deviation of the field."""
-        from scipy.ndimage import gaussian_filter
-
         assert self.grid is not None
-        mean = torch.stack(self.squares).mean(dim=0)
-        if self.detail is not None:
-            mean = mean + self.detail.values.double().square()
         edge = math.prod(self.grid.box.edges) ** (1 / 3)
-        width = [WIDTH * edge / h for h in self.grid.spacing[::-1]]  # voxels along z, y, x
-        local = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")).sqrt()
-        values = VoxelField.through(local, self.grid).sample(self.main.grid).clamp(min=0)
+        local = _blurred(torch.stack(self.squares).mean(dim=0), self.grid, WIDTH * edge).sqrt()
+        whole = (BEYOND + LOST * math.sqrt(self.lost)) * local
+        values = VoxelField.through(whole, self.grid).sample(self.main.grid).clamp(min=0)
         return Volume(values, self.main.grid, f"{self.main.quantity}_std")
 
     def volumes(self) -> list[Volume]:
