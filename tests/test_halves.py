@@ -95,6 +95,13 @@ def test_a_half_kept_out_is_predicted_and_evaluated_again(jet_file, capsys):
     assert again["views"][0]["cc"] == pytest.approx(metrics["views"][0]["cc"], abs=1e-4)
 
 
+def test_harmonics_of_one_view_are_refused_before_anything_is_written(jet_file, capsys):
+    out = jet_file.parent / "bent"
+    assert main(["reconstruct", str(jet_file), "-o", str(out), *QUICK, "--symmetry", "axis+1"]) == 2
+    assert "symmetry: expected 2 views or more for axis+1, better 3, got 1" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_a_half_is_kept_out_first_and_the_verdict_goes_by_it(jet_file):
     out = jet_file.parent / "whole"
     assert main(["reconstruct", str(jet_file), "-o", str(out), *QUICK]) == 0

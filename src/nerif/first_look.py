@@ -10,16 +10,19 @@ from typing import Any
 
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views
+from nerif.halves import HALVES, kept_half
 from nerif.json_file import write_json
 from nerif.kept_run import KeptRun
 from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
 from nerif.prediction import reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
+from nerif.reconstruction.shared_settings import SharedSettings
+from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
 from nerif.reconstruction.trials import best_covered
 from nerif.result import ResultDirectory
 
-__all__ = ["AUTO", "FEWEST", "NONE", "FirstLook", "kept_out"]
+__all__ = ["AUTO", "FEWEST", "NONE", "FirstLook", "kept_apart", "kept_out"]
 
 AUTO: tuple[str, ...] = ("auto",)
 NONE: tuple[str, ...] = ("none",)
@@ -38,6 +41,34 @@ def kept_out(hold_out: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the views that are kept out of the whole run, out of all names."""
     words = tuple(hold_out)
     return () if words in (AUTO, NONE) and words[0] not in names else words
+
+
+def kept_apart(
+    hold_out: Sequence[str], measurement: Measurement, reconstructor: Reconstructor
+) -> tuple[Measurement, Reconstructor, tuple[str, ...]]:
+    """Return the measurement, in halves if one of them is to be kept out, what reconstructs it, and what is kept out.
+
+    Parameters
+    ----------
+    hold_out : names of views, one of HALVES, AUTO or NONE
+    measurement : with all views
+    reconstructor : settings
+
+    Raises
+    ------
+    InputError
+        If a half is asked for without an axis, or more harmonics than the views could tell.
+    """
+    axis = None
+    if isinstance(reconstructor, SharedSettings):
+        check_views(reconstructor, measurement)
+        if tuple(hold_out) in [(half,) for half in HALVES]:
+            axis = axis_of(reconstructor, measurement)  # by both halves: one does not tell
+    parts, names = kept_half(measurement, hold_out, None if axis is None else axis.symmetry)
+    if axis is not None and parts is not measurement:
+        assert isinstance(reconstructor, SharedSettings)
+        reconstructor = with_axis(reconstructor, axis)
+    return parts, reconstructor, kept_out(names, parts.names)
 
 
 @dataclass(frozen=True)

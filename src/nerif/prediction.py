@@ -31,6 +31,7 @@ SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the
 EXACT_WORK = {"cpu": 2.5e11, "cuda": 2.5e13}  # multiplications: ten seconds on two cores
 VOXELS, BEYOND = 100, 3  # along the longest edge of the box, and beyond each face
 SYMMETRIC_VOXELS = 400  # the same, of (r, h) alone
+RAYS = 1.4  # along the edge of a voxel, at least
 COMPARED = 1024  # pixels
 AT_ONCE = 1 << 21  # thin rays through voxels
 
@@ -231,7 +232,7 @@ def _beyond(grid: Grid, axes: Sequence[int]) -> Grid:
 class SampledViews:
     """Views of a network by way of its values on voxels.
 
-    Rays of a lattice of pixels, about two a voxel, are integrated through the spline by the compiled
+    Rays of a lattice of pixels, RAYS a voxel, are integrated through the spline by the compiled
     operator, and the pixels between them are interpolated by bicubic splines. What bending adds (`curved`) is
     integrated through the network itself on a coarser lattice.
 
@@ -252,7 +253,8 @@ class SampledViews:
 
     def __call__(self, camera: Camera) -> Float[Tensor, "row column c"]:
         """Return what a camera would see; of no meaning where a ray misses the box."""
-        step = max(1, min(camera.image_size) // (2 * self.resolution))
+        pixel = float(camera.pixel_size(torch.tensor(self.box.centre, dtype=camera.rotation.dtype)))
+        step = max(1, int(max(self.box.edges) / self.resolution / (RAYS * pixel)))
         view = _interpolated(camera, self.box, step, self._straight)
         if not self.projector.model.straight:
             view = view + _interpolated(camera, self.box, 8 * step, self._bending)

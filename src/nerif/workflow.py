@@ -11,9 +11,9 @@ from typing import Any
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
-from nerif.first_look import AUTO, FEWEST, FirstLook, kept_out
+from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
 from nerif.gains import fit_gains, with_gains
-from nerif.halves import HALVES, departure_sentence, departures, halved, kept_half
+from nerif.halves import departure_sentence, departures, halved
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.live import Live
 from nerif.measurement import Measurement
@@ -132,7 +132,7 @@ def reconstruct_into(
     if voxels < 1:
         raise InputError(f"voxels: expected at least 1, got {voxels}")
     whole = measurement
-    measurement, reconstructor, unseen = _kept_apart(run, whole, reconstructor)
+    measurement, reconstructor, unseen = kept_apart(run.hold_out, whole, reconstructor)
     training = measurement.without(unseen)
     gains = fit_gains(training) if run.fit_gains else {}
     if gains:
@@ -298,20 +298,6 @@ def _tell_axis(out: ResultDirectory, result: Reconstruction, whole: Measurement,
     out.add_metrics({"axis": result.axis.record, "departures": apart})
     for line in (*result.axis.sentences, *(departure_sentence(d) for d in apart)):
         monitor.say(line)
-
-
-def _kept_apart(
-    run: Run, measurement: Measurement, reconstructor: Reconstructor
-) -> tuple[Measurement, Reconstructor, tuple[str, ...]]:
-    """The measurement, in halves if one of them is to be kept out, what reconstructs it, and the views kept out."""
-    axis = None
-    if run.hold_out in [(half,) for half in HALVES] and isinstance(reconstructor, SharedSettings):
-        axis = axis_of(reconstructor, measurement)  # by both halves: one does not tell
-    parts, names = kept_half(measurement, run.hold_out, None if axis is None else axis.symmetry)
-    if axis is not None and parts is not measurement:
-        assert isinstance(reconstructor, SharedSettings)
-        reconstructor = with_axis(reconstructor, axis)
-    return parts, reconstructor, kept_out(names, parts.names)
 
 
 def _repetitions(run: Run, training: Measurement) -> Repetitions | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -21,7 +22,7 @@ from nerif.reconstruction.multiplicative import MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.operator import rays_through
 from nerif.reconstruction.symmetric_operator import SymmetricOperator
-from nerif.reconstruction.symmetry import symmetry_asked
+from nerif.reconstruction.symmetry import check_views, symmetry_asked
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.simulation import simulate
@@ -161,6 +162,17 @@ def test_harmonics_take_up_what_is_not_alike_around_the_axis(method):
     none, two = off("axis"), off("axis+2")
     assert none > 0.1
     assert two < 0.4 * none
+
+
+@pytest.mark.parametrize(("text", "views", "instead"), [("axis+2", 1, "axis"), ("axis+3", 3, "axis+2")])
+def test_more_harmonics_than_views_could_tell_are_refused(text, views, instead):
+    box = Box.cube(50.0)
+    few = simulate(Bent(), paper_rig(8)[0][:views], box, 1.00027, 0.02, 0)
+    told = rf"symmetry: expected .* views or more.*, got {views}; give --symmetry {re.escape(instead)}$"
+    with pytest.raises(InputError, match=told):
+        check_views(NeRIF(symmetry=text), few)
+    check_views(NeRIF(symmetry=instead), few)
+    check_views(NeRIF(), few)
 
 
 class Sheet(Field):

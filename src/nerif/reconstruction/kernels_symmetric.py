@@ -69,26 +69,35 @@ def _sample(start, stride, m, plane, spline):
 
 
 @njit(fastmath=FASTMATH)
-def _angles(r, along, aside, share, rise):
+def _phases(angles):
+    """(m, k), exp(-2 pi i m k / angles) of the harmonics m = 1 ... (angles - 1) / 2."""
+    phases = np.empty(((angles - 1) // 2, angles), dtype=np.complex128)
+    for m in range(len(phases)):
+        for k in range(angles):
+            phases[m, k] = np.exp(-2j * np.pi * ((m + 1) * k) / angles)
+    return phases
+
+
+@njit(fastmath=FASTMATH)
+def _angles(r, along, aside, phases, share, rise):
     """D_k, and its slopes along e1 and e2."""
     count = len(share)
-    for k in range(count):
-        share[k], rise[k, 0], rise[k, 1] = 1.0 / count, 0.0, 0.0
-        u, power = complex(along, aside), complex(1.0, 0.0)
-        for m in range(1, (count - 1) // 2 + 1):
-            phase = np.exp(-1j * (m * 2 * np.pi * k / count))
-            turn = m * power * phase / r
-            rise[k, 0] += 2 / count * (turn * (1.0 - u * along)).real
-            rise[k, 1] += 2 / count * (turn * (1j - u * aside)).real
-            power = power * u
-            share[k] += 2 / count * (power * phase).real
+    share[:], rise[:] = 1.0 / count, 0.0
+    u, power = complex(along, aside), complex(2.0 / count, 0.0)
+    for m in range(len(phases)):
+        east, north = (m + 1) * power / r * (1.0 - u * along), (m + 1) * power / r * (1j - u * aside)
+        power = power * u
+        for k in range(count):
+            share[k] += (power * phases[m, k]).real
+            rise[k, 0] += (east * phases[m, k]).real
+            rise[k, 1] += (north * phases[m, k]).real
 
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
 def _integrate(padded, start, stride, profile, count, plane, seen, spline, part):
-    neighbours = len(spline)
+    neighbours, angles = len(spline), padded.shape[1]
+    phases = _phases(angles)
     for n in prange(len(start)):
-        angles = padded.shape[1]
         share, rise = np.ones(angles), np.zeros((angles, 2))
         q1 = q2 = q3 = 0.0
         for m in range(count[n]):
@@ -96,7 +105,7 @@ def _integrate(padded, start, stride, profile, count, plane, seen, spline, part)
             if not inside:
                 continue
             if angles > 1:
-                _angles(r, along, aside, share, rise)
+                _angles(r, along, aside, phases, share, rise)
             w = profile_at(profile[n], m)
             for k in range(angles):
                 f = fr = fh = 0.0
@@ -124,6 +133,7 @@ def _integrate(padded, start, stride, profile, count, plane, seen, spline, part)
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
 def _spread(each, start, stride, profile, count, plane, seen, spline, part):
     neighbours, angles, rays = len(spline), each.shape[2], len(start)
+    phases = _phases(angles)
     for chunk in prange(len(each)):
         padded = each[chunk]
         share, rise = np.ones(angles), np.zeros((angles, 2))
@@ -133,7 +143,7 @@ def _spread(each, start, stride, profile, count, plane, seen, spline, part):
                 if not inside:
                     continue
                 if angles > 1:
-                    _angles(r, along, aside, share, rise)
+                    _angles(r, along, aside, phases, share, rise)
                 w = profile_at(profile[n], m)
                 for k in range(angles):
                     if len(part) == 1:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from nerif.conventions import InputError
 from nerif.geometry.axis import Axis
 from nerif.geometry.symmetry import Symmetry, parse_symmetry
 from nerif.measurement import Measurement
@@ -15,7 +16,7 @@ from nerif.reconstruction.gauge import ambient_faces
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
 
-__all__ = ["axis_of", "symmetry_asked", "with_axis"]
+__all__ = ["axis_of", "check_views", "symmetry_asked", "with_axis"]
 
 PLACE = 0.03  # of the longest edge of the box: standard deviation of where an axis is, if nothing is said
 ROUNDING = 0.002  # of the longest edge of the box: within this of the axis a field is round
@@ -32,6 +33,23 @@ def symmetry_asked(settings: SharedSettings, measurement: Measurement) -> Symmet
         direction = (0.0, 0.0, 1.0) if parsed[0] == "axis" else _looked_along(measurement)
     point = box.centre if settings.axis_point is None else settings.axis_point
     return Symmetry.about(settings.symmetry, point, direction, ROUNDING * max(box.edges))
+
+
+def check_views(settings: SharedSettings, measurement: Measurement) -> None:
+    """Refuse more harmonics than the views could tell: 2 N + 1 functions of (r, h), of which a view tells two.
+
+    Raises
+    ------
+    InputError
+        If there are N views or fewer.
+    """
+    parsed, views = parse_symmetry(settings.symmetry), len(measurement.cameras)
+    if parsed is not None and parsed[1] >= views:
+        most = "axis" if views == 1 else f"axis+{views - 1}"
+        raise InputError(
+            f"symmetry: expected {parsed[1] + 1} views or more for {settings.symmetry}, better {2 * parsed[1] + 1}, "
+            f"got {views}; give --symmetry {most}"
+        )
 
 
 def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:
