@@ -1,4 +1,4 @@
-"""What refinement of a rig can reach at best, of rigs whose cameras stand elsewhere than their file says.
+"""What may be expected of a refined rig at best, of rigs whose cameras stand elsewhere than their file says.
 
     python benchmarks/pose_floor.py ../shared/data/rigs --write benchmarks/results/pose-floor-cpu.md
 
@@ -7,10 +7,10 @@ No camera sees a shift of all of them with the field; only their priors hold it,
     b = argmin sum_v (a_v + A_v b)^T C_v^-1 (a_v + A_v b)
 
 with a_v by how many pixels view v shows the middle of the box elsewhere than it is stated to, A_v what a shift changes
-of that, and C_v the covariance that the file states of it. So the best that a reconstruction can find is the field
-moved by b, and the first row of each rig is the L2 of the truth so moved. The box is not moved with it, and the flame
-ends at its faces; the other rows are NeRIF's with cameras fitted to the truth, where they are and moved by b. These
-cameras have seen the truth: they tell what could be reached, and no reconstruction starts from them.
+of that, and C_v the covariance that the file states of it. So a reconstruction that is right in all else finds the
+field moved by b, and the first row of each rig is the L2 of the truth so moved. The box is not moved with it, and the
+flame ends at its faces; the other rows are NeRIF's with cameras fitted to the truth, where they are and moved by b.
+These cameras have seen the truth: they tell what may be expected, and no reconstruction starts from them.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     add_write(parser)
     asked = parser.parse_args()
-    table = Table("What refinement of a rig can reach at best", ["rig", "field", "L2", "L2 aligned"], asked.write)
+    table = Table("What may be expected of a refined rig at best", ["rig", "field", "L2", "L2 aligned"], asked.write)
     truth = read_volume(asked.rigs / "truth.nc")
     field = VoxelField.through(truth.values.double(), truth.grid)
     for name in asked.only:
