@@ -6,7 +6,7 @@ Simulated data on rings of cameras over half a turn. For each case: error, and i
 largest) the share of voxels whose truth lies within one and two standard deviations, where 68 and 95 % would be right;
 the rank correlation (Spearman) of errors and deviations over all voxels and, of errors averaged as the deviations are,
 in the flow; rms deviation over rms error; and the time of the whole command over that without them. Steps end a run, so
-that what else the machine does changes the seconds alone. `fire` took no part in the development of the method.
+that what else the machine does changes the seconds alone. None of these flows scales the deviations (deviations.py).
 
 Then the verdicts (verdicts.py) on measurements that are good and spoiled.
 """

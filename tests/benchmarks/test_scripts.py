@@ -24,7 +24,8 @@ SMALLEST = {
     "watching": "--pixels 12 --seconds 3 --turns 1",
     "warm_start": "--pixels 12 --seconds 8 --voxels 12 --fit-steps 5",
 }
-SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in ("abel_peers", "bench", "spoiling"))
+SHARED = ("abel_peers", "bench", "random_flows", "spoiling")  # by the scripts
+SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -15,7 +16,7 @@ from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.repetition import Found, Member
-from nerif.reconstruction.trials import BEYOND, BLOCK, LOST, VOXELS, WIDTH, Deviations, Trials, best_covered
+from nerif.reconstruction.trials import BLOCK, LOST, VOXELS, WIDTH, Deviations, Trials, best_covered
 from nerif.volume import Volume
 
 AMBIENT = 1.00027
@@ -73,30 +74,44 @@ def test_pixels_that_were_not_measured_stay_so(found):
     assert int(holes.measurement.usable.sum()) < int(found.measurement.usable.sum())
 
 
-def test_what_trials_lose_of_the_detail_tells_what_was_lost_before(measurement):
+def test_what_trials_lose_of_the_detail_tells_what_was_lost_before(found):
     """Deviations grow with the share of detail that trials do not keep, and stay where they have more of it."""
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 24)
     bare = Volume.of(hot(box, 0.1).sample(grid), grid, "index_excess", AMBIENT)
     for kept in (1.02, 0.98, 0.9):
-        deviations = Deviations(bare, GasSettings(), 40.0 / 24)
+        deviations = Deviations(bare, GasSettings(), found)
         for _ in range(2):
             trial = result_of(VoxelField.through(kept * bare.values.double(), grid), box)
-            deviations.add(Member(NeRIF(), measurement, (), bare), trial)
+            deviations.add(Member(NeRIF(), found.measurement, (), bare), trial)
         assert deviations.lost == pytest.approx(max(1 - kept**2, 0), abs=1e-4)
         ratio = float(deviations.std().values.norm() / (abs(1 - kept) * bare.values.norm()))
-        assert ratio == pytest.approx(BEYOND + LOST * deviations.lost**0.5, rel=0.02)
+        assert ratio == pytest.approx(deviations.better * math.exp(LOST * deviations.lost**0.5), rel=0.02)
 
 
-def test_a_field_without_detail_has_lost_none(measurement):
+@pytest.mark.parametrize("worse", [1.0, 2.0, 0.0])
+def test_errors_are_as_much_smaller_as_the_data_are_met_better_than_by_trials(found, worse):
+    trial = found.result
+    seen = found.seen(trial.field)["deflection"].to(found.measurement.displacement)
+    left = found.measurement.displacement - seen
+    known = found.result.volume(Grid.of_resolution(found.result.box, 16))
+    deviations = Deviations(known, GasSettings(), found)
+    assert deviations.better == 1.0  # of no trial
+    for share in (worse, worse):
+        data = replace(found.measurement, displacement=seen + share * left)
+        deviations.add(Member(NeRIF(), data, (), known), trial)
+    assert deviations.better == pytest.approx(1 / worse if worse else 1.0, rel=1e-3)
+
+
+def test_a_field_without_detail_has_lost_none(found):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 16)
     main = Volume.of(torch.full(grid.shape, -1e-4, dtype=torch.float64), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings(), 1.0)
+    deviations = Deviations(main, GasSettings(), found)
     flat = result_of(VoxelField.through(torch.full(grid.shape, -1.05e-4).double(), grid), box)
-    deviations.add(Member(NeRIF(), measurement, (), main), flat)
+    deviations.add(Member(NeRIF(), found.measurement, (), main), flat)
     std = deviations.std().values
-    torch.testing.assert_close(std, torch.full_like(std, BEYOND * 5e-6), rtol=1e-3, atol=0)
+    torch.testing.assert_close(std, torch.full_like(std, deviations.better * 5e-6), rtol=1e-3, atol=0)
 
 
 def test_views_are_covered_by_those_beside_them_and_opposite():
@@ -106,49 +121,49 @@ def test_views_are_covered_by_those_beside_them_and_opposite():
     assert order[-1] == "110deg"
 
 
-def test_standard_deviations_average_the_squares_of_known_errors_around_each_voxel(measurement):
+def test_standard_deviations_average_the_squares_of_known_errors_around_each_voxel(found):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 32)
     main = Volume.of(torch.full(grid.shape, -1e-4), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings(), 1.0)
+    deviations = Deviations(main, GasSettings(), found)
     drawn = torch.Generator().manual_seed(0)
     coarse = Grid.of_resolution(box, 16)
     for size in (3e-6, 4e-6):
         error = size * torch.randn(coarse.shape, generator=drawn, dtype=torch.float64)
         expected = Volume.of(torch.full(coarse.shape, -1e-4).double(), coarse, "index_excess", AMBIENT)
         plain = result_of(VoxelField.through(expected.values + error, coarse), box)
-        deviations.add(Member(NeRIF(), measurement, (), expected), plain)
-    deviations.add(Member(NeRIF(), measurement, ("a",)), plain)  # of which no error is known
-    found = {v.quantity: v for v in deviations.volumes()}
+        deviations.add(Member(NeRIF(), found.measurement, (), expected), plain)
+    deviations.add(Member(NeRIF(), found.measurement, ("a",)), plain)  # of which no error is known
+    told = {v.quantity: v for v in deviations.volumes()}
     assert deviations.count == 2
-    std = found["index_excess_std"].values
-    rms = BEYOND * (0.5 * (3e-6**2 + 4e-6**2)) ** 0.5
+    std = told["index_excess_std"].values
+    rms = deviations.better * (0.5 * (3e-6**2 + 4e-6**2)) ** 0.5
     assert float(std.square().mean().sqrt()) == pytest.approx(rms, rel=0.05)
     assert float(std.std() / std.mean()) < 0.5 * (2 * 2 * 1.1) ** -0.5 + 0.3  # smooth, where one error is not
-    k = found["density_std"].attributes["gladstone_dale_m3_kg-1"]
-    torch.testing.assert_close(found["density_std"].values, std / k, rtol=1e-4, atol=1e-9)
-    torch.testing.assert_close(found["n_std"].values, std, rtol=1e-4, atol=1e-12)
-    assert set(found) == {*(f"{q}_std" for q in ("index_excess", "n", "density", "temperature")),
+    k = told["density_std"].attributes["gladstone_dale_m3_kg-1"]
+    torch.testing.assert_close(told["density_std"].values, std / k, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(told["n_std"].values, std, rtol=1e-4, atol=1e-12)
+    assert set(told) == {*(f"{q}_std" for q in ("index_excess", "n", "density", "temperature")),
                           "temperature_p05", "temperature_p95"}  # fmt: skip
-    low, high = (found[f"temperature_{name}"].values for name in ("p05", "p95"))
+    low, high = (told[f"temperature_{name}"].values for name in ("p05", "p95"))
     middle = 293.15 * (AMBIENT - 1) / (AMBIENT - 1 - 1e-4)
     assert bool((low < high).all())
     assert float(low.mean()) < middle < float(high.mean())
     assert float((high + low).mean()) > 2 * middle  # temperature goes up faster than it comes down
-    assert found["temperature_p95"].unit == "K"
+    assert told["temperature_p95"].unit == "K"
 
 
-def test_temperatures_beyond_the_relation_are_masked_and_counted(measurement):
+def test_temperatures_beyond_the_relation_are_masked_and_counted(found):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 8)
     main = Volume.of(torch.full(grid.shape, -2.6e-4), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings(), 1.0)
+    deviations = Deviations(main, GasSettings(), found)
     plain = result_of(VoxelField.through(torch.full(grid.shape, -2.6e-4).double(), grid), box)
     expected = Volume.of(torch.full(grid.shape, -2.3e-4), grid, "index_excess", AMBIENT)
-    deviations.add(Member(NeRIF(), measurement, (), expected), plain)
-    found = {v.quantity: v for v in deviations.volumes()}
-    assert found["temperature_p95"].notes["masked_voxels"] == grid.shape[0] ** 3
-    assert float(found["index_excess_std"].values.mean()) == pytest.approx(BEYOND * 3e-5, rel=1e-3)
+    deviations.add(Member(NeRIF(), found.measurement, (), expected), plain)
+    told = {v.quantity: v for v in deviations.volumes()}
+    assert told["temperature_p95"].notes["masked_voxels"] == grid.shape[0] ** 3
+    assert float(told["index_excess_std"].values.mean()) == pytest.approx(deviations.better * 3e-5, rel=1e-3)
 
 
 @pytest.mark.parametrize(("kind", "members"), [("off", 0), ("fast", 2), ("full", 8)])

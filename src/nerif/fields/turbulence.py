@@ -18,24 +18,27 @@ LONGEST, SHORTEST = 0.5, 0.0112
 """Wavelengths of the inertial range, shares of the shortest edge: at 50 mm 25 mm and two pixels of the paper's rig."""
 
 
-def inertial_scalar(box: Box, seed: int, shortest: float = SHORTEST) -> VoxelField:
-    """Return a homogeneous, isotropic Gaussian field of mean 0 and variance 1 with E(k) ~ k^(-5/3).
+def inertial_scalar(
+    box: Box, seed: int, shortest: float = SHORTEST, longest: float = LONGEST, slope: float = 5 / 3
+) -> VoxelField:
+    """Return a homogeneous, isotropic Gaussian field of mean 0 and variance 1 with E(k) ~ k^-slope.
 
-    The spectrum reaches from LONGEST to `shortest` and is 0 beyond; the field is periodic in the box.
+    The spectrum reaches from `longest` to `shortest` and is 0 beyond; the field is periodic in the box.
 
     Parameters
     ----------
     box : Box, mm
     seed : of the phases
-    shortest : wavelength at which the spectrum ends, share of the shortest edge
+    shortest, longest : wavelengths at which the spectrum ends and begins, shares of the shortest edge
+    slope : 5/3 in the inertial range
 
     Raises
     ------
     InputError
         If the range of wavelengths is empty.
     """
-    if not 0 < shortest < LONGEST:
-        raise InputError(f"shortest: expected a share of the edge between 0 and {LONGEST}, got {shortest}")
+    if not 0 < shortest < longest:
+        raise InputError(f"shortest: expected a share of the edge between 0 and {longest}, got {shortest}")
     edge = min(box.edges)
     shape = [math.ceil(2 * length / (shortest * edge)) for length in reversed(box.edges)]  # z, y, x
     generator = torch.Generator().manual_seed(seed)
@@ -44,9 +47,9 @@ def inertial_scalar(box: Box, seed: int, shortest: float = SHORTEST) -> VoxelFie
     z, y = (torch.fft.fftfreq(n, d) for n, d in zip(shape[:2], spacing[:2], strict=True))
     x = torch.fft.rfftfreq(shape[2], spacing[2])
     k = (z[:, None, None].square() + y[:, None].square() + x.square()).sqrt() * edge  # waves per edge
-    inertial = (k >= 1 / LONGEST) & (k <= 1 / shortest)
-    # E(k) ~ k^2 |f(k)|^2 ~ k^(-5/3)
-    amplitude = torch.where(inertial, k.clamp_min(1e-9) ** (-11 / 6), 0.0)
+    inertial = (k >= 1 / longest) & (k <= 1 / shortest)
+    # E(k) ~ k^2 |f(k)|^2 ~ k^-slope
+    amplitude = torch.where(inertial, k.clamp_min(1e-9) ** (-0.5 * slope - 1), 0.0)
     values = torch.fft.irfftn(white * amplitude, s=shape)
     return VoxelField.through(values / values.std(), Grid(box, tuple(shape)))  # type: ignore[arg-type]
 

@@ -1,15 +1,17 @@
 """How far off a reconstruction may be, from more of them whose errors are known.
 
-    std(x) = (B + C sqrt(1 - k^2)) (G * mean_j (q'_j - q)^2)^(1/2) (x),    k^2 = <(q'_j - g * q'_j)^2> / <(q - g * q)^2>
+    std(x) = rho exp(C sqrt(1 - k^2)) (G * mean_j (q'_j - q)^2)^(1/2) (x)
+    k^2 = <(q'_j - g * q'_j)^2> / <(q - g * q)^2>,    rho^2 = <(d - F q)^2> / <(d_j - F q'_j)^2>
 
 Trial q'_j is of a field that is known, the one that was found, q, seen by the same cameras. What it looks like is
 predicted, with what the reconstruction left unexplained added in blocks of random sign: whatever noise there is, of the
 right size and correlated as it is. How far the reconstruction of it is off is an error as q may have it.
 
 But q is smoother than the truth: what a reconstruction cannot take up, no trial of q can miss. Trials tell how much
-that is by the detail of q that they keep themselves, the share k^2 of its squares, with g as wide as pixels see. Where
-they keep all of it errors are those of noise; where they do not, q has lost more of the truth than they of q. B and C
-were fitted to phantoms (docs/architecture.md).
+that is by the detail of q that they keep themselves, the share k^2 of its squares, with g as fine as pixels see. Where
+they keep all of it errors are those of noise; where they do not, q has lost more of the truth than they of q. C was
+fitted to random flows (benchmarks/deviations.py). And q may explain what it was made from, d, better than trials do
+what they were, d_j, if it was trained for longer; then its errors are as much smaller, rho.
 
 One error is noisy, so squares are averaged around each voxel by a Gaussian G, WIDTH wide. No trial sees a truth.
 """
@@ -19,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from statistics import mean
 
 import numpy as np
@@ -32,7 +35,7 @@ from nerif.geometry import Camera, Grid
 from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings, derive
 from nerif.reconstruction.base import Reconstruction
-from nerif.reconstruction.repetition import Found, Member, other_seed
+from nerif.reconstruction.repetition import Found, Maps, Member, other_seed
 from nerif.volume import Volume, describe, quantities_of
 
 __all__ = ["KINDS", "Deviations", "Trials", "best_covered"]
@@ -42,8 +45,8 @@ KINDS = {"off": 0, "fast": 2, "full": 8}
 
 WIDTH = 0.04  # of the box edge, standard deviation
 VOXELS = 64  # along the longest edge, on which errors are compared
-DETAIL = 1.1  # px in the middle of the box, standard deviation of g
-BEYOND, LOST = 1.05, 1.5  # B and C
+DETAIL = 0.7  # px in the middle of the box, standard deviation of g
+LOST = 1.9  # C
 NONE = 1e-10  # of the squares of a field: less than that is rounding, and no detail
 BLOCK = 8  # px, in which what is left unexplained keeps its sign
 TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations at which percentiles lie
@@ -88,7 +91,7 @@ class Trials:
         return Member(other_seed(found.reconstructor, number), simulated, (), volume, ", of a field that is known")
 
     def taken(self, found: Found, main: Volume, gas: GasSettings) -> Deviations:
-        return Deviations(main, gas, mean(found.measurement.pixel_sizes))
+        return Deviations(main, gas, found)
 
 
 def _sampled(result: Reconstruction) -> Volume:
@@ -132,6 +135,18 @@ def _signs(like: Float[Tensor, "view row column c"], drawn: torch.Generator) -> 
     return fine[:, :height, :width].to(like)
 
 
+def _left(measurement: Measurement, seen: Maps) -> list[float]:
+    """Mean square of what a field leaves unexplained of each technique, over sigma^2 where that is known."""
+    squares = []
+    for o in measurement.observations:
+        used = measurement.usable_for(o) & measurement.sees_box
+        left = (o.values - seen[o.technique.name].to(o.values))[used].double()
+        if o.sigma is not None:
+            left = left / o.sigma[used].double()
+        squares.append(float(left.square().mean()))
+    return squares
+
+
 def _blurred(values: Tensor, grid: Grid, mm: float) -> Tensor:
     """The mean over a Gaussian of that standard deviation, at least a voxel."""
     from scipy.ndimage import gaussian_filter
@@ -147,14 +162,17 @@ class Deviations:
     ----------
     main : (z, y, x) the field that was found, as it is written
     gas : what density and temperature are computed for
-    pixel : edge of one in the middle of the box, mm
+    found : what the trials are of
     """
 
-    def __init__(self, main: Volume, gas: GasSettings, pixel: float) -> None:
-        self.main, self.gas, self.pixel = main, gas, pixel
+    def __init__(self, main: Volume, gas: GasSettings, found: Found) -> None:
+        self.main, self.gas, self.found = main, gas, found
+        self.pixel = mean(found.measurement.pixel_sizes)  # mm, in the middle of the box
         self.squares: list[Tensor] = []
         self.detail: list[tuple[float, float]] = []
         """Mean squares of the detail that a trial has, and of that of the field it is of, where that has some."""
+        self.left: list[float] = []
+        """Mean squares of what trials leave unexplained, over those of the reconstruction."""
         self.grid: Grid | None = None
 
     @property
@@ -171,6 +189,12 @@ class Deviations:
             fine = [float((v - _blurred(v, self.grid, DETAIL * self.pixel)).square().mean()) for v in both]
             if fine[1] > NONE * float(both[1].square().mean()):
                 self.detail.append((fine[0], fine[1]))
+            left = _left(member.measurement, self.found.seen(result.field))
+            self.left += [j / q for j, q in zip(left, self._left_by_it, strict=True) if q > 0]
+
+    @cached_property
+    def _left_by_it(self) -> list[float]:
+        return _left(self.found.measurement, self.found.seen(self.found.result.field))
 
     @property
     def lost(self) -> float:
@@ -180,12 +204,21 @@ class Deviations:
         kept, there = (sum(squares) for squares in zip(*self.detail, strict=True))
         return max(1 - kept / there, 0.0)
 
+    @property
+    def better(self) -> float:
+        """How much less the reconstruction leaves unexplained than trials do, rho."""
+        return mean(self.left) ** -0.5 if self.left and mean(self.left) > 0 else 1.0
+
+    def local(self) -> Float[Tensor, "z y x"]:
+        """Return the rms error of the trials around each voxel of `grid`."""
+        assert self.grid is not None
+        edge = math.prod(self.grid.box.edges) ** (1 / 3)
+        return _blurred(torch.stack(self.squares).mean(dim=0), self.grid, WIDTH * edge).sqrt()
+
     def std(self) -> Volume:
         """Return the standard deviation of the field."""
         assert self.grid is not None
-        edge = math.prod(self.grid.box.edges) ** (1 / 3)
-        local = _blurred(torch.stack(self.squares).mean(dim=0), self.grid, WIDTH * edge).sqrt()
-        whole = (BEYOND + LOST * math.sqrt(self.lost)) * local
+        whole = self.better * math.exp(LOST * math.sqrt(self.lost)) * self.local()
         values = VoxelField.through(whole, self.grid).sample(self.main.grid).clamp(min=0)
         return Volume(values, self.main.grid, f"{self.main.quantity}_std")
 
