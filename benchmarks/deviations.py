@@ -58,8 +58,8 @@ def _reconstructed(number: int) -> dict[str, float | str]:
     from nerif.prediction import reproject
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.repetition import Found
-    from nerif.reconstruction.trials import VOXELS, Trials
+    from nerif.reconstruction.repetition import VOXELS, Found
+    from nerif.reconstruction.trials import Trials
     from nerif.workflow import Run, reconstruct_into
 
     torch.set_num_threads(1)
@@ -75,12 +75,12 @@ def _reconstructed(number: int) -> dict[str, float | str]:
         result = ResultDirectory(out)
         main = _read(result)
         found = Found(main, method, measurement, dict, lambda field: reproject(field, measurement).maps)
-        deviations = Deviations(main.volume(grid), GasSettings(), found)
+        deviations = Deviations(found.sampled, GasSettings(), found)
         trials = Trials("fast")
         for trial in range(1, trials.members + 1):
             deviations.add(trials.member(trial, found, []), _read(result.member(trial)))
     flow = truth.abs() > FLOW * truth.abs().max()
-    error = main.volume(grid).values.double() - truth
+    error = found.sampled.values.double() - truth
     size = (error.abs() / deviations.local())[flow].numpy()
     return {
         "flow": "cloud" if case.cloudy else "front",

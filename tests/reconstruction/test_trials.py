@@ -15,8 +15,8 @@ from nerif.physics.quantities import GasSettings
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.repetition import Found, Member
-from nerif.reconstruction.trials import BLOCK, LOST, VOXELS, WIDTH, Deviations, Trials, best_covered
+from nerif.reconstruction.repetition import VOXELS, Found, Member
+from nerif.reconstruction.trials import BLOCK, LOST, WIDTH, Deviations, Trials, best_covered
 from nerif.volume import Volume
 
 AMBIENT = 1.00027
@@ -24,7 +24,7 @@ AMBIENT = 1.00027
 
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch):
-    monkeypatch.setattr("nerif.reconstruction.trials.VOXELS", 16)
+    monkeypatch.setattr("nerif.reconstruction.repetition.VOXELS", 16)
 
 
 def hot(box: Box, wide: float = 0.2, at: float = 0.0) -> VoxelField:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -12,12 +13,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.fields.base import Field
+from nerif.fields.grid import VoxelField
+from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.volume import Volume, describe
 
-__all__ = ["Found", "Maps", "Member", "Repetitions", "Taken", "certainty", "other_seed"]
+__all__ = ["VOXELS", "Found", "Maps", "Member", "Repetitions", "Taken", "certainty", "other_seed"]
+
+VOXELS = 64
 
 Maps = Mapping[str, Float[Tensor, "view row column c"]]
 """What views see, or its noise, by the name of the technique."""
@@ -41,6 +46,16 @@ class Found:
     measurement: Measurement
     noise: Callable[[], Maps]
     seen: Callable[[Field], Maps]
+
+    @cached_property
+    def sampled(self) -> Volume:
+        """The result on VOXELS voxels along the longest edge, on which errors are compared."""
+        return self.result.volume(Grid.of_resolution(self.result.box, VOXELS))
+
+    @cached_property
+    def predicted(self) -> Maps:
+        """What the views see of the result as it is sampled, by a spline through it."""
+        return self.seen(VoxelField.through(self.sampled.values.double(), self.sampled.grid))
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,6 @@ KINDS = {"off": 0, "fast": 2, "full": 8}
 """How many trials."""
 
 WIDTH = 0.04  # of the box edge, standard deviation
-VOXELS = 64  # along the longest edge, on which errors are compared
 DETAIL = 0.7  # px in the middle of the box, standard deviation of g
 LOST = 1.9  # C
 NONE = 1e-10  # of the squares of a field: less than that is rounding, and no detail
@@ -85,17 +84,12 @@ class Trials:
 
     def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
         """Return a trial: of the field that was found, and what was left of the measurement with other signs."""
-        volume = _sampled(found.result)
         drawn = torch.Generator().manual_seed(2_000_003 + number)
-        simulated = _simulated(found, volume, drawn)
-        return Member(other_seed(found.reconstructor, number), simulated, (), volume, ", of a field that is known")
+        reconstructor, about = other_seed(found.reconstructor, number), ", of a field that is known"
+        return Member(reconstructor, _simulated(found, drawn), (), found.sampled, about)
 
     def taken(self, found: Found, main: Volume, gas: GasSettings) -> Deviations:
         return Deviations(main, gas, found)
-
-
-def _sampled(result: Reconstruction) -> Volume:
-    return result.volume(Grid.of_resolution(result.box, VOXELS))
 
 
 def best_covered(cameras: Sequence[Camera]) -> list[str]:
@@ -112,18 +106,14 @@ def best_covered(cameras: Sequence[Camera]) -> list[str]:
     return [cameras[int(i)].name for i in order]
 
 
-def _simulated(found: Found, known: Volume, drawn: torch.Generator) -> Measurement:
-    """What would have been measured of a field that is known, with what was left unexplained of the one found."""
-    seen, maps = found.seen(_spline(known)), {}
+def _simulated(found: Found, drawn: torch.Generator) -> Measurement:
+    """What would have been measured of the field that was found, with what was left unexplained of it."""
+    maps = {}
     for o in found.measurement.observations:
-        predicted = seen[o.technique.name].to(o.values)
+        predicted = found.predicted[o.technique.name].to(o.values)
         maps[o.technique.name] = predicted + (o.values - predicted) * _signs(o.values, drawn)
     sigmas = {o.technique.name: o.sigma for o in found.measurement.observations}
     return found.measurement.observed(maps, sigmas)
-
-
-def _spline(volume: Volume) -> VoxelField:
-    return VoxelField.through(volume.values.double(), volume.grid)
 
 
 def _signs(like: Float[Tensor, "view row column c"], drawn: torch.Generator) -> Float[Tensor, "view row column c"]:
