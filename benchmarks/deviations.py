@@ -10,8 +10,7 @@ factor between the errors that trials show around each voxel of the flow and tho
 e^2 the mean square error of the trials, averaged as for standard deviations. Lost is (1 - k^2)^(1/2), k^2 the share of
 detail that trials keep, and rho how much less the reconstruction leaves unexplained than they do. C makes the squares
 of log F - log rho - C lost least over all draws; how far F is from what the other draws tell of it is the scatter to
-expect of standard deviations. What is done is kept in --folder, and
-not done again.
+expect of standard deviations. What is done is kept in --folder, and not done again.
 """
 
 from __future__ import annotations
@@ -106,7 +105,7 @@ def fitted(lost: NDArray[np.float64], factors: NDArray[np.float64]) -> float:
 def main() -> None:
     """Reconstruct the draws, and print the number fitted to them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--draws", type=int, default=40)
+    parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--folder", type=Path, default=Path("out/deviations"), help="where each draw is kept")
     parser.add_argument("--processes", type=int, default=2)
     add_write(parser)

@@ -152,7 +152,7 @@ def test_unknown_phantom_is_refused():
 
 @pytest.mark.parametrize("asked", [5 / 3, 3.0])
 def test_the_scalar_of_turbulence_has_the_spectrum_of_the_inertial_range(asked):
-    """Power summed over shells of wave numbers falls as k^(-5/3) within the range, and there is none beyond."""
+    """Power summed over shells of wave numbers falls as k^-slope within the range, and there is none beyond."""
     scalar = inertial_scalar(CUBE, 0, shortest=0.04, slope=asked)
     values = scalar(scalar.grid.points(torch.float64))
     n = scalar.grid.shape[0]
