@@ -85,6 +85,7 @@ def _reconstructed(number: int) -> dict[str, float | str]:
         "flow": "cloud" if case.cloudy else "front",
         "views": case.views,
         "noise": case.noise,
+        "steps": case.steps,
         "f_number": case.f_number,
         "l2_variation": float(error.norm() / truth.norm()),
         "lost": math.sqrt(deviations.lost),
@@ -105,7 +106,7 @@ def fitted(lost: NDArray[np.float64], factors: NDArray[np.float64]) -> float:
 def main() -> None:
     """Reconstruct the draws, and print the number fitted to them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--draws", type=int, nargs="+", default=list(range(20)), help="their numbers")
     parser.add_argument("--folder", type=Path, default=Path("out/deviations"), help="where each draw is kept")
     parser.add_argument("--processes", type=int, default=2)
     add_write(parser)
@@ -114,7 +115,7 @@ def main() -> None:
     columns = ["draw", "flow", "views", "noise", "lens", "L2 of variation", "lost", "rho", "F_1", "F_2", "F", "told"]
     table = Table("What scales standard deviations", columns, asked.write)
     with ProcessPoolExecutor(asked.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
-        draws = list(pool.map(looked_at, range(asked.draws), [asked.folder] * asked.draws))
+        draws = list(pool.map(looked_at, asked.draws, [asked.folder] * len(asked.draws)))
     lost = np.array([float(d["lost"]) for d in draws])
     better = np.array([float(d["better"]) for d in draws])
     factors = np.array([math.sqrt(float(d["factor_1"]) * float(d["factor_2"])) for d in draws])
@@ -125,7 +126,7 @@ def main() -> None:
         lens = f"f/{d['f_number']:g}" if d["f_number"] else "-"
         numbers = [lost[number], better[number], d["factor_1"], d["factor_2"], factors[number], told[-1]]
         cells = [f"{d['noise']:.3f}", lens, f"{d['l2_variation']:.1%}", *(f"{float(x):.2f}" for x in numbers)]
-        table.row([str(number), str(d["flow"]), str(d["views"]), *cells])
+        table.row([str(asked.draws[number]), str(d["flow"]), str(d["views"]), *cells])
     off = np.abs(np.log(factors / np.array(told)))
     table.text("", f"C = {fitted(lost, factors / better):.2f}; in trials.py {LOST:g}.")
     median, most = (math.exp(float(np.quantile(off, q))) for q in (0.5, 0.9))

@@ -117,7 +117,7 @@ def random_flow(number: int) -> RandomFlow:
     views, pixels = drawn.randint(5, 14), drawn.choice((36, 48))
     noise = math.exp(drawn.uniform(math.log(0.02), math.log(0.2)))
     f_number = drawn.choice((0.0, 0.0, 0.0, 5.6, 8.0, 16.0))
-    steps = drawn.choice((150, 250))
+    steps = round(math.exp(drawn.uniform(math.log(150), math.log(900))))
     return RandomFlow(number, field, box, cloudy, views, pixels, drawn.uniform(0, 30), noise, f_number, steps)
 
 
