@@ -10,6 +10,7 @@ rays held back. Each is a process of its own.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,7 @@ def main() -> None:
             path = alone(measured, pixels, asked.noise, kept)
             for seed in asked.seeds:
                 steps, seconds, error, why = alone(run, path, 0, seed, asked.threads)
+                print(f"{pixels}²: {steps} steps, {seconds:.0f} s, {error:.3%}, {why}", file=sys.stderr, flush=True)
                 more, longer, least, _ = alone(run, path, LONGER * steps, seed, asked.threads)
                 cells = [str(steps), f"{seconds:.0f}", f"{error:.3%}", str(more), f"{longer:.0f}", f"{least:.3%}"]
                 table.row([f"{pixels}²", str(seed), *cells, f"{error / least:.2f}", why])

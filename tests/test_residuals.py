@@ -90,10 +90,10 @@ def test_of_a_few_pixels_nothing_is_said():
     ("file", "cause", "views"),
     [
         ("thin", "", 9),
-        ("offset", "offset", 8),
+        pytest.param("offset", "offset", 8, marks=pytest.mark.slow),
         ("pose_large", "calibration", 7),
-        ("window6", "blur", 8),
-        ("f4", "blur", 7),
+        pytest.param("window6", "blur", 8, marks=pytest.mark.slow),
+        pytest.param("f4", "blur", 7, marks=pytest.mark.slow),
     ],
 )
 def test_on_measurements_made_by_others(file, cause, views):

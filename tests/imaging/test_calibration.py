@@ -15,6 +15,7 @@ from nerif.experiment import target_poses, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.bundle import Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration import CalibrationSettings, calibrate
+from nerif.imaging.calibration_result import Calibration
 from nerif.imaging.cameras_file import read_cameras
 from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
 
@@ -49,14 +50,26 @@ def rig() -> tuple[Camera, ...]:
 
 CAMERAS = rig()
 SETTINGS = CalibrationSettings(world="0", axes=world_axes(CAMERAS))
+NOISE = 0.05  # px
 
 
 def pictures(noise: float = 0.0, poses: int = 12, backgrounds: int = 3) -> list[ViewPictures]:
     return target_pictures(CAMERAS, TARGET, noise, poses, backgrounds)
 
 
-def test_exact_points_give_the_rig_back():
-    result = calibrate(pictures(), SETTINGS)
+@pytest.fixture(scope="module")
+def exact() -> Calibration:
+    """From points without noise."""
+    return calibrate(pictures(), SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Calibration:
+    return calibrate(pictures(NOISE, poses=16), SETTINGS)
+
+
+def test_exact_points_give_the_rig_back(exact):
+    result = exact
     assert result.rms() < 1e-4
     for camera, pose, k, plane in zip(CAMERAS, result.poses, result.intrinsics, result.backgrounds, strict=True):
         turn = Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude()
@@ -70,10 +83,9 @@ def test_exact_points_give_the_rig_back():
         assert abs(plane.offset - camera.background.offset) < 0.01
 
 
-def test_errors_are_about_what_is_stated():
-    noise = 0.05
-    result = calibrate(pictures(noise, poses=16), SETTINGS)
-    assert result.rms() == pytest.approx(noise * np.sqrt(2), rel=0.1)
+def test_errors_are_about_what_is_stated(noisy):
+    result = noisy
+    assert result.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.1)
     turns, moves = [], []
     for camera, pose in zip(CAMERAS, result.poses, strict=True):
         turns.append(np.degrees(Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude()))
@@ -83,9 +95,9 @@ def test_errors_are_about_what_is_stated():
     assert np.all(np.array(moves) < 3 * result.sigma_translation)
 
 
-def test_turns_and_shifts_of_cameras_are_about_their_pose_sigma():
+def test_turns_and_shifts_of_cameras_are_about_their_pose_sigma(noisy):
     """The mount is left out; what noise does to a camera about its own axes is what refinement goes by."""
-    result = dataclasses.replace(calibrate(pictures(0.05, poses=16), SETTINGS), mount=(0.0, 0.0))
+    result = dataclasses.replace(noisy, mount=(0.0, 0.0))
     off = []
     for camera, found in zip(CAMERAS, result.cameras, strict=True):
         turn = Rotation.from_matrix((camera.rotation @ found.rotation.T).numpy()).as_rotvec()
@@ -96,8 +108,7 @@ def test_turns_and_shifts_of_cameras_are_about_their_pose_sigma():
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.6
 
 
-def test_a_mount_adds_to_the_noise_and_is_kept_in_the_file(tmp_path):
-    exact = calibrate(pictures(), SETTINGS)
+def test_a_mount_adds_to_the_noise_and_is_kept_in_the_file(tmp_path, exact):
     exact.write(tmp_path / "c.toml")
     sigma = read_cameras(tmp_path / "c.toml")[0].camera((400, 500)).pose_sigma
     assert sigma.tolist() == pytest.approx([np.radians(0.005)] * 3 + [0.05] * 3, rel=0.05)

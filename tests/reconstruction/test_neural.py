@@ -216,7 +216,9 @@ def test_sixty_steps_serve_every_shape(measurement, octaves, width, depth):
     assert not result.outcome.failed
 
 
-@pytest.mark.parametrize(("pixels", "octaves"), [(16, 3), (24, 4), (40, 4), (48, 5), (200, 5)])
+@pytest.mark.parametrize(
+    ("pixels", "octaves"), [(16, 3), (24, 4), (40, 4), (48, 5), pytest.param(200, 5, marks=pytest.mark.slow)]
+)
 def test_waves_that_pixels_cannot_tell_apart_are_left_out(pixels, octaves):
     cameras, box = paper_rig(pixels)
     seen = simulate(make_phantom("gaussians", box, 0), cameras[:2], box, 1.00027, 0.02, 0)

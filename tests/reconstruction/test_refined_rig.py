@@ -133,7 +133,7 @@ def alone(measurement: Measurement) -> Measurement:
     return measurement.select([measurement.names[2]])
 
 
-@pytest.mark.parametrize("method", [Tikhonov, TotalVariation])
+@pytest.mark.parametrize("method", [Tikhonov, pytest.param(TotalVariation, marks=pytest.mark.slow)])
 def test_voxels_follow_a_rig_that_is_refined(measured, method):
     wrong = knocked(measured)
     settings = method(voxels=20, refine=("cameras",), pose_sigma_mm=2.0, coarse_to_fine=False, device="cpu")

@@ -170,6 +170,32 @@ def test_the_rigid_motion_of_all_cameras_is_taken_out(measured):
     assert float(refinement._centred(one)[2, 4]) > 0.5
 
 
+def test_a_stretch_of_all_pictures_alike_is_taken_out_and_that_of_one_is_not(measured):
+    refinement = Refinement.asked(measured, ["shift"])
+    alike = torch.zeros(len(measured.cameras), len(NAMES), dtype=torch.float64)
+    for name in ("u_x", "v_y"):
+        alike[:, NAMES.index(name)] = 0.01
+    assert float(refinement._centred(alike).abs().max()) < 1e-12
+    for name in ("u", "v", "u_y", "v_x"):  # no field does that in every view
+        other = torch.zeros_like(alike)
+        other[:, NAMES.index(name)] = 0.01
+        assert torch.equal(refinement._centred(other), other)
+    one = torch.zeros_like(alike)
+    one[2, NAMES.index("u_x")] = 0.01
+    assert float(refinement._centred(one)[2, NAMES.index("u_x")]) == pytest.approx(0.008)
+
+
+def test_a_shift_of_pictures_is_not_overshot(measured):
+    """Two steps against the field as it is find it; a third stays there."""
+    shift = torch.tensor([0.4, -0.3])
+    wrong = replace(measured, displacement=measured.displacement + shift)
+    refinement = Refinement.asked(wrong, ["shift"], px=0.5)
+    for _ in range(3):
+        refinement.step(in_sigmas(wrong), predict)
+        found = refinement.values[:, [NAMES.index("u"), NAMES.index("v")]]
+        assert float((found - shift).abs().max()) < 0.03
+
+
 def test_views_that_are_fewer_are_moved_as_themselves(measured):
     refinement = Refinement.asked(measured, ["cameras"], 0.5, 0.03, 0.03)
     refinement.restore({**refinement.kept(), "values": torch.randn(5, 14).double() * refinement.sigma})

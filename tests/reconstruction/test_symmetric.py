@@ -76,7 +76,8 @@ def test_the_operator_is_the_path_integral_of_its_field_and_has_its_adjoint(jet,
 
 @pytest.mark.parametrize(
     ("method", "most"),
-    [(Tikhonov(voxels=40), 0.03), (TotalVariation(voxels=40), 0.03), (Landweber(voxels=40), 0.06),
+    [(Tikhonov(voxels=40), 0.03), pytest.param(TotalVariation(voxels=40), 0.03, marks=pytest.mark.slow),
+     pytest.param(Landweber(voxels=40), 0.06, marks=pytest.mark.slow),
      pytest.param(NeRIF(max_steps=120), 0.03, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_one_view_is_enough(jet, method, most):
@@ -102,7 +103,7 @@ def test_emission_from_one_view():
     assert float((found.field.sample(grid) - truth).norm() / truth.norm()) < 0.08
 
 
-@pytest.mark.parametrize("shift", [(1.0, -0.7, 0.0), (-1.5, 0.4, 2.0)])
+@pytest.mark.parametrize("shift", [(1.0, -0.7, 0.0), pytest.param((-1.5, 0.4, 2.0), marks=pytest.mark.slow)])
 def test_the_axis_is_found_in_the_picture_and_left_where_it_cannot_be_seen(jet, shift):
     symmetry = Symmetry.about("axis", shift, (0.03, -0.02, 1.0), 0.1)
     one = find_axis(one_view(jet), symmetry, (2.0, math.radians(3.0)), SIDES)

@@ -4,9 +4,10 @@
     min  sum |d - measured|^2 / sigma^2 + sum theta^2 / sigma_theta^2
 
 Every number is held by its standard deviation. A step is one of Gauss and Newton against the field as it is, camera by
-camera; between two steps the field follows. It follows so well that a step sees but a part of what is wrong, so that
-steps gather momentum. What no camera can tell, the rigid motion of all of them with the field, is taken out: the mean
-of the corrections, weighted by their priors, stays 0.
+camera; between two steps the field follows. It follows cameras so well that a step sees but a part of what is wrong, so
+that steps of those gather momentum; a shift of pictures is seen whole. What the field follows for good, the rigid motion
+of all cameras and a stretch of all pictures alike, is taken out: the mean of the corrections, weighted by their priors,
+stays 0.
 
 While the field is not found yet, what it leaves is alike around and no noise. So data count little at first, and where
 they tell less than the prior does, the prior holds (docs/refinement.md).
@@ -37,6 +38,7 @@ ALIKE = 20.0  # neighbours that what is not understood is alike in
 MOMENTUM = 0.6
 DRAWN = 150  # pixels a view, for a step
 SIGN, SIGNS = 0.012, 2  # share of a residual that a number explains, and how often, before cameras are moved
+STRETCHED = ("u_x", "v_y")  # of all pictures alike: as a field that is a parabola across, or along the axis, does it
 UNTOLD = 0.05  # share that a movement has in the mean of all which no data tell
 
 Predict = Callable[[Part, Rays], Float[Tensor, "n k"]]
@@ -51,7 +53,7 @@ class Refinement:
     cameras : as they were calibrated
     box : of the field, mm
     sigma : (view, 14) standard deviation of each of NAMES; 0 for one that is not refined
-    gauged : whether the field moves with the cameras, so that their rigid motion has to be taken out
+    gauged : whether the field follows, so that what it can follow for good has to be taken out
     """
 
     def __init__(
@@ -218,7 +220,9 @@ class Refinement:
         move = ((1 + told) * pull - at) / (1 + told * (1 + told))  # what is told clearly is free of the prior
         change = torch.zeros_like(self.values)
         change[:, self.columns] = sigma * torch.einsum("vij,vj->vi", ways, move)
-        self.velocity = momentum * self.velocity + change
+        gathered = momentum * self.velocity
+        gathered[:, len(GEOMETRY) :] = 0
+        self.velocity = gathered + change
         counts = (told / (1 + told)).clamp(min=UNTOLD).sqrt()[:, :, None] * ways.mT
         self.values = self._centred(self.values + self.velocity, counts)
         self._corrections = self._of(self.values)
@@ -297,25 +301,36 @@ class Refinement:
     def _centred(
         self, values: Float[Tensor, "view 14"], counts: Float[Tensor, "view k k"] | None = None
     ) -> Float[Tensor, "view 14"]:
-        """The numbers without the rigid motion of all cameras: their mean, each movement as clearly as it is told.
+        """The numbers without what no camera tells: the mean of each of `_modes`, every number as clearly as it is told.
 
         Parameters
         ----------
         counts : movements in units of sigma to what counts of them; None for all alike
         """
-        if not self.gauged or not bool((self.sigma[:, :6] > 0).all()):
+        modes = self._modes()
+        if not self.gauged or not modes.shape[-1]:
             return values
-        motions = torch.stack([_motion(camera) for camera in self.cameras])
         sigma = self.sigma[:, self.columns].clamp(min=1e-30)
-        rigid = torch.zeros(len(self.cameras), len(self.columns), 6, dtype=torch.float64)
-        rigid[:, :6] = motions / sigma[:, :6, None]
+        scaled = modes[:, self.columns] / sigma[..., None]
         if counts is None:
             counts = torch.eye(len(self.columns), dtype=torch.float64).expand(len(self.cameras), -1, -1)
         moved = counts @ (values[:, self.columns] / sigma)[..., None]
-        best = torch.linalg.lstsq((counts @ rigid).flatten(0, 1), moved.flatten(0, 1)).solution[:, 0]
-        values = values.clone()
-        values[:, :6] -= torch.einsum("vij,j->vi", motions, best)
-        return values
+        best = torch.linalg.lstsq((counts @ scaled).flatten(0, 1), moved.flatten(0, 1)).solution[:, 0]
+        return values - torch.einsum("vij,j->vi", modes, best)
+
+    def _modes(self) -> Float[Tensor, "view 14 mode"]:
+        """What the field follows: six rigid motions, and pictures that all stretch alike, along columns or along rows.
+
+        Only those of which every view refines every number.
+        """
+        modes = torch.zeros(*self.sigma.shape, 6 + len(STRETCHED), dtype=torch.float64)
+        modes[:, :6, :6] = torch.stack([_motion(camera) for camera in self.cameras])
+        for i, name in enumerate(STRETCHED, 6):
+            modes[:, NAMES.index(name), i] = 1
+        free = (self.sigma > 0).all(dim=0)
+        needed = (modes != 0).any(dim=0)  # number, mode
+        needed[:6, :6] = True
+        return modes[..., (free[:, None] | ~needed).all(dim=0)]
 
     def _steps(self) -> Float[Tensor, "view 14"]:
         """By how much each number is changed to see what it does: what moves rays by STEP_PX, at about."""
