@@ -5,7 +5,7 @@
 
 Every number is held by its standard deviation. A step is one of Gauss and Newton against the field as it is, camera by
 camera; between two steps the field follows. It follows cameras so well that a step sees but a part of what is wrong, so
-that steps of those gather momentum; a shift of pictures is seen whole. What the field follows for good, the rigid motion
+that steps of those gather momentum; shifts of pictures are seen whole. What the field follows for good, a rigid motion
 of all cameras and a stretch of all pictures alike, is taken out: the mean of the corrections, weighted by their priors,
 stays 0.
 
@@ -301,7 +301,7 @@ class Refinement:
     def _centred(
         self, values: Float[Tensor, "view 14"], counts: Float[Tensor, "view k k"] | None = None
     ) -> Float[Tensor, "view 14"]:
-        """The numbers without what no camera tells: the mean of each of `_modes`, every number as clearly as it is told.
+        """The numbers without what no camera tells: the mean of `_modes`, every number as clearly as it is told.
 
         Parameters
         ----------
