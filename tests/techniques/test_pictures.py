@@ -11,6 +11,7 @@ import torch
 import xarray as xr
 from scipy.ndimage import map_coordinates
 
+from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.phantoms import GaussianBalls
@@ -193,6 +194,13 @@ def test_outliers_pull_by_their_size_alone(taken):
 
 
 # -- reconstructions -------------------------------------------------------------------------------------------------
+
+
+def test_pictures_that_are_not_there_are_asked_for_in_one_line(balls, tmp_path, capsys):
+    predict(balls, RING.cameras(), BOX, 1.00027).write(tmp_path / "m.nc")
+    assert main(["reconstruct", str(tmp_path / "m.nc"), "-o", str(tmp_path / "r"), "--from", "pictures"]) == 2
+    (line,) = "".join(capsys.readouterr()).splitlines()
+    assert "from: expected a measurement with pictures" in line
 
 
 @pytest.mark.slow

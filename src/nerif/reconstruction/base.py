@@ -168,6 +168,8 @@ class Reconstructor(ABC):
 
     aperture: str
     """Whether pixels see through the whole of their lens (aperture.py)."""
+    source: str
+    """Whether it goes by pictures, displacements or both (sources.py)."""
 
     @abstractmethod
     def __call__(
