@@ -34,7 +34,7 @@ from nerif.reconstruction.refit import refit
 from nerif.reconstruction.repetition import Repetitions
 from nerif.reconstruction.rig_posterior import with_posterior
 from nerif.reconstruction.shared_settings import SharedSettings
-from nerif.reconstruction.sources import of_source
+from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
@@ -128,7 +128,7 @@ def reconstruct_into(
         path = Path(measurement)
         measurement = Measurement.read(path)
     measurement = seen_through(measurement, reconstructor.aperture)
-    of_source(measurement, reconstructor.source)  # what is asked for has to be there, before any view is kept out
+    check_source(reconstructor.source, measurement)  # before any view is kept out
     if voxels is None:
         voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
     if voxels < 1:

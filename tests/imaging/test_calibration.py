@@ -69,9 +69,8 @@ def noisy() -> Calibration:
 
 
 def test_exact_points_give_the_rig_back(exact):
-    result = exact
-    assert result.rms() < 1e-4
-    for camera, pose, k, plane in zip(CAMERAS, result.poses, result.intrinsics, result.backgrounds, strict=True):
+    assert exact.rms() < 1e-4
+    for camera, pose, k, plane in zip(CAMERAS, exact.poses, exact.intrinsics, exact.backgrounds, strict=True):
         turn = Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude()
         assert np.degrees(turn) < 1e-3
         assert np.abs(pose.translation - camera.translation.numpy()).max() < 0.01
@@ -84,15 +83,14 @@ def test_exact_points_give_the_rig_back(exact):
 
 
 def test_errors_are_about_what_is_stated(noisy):
-    result = noisy
-    assert result.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.1)
+    assert noisy.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.1)
     turns, moves = [], []
-    for camera, pose in zip(CAMERAS, result.poses, strict=True):
+    for camera, pose in zip(CAMERAS, noisy.poses, strict=True):
         turns.append(np.degrees(Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude()))
         moves.append(np.linalg.norm(pose.translation - camera.translation.numpy()))
-    assert np.all(np.array(turns) < 3 * result.sigma_rotation)
-    assert np.mean(turns) > 0.1 * result.sigma_rotation.mean()
-    assert np.all(np.array(moves) < 3 * result.sigma_translation)
+    assert np.all(np.array(turns) < 3 * noisy.sigma_rotation)
+    assert np.mean(turns) > 0.1 * noisy.sigma_rotation.mean()
+    assert np.all(np.array(moves) < 3 * noisy.sigma_translation)
 
 
 def test_turns_and_shifts_of_cameras_are_about_their_pose_sigma(noisy):

@@ -323,14 +323,14 @@ class Refinement:
 
         Only those of which every view refines every number.
         """
-        modes = torch.zeros(*self.sigma.shape, 6 + len(STRETCHED), dtype=torch.float64)
-        modes[:, :6, :6] = torch.stack([_motion(camera) for camera in self.cameras])
-        for i, name in enumerate(STRETCHED, 6):
-            modes[:, NAMES.index(name), i] = 1
-        free = (self.sigma > 0).all(dim=0)
-        needed = (modes != 0).any(dim=0)  # number, mode
-        needed[:6, :6] = True
-        return modes[..., (free[:, None] | ~needed).all(dim=0)]
+        refined = (self.sigma > 0).all(dim=0)
+        stretched = [i for i in map(NAMES.index, STRETCHED) if refined[i]]
+        rigid = 6 if bool(refined[:6].all()) else 0
+        modes = torch.zeros(*self.sigma.shape, rigid + len(stretched), dtype=torch.float64)
+        if rigid:
+            modes[:, :6, :6] = torch.stack([_motion(camera) for camera in self.cameras])
+        modes[:, stretched, list(range(rigid, modes.shape[-1]))] = 1
+        return modes
 
     def _steps(self) -> Float[Tensor, "view 14"]:
         """By how much each number is changed to see what it does: what moves rays by STEP_PX, at about."""

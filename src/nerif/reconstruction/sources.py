@@ -46,10 +46,21 @@ class Stage:
     measurement: Callable[[], Measurement]
 
 
-def check_source(source: str) -> None:
-    """Raise InputError unless it is one of SOURCES."""
+def check_source(source: str, measurement: Measurement | None = None) -> None:
+    """Raise InputError unless it is one of SOURCES, and the measurement, if one is given, holds it."""
     if source not in SOURCES:
         raise InputError(f"from: expected one of {', '.join(SOURCES)}, got '{source}'")
+    if measurement is None:
+        return
+    pictures, found = _pair(measurement)
+    if pictures is None and source in ("pictures", "both"):
+        names = " and ".join(o.technique.measured for o in measurement.observations)
+        raise InputError(
+            f"from: expected a measurement with pictures (variables reference and flow) for '{source}', got {names}; "
+            "nerif displacement writes them"
+        )
+    if pictures is not None and found is None and source in ("displacements", "both"):
+        raise InputError(f"from: expected displacements for '{source}', got pictures alone; give --from pictures")
 
 
 def of_source(
@@ -70,20 +81,12 @@ def of_source(
     InputError
         If the measurement does not hold what is asked for.
     """
-    check_source(source)
+    check_source(source, measurement)
     pictures, found = _pair(measurement)
     if pictures is None:
-        if source in ("pictures", "both"):
-            names = " and ".join(o.technique.measured for o in measurement.observations)
-            raise InputError(
-                f"from: expected a measurement with pictures (variables reference and flow) for '{source}', got "
-                f"{names}; nerif displacement writes them"
-            )
         return measurement
     if source == "auto" and found is not None:
         source = preferred
-    if found is None and source in ("displacements", "both"):
-        raise InputError(f"from: expected displacements for '{source}', got pictures alone; give --from pictures")
     if found is not None and source == "displacements":
         return found.alone(measurement)
     whole = measurement if source == "both" else pictures.alone(measurement)
