@@ -77,7 +77,7 @@ def _reconstructed(number: int) -> dict[str, float | str]:
         deviations = Deviations(found.sampled, GasSettings(), found)
         trials = Trials("fast")
         for trial in range(1, trials.members + 1):
-            deviations.add(trials.member(trial, found, []), _read(result.member(trial)))
+            deviations.add(trials.member(trial, found), _read(result.member(trial)))
     flow = truth.abs() > FLOW * truth.abs().max()
     error = found.sampled.values.double() - truth
     size = (error.abs() / deviations.local())[flow].numpy()

@@ -13,8 +13,12 @@ import pytest
 import xarray as xr
 
 from nerif.cli import main
+from nerif.monitor import Monitor
+from nerif.reconstruction.base import Outcome
+from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.report.pages import slices
 from nerif.volume_file import read_volumes
+from nerif.workflow import Run, reconstruct_into
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "4", "--steps", "30", "--truth-voxels", "12"]
 QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]
@@ -109,6 +113,24 @@ def test_trials_that_are_there_are_not_done_again(measured, tmp_path):
     with xr.open_dataset(out / "volume.nc") as volume:
         np.testing.assert_allclose(volume["index_excess_std"].values, before, rtol=1e-4)
     assert [p.stat().st_mtime_ns != stamp for p, stamp in stamps.items()] == [False, True]
+
+
+def test_a_run_that_failed_is_not_repeated(measured, tmp_path, monkeypatch):
+    real, asked = Tikhonov.__call__, []
+
+    def failing(self, *arguments, **named):
+        asked.append(1)
+        found = real(self, *arguments, **named)
+        return replace(found, outcome=Outcome("diverged", "of itself"))
+
+    monkeypatch.setattr(Tikhonov, "__call__", failing)
+    lines: list[str] = []
+    settings = Tikhonov(voxels=8, regularisation=0.1, device="cpu")
+    run = Run(report=False, uncertainty="fast", hold_out=("none",))
+    reconstruct_into(tmp_path / "r", measured, settings, run, monitor=Monitor(lines.append))
+    assert len(asked) == 1
+    assert "uncertainty: none of a run that diverged" in lines
+    assert lines[-1].startswith("Do not use")
 
 
 @pytest.mark.parametrize(

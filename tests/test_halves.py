@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,12 @@ from nerif.geometry import paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.halves import Reflection, departures, halved, kept_half, left_of_axis
 from nerif.measurement import Measurement
+from nerif.monitor import Monitor
+from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.result import ResultDirectory
 from nerif.simulation import simulate
+from nerif.verdict import WORDS
+from nerif.workflow import Run, reconstruct_into
 
 ABOUT_Z = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)
 QUICK = ["--symmetry", "axis", "--method", "tikhonov", "--voxels", "20", "--no-report"]
@@ -109,6 +115,20 @@ def test_a_half_is_kept_out_first_and_the_verdict_goes_by_it(jet_file):
     assert metrics["first_look"]["views"][0]["name"] in ("0deg left", "0deg right")
     assert metrics["verdict"]["word"] in ("use", "use with care")
     assert metrics["axis"]["told"] == {"shift_1": True, "shift_2": False, "lean_1": True, "lean_2": False}
+
+
+def test_a_run_that_is_stopped_while_a_half_is_kept_out_shows_that_half(tmp_path):
+    out, lines = ResultDirectory(tmp_path / "r"), []
+
+    def stopped(title: str):
+        return nullcontext(lambda step: "first" in title and step.step == 2)
+
+    settings = Tikhonov(voxels=12, regularisation=0.01, symmetry="axis", device="cpu")
+    monitor = Monitor(lines.append, training=stopped)
+    found = reconstruct_into(out.path, measured("gaussian-jet", 0.03), settings, Run(report=False), monitor=monitor)
+    assert found.outcome.reason == "interrupted"
+    assert sorted(v["held_out"] for v in out.metrics()["views"]) == [False, True]
+    assert out.metrics()["verdict"]["word"] in WORDS
 
 
 @pytest.mark.slow

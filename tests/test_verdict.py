@@ -66,6 +66,35 @@ def test_words(metrics, word):
     assert found.sentence.lower().startswith(word)
 
 
+UNLIKE = [{"name": "a", "departure": 0.5, "cc": {"u": 0.4, "v": 0.6}}]
+ABOUT = {"kind": "axis", "harmonics": 0}
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "word"),
+    [(ABOUT, "do not use"), ({**ABOUT, "harmonics": 2}, "use"), ({**ABOUT, "kind": "planar"}, "use")],
+)
+def test_halves_may_differ_where_the_flow_may(symmetry, word):
+    metrics = {"views": SEEN, "first_look": FIRST, "axis": {"symmetry": symmetry}, "departures": UNLIKE}
+    assert judged(**metrics).word == word
+
+
+def test_a_view_that_the_others_contradict_is_not_excused_by_unlike_halves():
+    roughly = [{**UNLIKE[0], "departure": 0.3}]
+    views = [*SEEN[1:], view("a", 0.06, **ALIKE)]
+    found = judged(views=views, first_look=FIRST, axis={"symmetry": ABOUT}, departures=roughly)
+    assert found.word == "do not use"
+    assert "only roughly axisymmetric" in found.why
+    assert "no noise" in found.why
+
+
+@pytest.mark.parametrize(("symmetry", "words"), [(None, "2 views leave much open"), (ABOUT, "no view contradicts")])
+def test_few_cameras_are_few_whatever_they_measured_by(symmetry, words):
+    pictures = [{**v, "measured": "flow"} for v in SEEN[:2]]
+    found = judged(views=[*SEEN[:2], *pictures], first_look=FIRST, axis={"symmetry": symmetry})
+    assert words in found.why
+
+
 def test_the_truth_is_not_looked_at():
     known = {"views": SEEN, "first_look": FIRST}
     assert judged(**known, cc=0.1, l2_variation=3.0) == judged(**known)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerif.conventions import InputError
-from nerif.evaluation import evaluate_views
+from nerif.evaluation import evaluate_views, rms_text
 from nerif.halves import HALVES, kept_half
 from nerif.json_file import write_json
 from nerif.kept_run import KeptRun
@@ -124,8 +124,7 @@ class FirstLook:
         views = evaluate_views(seen)
         write_json(self._directory / SCORES, {"views": views, "seconds": time.monotonic() - started})
         for v in views:
-            noise = f" = {v['rms_over_sigma']:.2f} sigma" if "rms_over_sigma" in v else ""
-            say(f"{name}, not seen so far, is predicted with CC {v['cc']:.4f}, rms error{noise}")
+            say(f"{name}, not seen so far, is predicted with CC {v['cc']:.4f}, rms error {rms_text(v)}")
         return result
 
     def scores(self) -> dict[str, Any]:

@@ -68,10 +68,9 @@ class Members:
         found = Found(main, self.reconstructor, self.training, lambda: noise()[0], lambda f: self._seen(f, main))
         quantities = all_quantities(main, gas, voxels)
         taken = self.kind.taken(found, quantities[0], gas)
-        earlier: list[Reconstruction | None] = []
         left_out, diverged = [], []
         for number in range(1, self.kind.members + 1):
-            member = self.kind.member(number, found, earlier)
+            member = self.kind.member(number, found)
             kept = KeptRun(
                 self.out.member(number), member.reconstructor, member.measurement, self.start, self.made_of,
                 self.checkpoint_every, self.monitor,
@@ -80,7 +79,6 @@ class Members:
             if result.outcome.reason == "interrupted":
                 say(f"{word}: interrupted after {number - 1} of {self.kind.members} members; --resume goes on")
                 break
-            earlier.append(None if result.outcome.failed else result)
             if result.outcome.failed:
                 say(f"{word}: member {number} {result.outcome.reason} and is left out: {result.outcome.message}")
                 diverged.append(number)
@@ -92,13 +90,12 @@ class Members:
         if taken.count < self.kind.fewest:
             say(f"{word}: {taken.count} members are too few for a standard deviation; none is written")
             return
-        done = sum(result is not None for result in earlier)
         volumes = [*quantities, *taken.volumes()]
         excess = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
         volumes.append(certainty(volumes[0], excess))
         self.out.write_volumes(volumes)
         about: dict[str, Any] = {
-            **dataclasses.asdict(self.kind), "members": done, "diverged": diverged,  # type: ignore[call-overload]
+            **dataclasses.asdict(self.kind), "members": taken.count, "diverged": diverged,  # type: ignore[call-overload]
             "left_out": left_out, "seconds": time.monotonic() - started,
         }  # fmt: skip
         if noise.cache_info().currsize:
@@ -109,7 +106,7 @@ class Members:
         largest = float(volumes[0].values.abs().max())
         rms = float(excess.values.square().mean().sqrt())
         share = f"{rms / largest:.2%} of the largest"
-        say(f"{word} of {done}: rms standard deviation of {volumes[0].quantity} {rms:.3g}, {share}")
+        say(f"{word} of {taken.count}: rms standard deviation of {volumes[0].quantity} {rms:.3g}, {share}")
         for v in left_out:
             say(f"left out {v['name']}: CC {v['cc']:.4f}, rms error {rms_text(v)}")
 

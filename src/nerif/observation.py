@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -74,6 +75,17 @@ class Observation:
         names = (kind.measured, kind.sigma, *kind.beside)
         own = {name: value for name, value in some.measured_maps.items() if name in names}
         return replace(some, cameras=tuple(kind.seen_by(c) for c in some.cameras), **arguments_of(own))
+
+    def without(self, measurement: Measurement) -> Measurement:
+        """Return the measurement by the other techniques, of the views that measured something by any of them."""
+        others = [o for o in measurement.observations if o.technique is not self.technique]
+        if len(others) == 1:
+            return others[0].alone(measurement)
+        usable = torch.stack([measurement.usable_for(o).flatten(1).any(dim=1) for o in others]).any(dim=0).tolist()
+        some = measurement.select([name for name, seen in zip(measurement.names, usable, strict=True) if seen])
+        kind = self.technique
+        names = (kind.measured, kind.sigma, *kind.beside)
+        return replace(some, **arguments_of({k: v for k, v in some.measured_maps.items() if k not in names}))
 
     def measured(self, view: int) -> Bool[Tensor, "row column"]:
         """Which pixels of a view have a value and, where it is known, a sigma within the limits of the technique."""

@@ -68,8 +68,11 @@ def verdict(result: Result) -> Verdict:
     seen = [v for v in views if not v["held_out"]]
     error, by = _error(result, views, seen)
     doubt, grave = _contradicted(seen)
-    if any(d["departure"] > ODD for d in metrics.get("departures") or []):
-        doubt, grave = _asymmetric(metrics["departures"])
+    symmetry = (metrics.get("axis") or {}).get("symmetry") or {}
+    alike = symmetry.get("kind") == "axis" and not symmetry.get("harmonics")  # with harmonics halves may differ
+    if alike and any(d["departure"] > ODD for d in metrics.get("departures") or []):
+        uneven, alien = _asymmetric(metrics["departures"])
+        doubt, grave = "; ".join(filter(None, (uneven, doubt))), grave or alien
     if grave:
         return Verdict("do not use", None, doubt)
     if error is not None and error > NOT:
@@ -77,9 +80,10 @@ def verdict(result: Result) -> Verdict:
     if error is None:
         why = "no view was kept out, and there are no standard deviations (--uncertainty fast)"
         return Verdict("use with care" if doubt else "cannot tell", None, doubt or why)
-    alike = (metrics.get("axis") or {}).get("symmetry")  # one view of an axisymmetric flow shows it from everywhere
-    if len(seen) < FEW and not alike:  # what they do not show is in no figure
-        doubt = "; ".join(filter(None, (doubt, f"{len(seen)} views leave much open")))
+    cameras = len({v["name"] for v in seen})  # a view has an entry for each technique
+    if cameras < FEW and not alike:  # what they do not show is in no figure; one view shows an axisymmetric flow
+        open_ = f"{cameras} view{'s leave' if cameras > 1 else ' leaves'} much open"
+        doubt = "; ".join(filter(None, (doubt, open_)))
     doubts = [by, *([doubt] if doubt else []), *(["the run was interrupted"] if outcome == "interrupted" else [])]
     if len(doubts) > 1 or error > USE:
         return Verdict("use with care", error, "; but ".join(doubts))

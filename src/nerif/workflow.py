@@ -171,7 +171,7 @@ def reconstruct_into(
     if first is not None:
         origin, method = first.field, reconstructor.in_two()[1]
     if look is not None and first is not None and first.outcome.reason == "interrupted":
-        result, run = replace(first, state=None), replace(run, hold_out=(*unseen, look.view))
+        result, run, measurement = replace(first, state=None), replace(run, hold_out=(look.view,)), look.data
     else:
         with watched.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
             callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
@@ -181,7 +181,9 @@ def reconstruct_into(
     _write(out, measurement, result, run, settings, gains, voxels, monitor, {"first_look": scores} if scores else {})
     _tell_axis(out, result, whole, monitor)
     try:
-        if repetitions is not None and result.outcome.reason != "interrupted":
+        if repetitions is not None and result.outcome.failed:
+            monitor.say(f"{repetitions.word}: none of a run that {result.outcome.reason}")
+        elif repetitions is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
             known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
             watched = monitor if looked is None else looked.watching(monitor, held_out=False, looks=False)

@@ -134,6 +134,23 @@ def test_more_time_goes_on_with_the_next_cycle(measurement):
     assert first["step"] == 30
 
 
+def test_the_best_cycle_is_kept_with_the_rig_it_had(measurement, monkeypatch):
+    errors, rigs = itertools.chain([2.0], itertools.repeat(3.0)), []
+    monkeypatch.setattr(objective.Objective, "held_back", lambda self: next(errors))
+    monkeypatch.setattr("nerif.reconstruction.refinement.SIGN", -1.0)  # the rig is taken to be off
+
+    def watch(step: Step) -> bool:
+        if step.step == 6:
+            rigs.append(step.capture().tensors["data.rig.values"])
+        return False
+
+    result = replace(ENDLESS, first_cycle=6, refine=("cameras",))(measurement, watch)
+    kept = torch.tensor([list(row["values"].values()) for row in result.rig], dtype=torch.float64)
+    last = result.state.tensors["data.rig.values"]
+    assert torch.equal(kept, rigs[0][:, : kept.shape[1]])
+    assert not torch.equal(kept, last[:, : kept.shape[1]])
+
+
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_the_best_cycle_is_kept(measurement, monkeypatch, interrupted):
     """A cycle that the rays held back like less than the one before gives it back, one that was broken off too."""

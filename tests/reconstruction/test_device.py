@@ -13,6 +13,7 @@ from nerif.reconstruction.presets import PRESETS, preset
 def test_auto_takes_the_gpu_where_there_is_one(monkeypatch):
     for there, kind, settings in ((True, "cuda", "best"), (False, "cpu", "fast")):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        monkeypatch.setattr(torch.cuda, "device_count", lambda there=there: int(there))
         assert resolve_device("auto").type == kind
         assert preset("auto") == PRESETS[settings]
 
@@ -22,6 +23,8 @@ def test_gpu_that_is_not_there(monkeypatch):
     assert resolve_device("cuda:1") == torch.device("cuda:1")
     with pytest.raises(InputError, match=r"one of 2 GPUs.*cuda:2"):
         resolve_device("cuda:2")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert resolve_device("cuda") == torch.device("cuda:1")  # under torchrun
     for name in ("tpu0", "meta"):
         with pytest.raises(InputError, match=name):
             resolve_device(name)

@@ -115,6 +115,19 @@ def test_a_run_stopped_on_a_grid_with_bins_goes_on_from_there(flame):
     assert float((a - b).norm() / a.norm()) < 1e-2
 
 
+def test_a_weight_that_is_being_chosen_is_chosen_the_same_after_a_pause(flame):
+    """Also where the run began from a field, which is not there any more."""
+    method = Tikhonov(voxels=24, device="cpu", iterations=3)
+    start = replace(method, voxels=8, regularisation=0.1)(flame).field
+    whole = method(flame, start=start)
+    parted = method(flame, start=start, on_step=lambda step: step.step == 8)
+    again = method(flame, resume=parted.state)
+    assert "; weight" in whole.outcome.message
+    assert parted.history[-1]["bin_edge"] == 1
+    assert again.outcome.reason == whole.outcome.reason
+    assert again.history[-1]["weight"] == pytest.approx(whole.history[-1]["weight"], rel=0.05)
+
+
 def solver(floor: float):
     """Solves whose residual falls with the weight towards a floor, and the weights asked for."""
     asked: list[float] = []

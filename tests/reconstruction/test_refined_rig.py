@@ -147,6 +147,18 @@ def test_voxels_follow_a_rig_that_is_refined(measured, method):
     assert after < 0.6 * before
 
 
+def test_a_view_that_displacements_do_not_show_has_no_posterior(measured):
+    """A rig refined by pictures has views of which no displacement was found."""
+    rig = Refinement.asked(measured, ASKED["refine"], 0.4, 0.02, 0.05)
+    rig.values = 0.1 * rig.sigma
+    table, shown = rig.table(), measured.without([measured.names[1]])
+    found = with_posterior(table, shown, BALLS, ASKED)
+    assert [row["name"] for row in found] == list(measured.names)
+    assert found[1] == table[1]
+    alone = with_posterior([row for i, row in enumerate(table) if i != 1], shown, BALLS, ASKED)
+    assert [row for i, row in enumerate(found) if i != 1] == alone
+
+
 def test_voxels_that_are_stopped_while_the_rig_is_refined_go_on_undisturbed(measured):
     settings = Tikhonov(voxels=12, regularisation=1e-3, iterations=12, refine=("cameras", "shift"), device="cpu")
     whole = settings(measured)

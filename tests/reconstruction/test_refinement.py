@@ -209,9 +209,9 @@ def test_views_that_are_fewer_are_moved_as_themselves(measured):
 
 def test_a_run_refines_and_resumes_as_if_undisturbed(measured):
     wrong, _ = spoiled(measured)
-    settings = NeRIF(max_steps=16, points_per_batch=1024, refine=("cameras", "shift"), pose_sigma_mm=0.5, device="cpu")
+    settings = NeRIF(max_steps=8, points_per_batch=1024, refine=("cameras", "shift"), pose_sigma_mm=0.5, device="cpu")
     whole = settings(wrong)
-    parted = settings(wrong, on_step=lambda step: step.step == 7)
+    parted = settings(wrong, on_step=lambda step: step.step == 4)
     assert parted.outcome.reason == "interrupted"
     again = settings(wrong, resume=parted.state)
     for name, value in whole.field.network.state_dict().items():
@@ -221,6 +221,27 @@ def test_a_run_refines_and_resumes_as_if_undisturbed(measured):
         assert list(a["values"].values()) == pytest.approx(list(b["values"].values()), rel=1e-6, abs=1e-12)
     assert max(row["moved"] for row in whole.rig) > 0
     assert NeRIF(max_steps=5, points_per_batch=2048, device="cpu")(wrong).rig == []
+
+
+def test_a_checkpoint_without_a_refined_rig_is_not_gone_on_with_and_the_other_way_round(measured):
+    plain = NeRIF(max_steps=2, points_per_batch=512, device="cpu")
+    moved = replace(plain, refine=("cameras",))
+    for before, after, word in ((plain, moved, "without"), (moved, plain, "with")):
+        state = before(measured).state
+        with pytest.raises(InputError, match=f"a run {word} --refine; give the same settings"):
+            after(measured, resume=state)
+
+
+def test_every_technique_tells_whether_a_view_is_off(measured):
+    """One that shows nothing does not hide what another shows."""
+    wrong = replace(measured, displacement=measured.displacement + 0.5)
+    (part,) = in_sigmas(wrong)
+    blind = replace(part, measured=torch.zeros_like(part.measured), inverse_scale=1e-3 * part.inverse_scale)
+    alone, both = (Refinement.asked(wrong, ["shift"], px=0.5) for _ in range(2))
+    alone.normal_equations([part], predict)
+    both.normal_equations([part, blind], predict)
+    torch.testing.assert_close(both.explained, alone.explained, rtol=0.05, atol=0.05)
+    assert float(alone.explained.min()) > 0.9
 
 
 def test_without_a_limit_the_rays_held_back_are_seen_by_the_refined_rig(measured):

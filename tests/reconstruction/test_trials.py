@@ -46,7 +46,7 @@ def found(measurement) -> Found:
 
 
 def test_trials_are_of_the_field_found_with_what_was_left_unexplained_in_blocks_of_either_sign(found):
-    member = Trials("fast").member(1, found, [])
+    member = Trials("fast").member(1, found)
     grid = Grid.of_resolution(found.result.box, 16)
     torch.testing.assert_close(member.expected.values, found.result.volume(grid).values)
     assert member.left_out == ()
@@ -60,16 +60,16 @@ def test_trials_are_of_the_field_found_with_what_was_left_unexplained_in_blocks_
     block = sign[:, :BLOCK, :BLOCK]
     assert bool((block.sign() == block[:, :1, :1].sign()).all())
     assert 0.2 < float((sign > 0).float().mean()) < 0.8
-    again = Trials("full").member(1, found, [])
+    again = Trials("full").member(1, found)
     assert torch.equal(again.measurement.displacement, member.measurement.displacement)
-    assert not torch.equal(Trials("fast").member(2, found, []).measurement.displacement, left + seen)
+    assert not torch.equal(Trials("fast").member(2, found).measurement.displacement, left + seen)
 
 
 def test_pixels_that_were_not_measured_stay_so(found):
     values = found.measurement.displacements.clone()
     values[1, 2:5, 3:7] = float("nan")
     holes = replace(found, measurement=replace(found.measurement, displacement=values))
-    data = Trials("fast").member(1, holes, []).measurement
+    data = Trials("fast").member(1, holes).measurement
     assert torch.equal(data.usable, holes.measurement.usable)
     assert int(holes.measurement.usable.sum()) < int(found.measurement.usable.sum())
 

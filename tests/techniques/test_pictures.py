@@ -26,6 +26,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.training_data import FrameData
 from nerif.techniques.deflection import LeverArm
+from nerif.techniques.interferometry import Interferometry
 from nerif.techniques.pictures import Pictures
 from nerif.techniques.registry import forward_model
 from nerif.techniques.warped import References
@@ -238,6 +239,40 @@ def test_pictures_go_on_from_displacements(balls, taken):
     assert [o.technique.name for o in of_source(both, "auto", preferred="displacements").observations] == ["deflection"]
     together = replace(NETWORK, source="both", max_steps=60)(both)
     assert not together.outcome.failed
+
+
+def test_shifts_of_pictures_are_refined_of_the_displacements_that_are_there(balls, taken):
+    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
+    both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05))
+    shifted = replace(NETWORK, refine=("cameras,shift",))
+    data = FrameData(shifted, both)
+    assert [[o.technique.name for o in stage.measurement().observations] for stage in data.stages] == [["deflection"]]
+    assert data.refinement is not None
+    with pytest.raises(InputError, match="give --from displacements"):
+        FrameData(replace(shifted, source="pictures"), both)
+
+
+def test_what_is_measured_by_other_techniques_stays(balls, taken):
+    """Fringes beside pictures and displacements, in a view that has nothing else too."""
+    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
+    fringes = predict(balls, taken.cameras, BOX, 1.00027, technique=Interferometry, wavelength_nm=532.0).maps["fringes"]
+    d[3] = math.nan
+    flow = taken.maps["flow"].clone()
+    flow[3] = math.nan
+    whole = replace(
+        taken, displacement=d, sigma=torch.full_like(d, 0.05), wavelength_nm=532.0,
+        maps={**taken.maps, "flow": flow, "fringes": fringes},
+    )  # fmt: skip
+    for source, expected in (
+        ("auto", ["interferometry", "pictures"]),
+        ("pictures", ["interferometry", "pictures"]),
+        ("displacements", ["deflection", "interferometry"]),
+        ("both", ["deflection", "interferometry", "pictures"]),
+    ):
+        found = of_source(whole, source)
+        assert sorted(o.technique.name for o in found.observations) == expected
+        assert found.names == whole.names
+    assert of_source(replace(taken, displacement=d), "displacements").names == whole.names[:3]
 
 
 def test_a_run_from_pictures_resumes_bit_for_bit(taken):

@@ -47,7 +47,7 @@ class DisplacementSettings:
     """How displacements are found."""
 
     method: str = "correlation"
-    """correlation (windows of 12 px x smoothness; best on dots), dis (best on noise, fast), deepflow (the paper's),
+    """correlation (windows of 12 px x smoothness; best on dots), dis (fast, good on noise), deepflow (the paper's),
     ilk, tvl1."""
     smoothness: float = 1.0
     """Above 1 for smoother displacements; scales window or regularisation (deepflow has a fixed one)."""

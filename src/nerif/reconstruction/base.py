@@ -58,6 +58,10 @@ class State:
     tensors: dict[str, Tensor]
     scalars: dict[str, Any]
 
+    def under(self, prefix: str) -> dict[str, Tensor]:
+        """Return the tensors whose names begin with a prefix, by what follows it."""
+        return {name.removeprefix(prefix): value for name, value in self.tensors.items() if name.startswith(prefix)}
+
 
 @dataclass(frozen=True)
 class Step:

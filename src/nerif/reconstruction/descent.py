@@ -33,6 +33,7 @@ from nerif.reconstruction.gauge import ambient_faces, check_gauge
 from nerif.reconstruction.layout import layout_of
 from nerif.reconstruction.levels import Level, coarser, levels
 from nerif.reconstruction.problem import Iterate, Problem
+from nerif.reconstruction.refined_rig import kept_of, take_up
 from nerif.reconstruction.refinement import MOMENTUM, Refinement, drawn
 from nerif.reconstruction.some_pixels import some_pixels
 from nerif.reconstruction.sources import of_source
@@ -54,7 +55,7 @@ WHILE_REFINED = 0.1  # of FIRST: the weight while a rig is refined and none is c
 ROUNDS = 20  # times that a rig is refined on a level, the field following
 CALM = 5  # of them at the end without momentum
 FOLLOWING = 8  # iterations in which the field follows
-KEPT = ("level", "round", "done", "total", "weight", "guess", "chosen")  # of a run, in a checkpoint
+KEPT = ("level", "round", "done", "total", "weight", "guess", "chosen", "choosing")  # of a run, in a checkpoint
 
 
 class _Stop(Exception):
@@ -109,7 +110,7 @@ class Descent:
             sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg, settings.shift_sigma_px)
             self.rig = Refinement.asked(measurement, settings.refine, *sigma)
         # a weight is sought on the last grid but one and mended on the last; where there is no other, sought at the end
-        self.choosing = (first - 1, first if first and start is None else len(self.levels) - 1)
+        self.choosing = [first - 1, first if first and start is None else len(self.levels) - 1]
         self.weight = settings.weight
         self.guess: float | None = None
         self.chosen = ""
@@ -313,8 +314,7 @@ class Descent:
         scalars: dict[str, Any] = {name: getattr(self, name) for name in KEPT}
         scalars |= {"method": type(self.settings).__name__, "seconds": self.seconds, "history": list(self.history)}
         scalars["fingerprint"] = self.fingerprint
-        rig = {} if self.rig is None else {f"rig.{name}": value for name, value in self.rig.kept().items()}
-        return State({"x": self.x.detach().clone(), **rig}, scalars)
+        return State({"x": self.x.detach().clone(), **kept_of(self.rig)}, scalars)
 
     def _restore(self, state: State) -> None:
         scalars, shapes = dict(state.scalars), [level.grid.shape for level in self.levels]
@@ -327,8 +327,7 @@ class Descent:
         ):
             raise InputError("resume: the checkpoint is of another method or grid; give the same settings")
         self.x = state.tensors["x"].clone()
-        if self.rig is not None:
-            self.rig.restore({name: state.tensors[f"rig.{name}"] for name in self.rig.kept()})
+        take_up(self.rig, state.tensors)
         self.spent, self.started = scalars.pop("seconds"), time.perf_counter()
         self.history = list(scalars.pop("history"))
         for name, value in scalars.items():

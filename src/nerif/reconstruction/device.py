@@ -16,23 +16,24 @@ __all__ = ["autocast_dtype", "available_memory", "keep_freed_memory", "peak_memo
 
 
 def resolve_device(name: str) -> torch.device:
-    """Return the device called `name`; "auto" is the GPU where there is one (under torchrun, the process's own).
+    """Return the device called `name`; "auto" is the GPU where there is one. "cuda" is the first, under torchrun the
+    process's own.
 
     Raises
     ------
     InputError
         If the device does not exist here.
     """
-    if name == "auto" and torch.cuda.is_available():
-        return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))  # torchrun: a GPU for each process
     if name == "auto":
-        return torch.device("cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError:
         raise InputError(f"device: expected auto, cpu, cuda or cuda:N, got '{name}'") from None
     if device.type not in ("cpu", "cuda"):
         raise InputError(f"device: expected auto, cpu, cuda or cuda:N, got '{name}'")
+    if name == "cuda":
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))  # torchrun: a GPU for each process
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise InputError(
             f"device: expected one of {torch.cuda.device_count()} GPUs, got '{name}'; use --device cpu, "

@@ -10,7 +10,6 @@ the method smooths away.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -63,7 +62,7 @@ class Ensemble:
             return ()
         return (names[(number - 1) % len(names)],)
 
-    def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None] = ()) -> Member:
+    def member(self, number: int, found: Found) -> Member:
         """Return member `number`, from 1 on: noise of the measurement's size is added once more."""
         measurement, noise = found.measurement, found.noise()
         seed = getattr(found.reconstructor, "seed", 0)

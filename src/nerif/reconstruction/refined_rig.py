@@ -1,13 +1,14 @@
-"""What a refinement found, as metrics.json keeps it: a rig that others can go by, and what to say of it."""
+"""What a refinement found, as metrics.json and checkpoints keep it: a rig to go by, and what to say of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from nerif.conventions import InputError
 from nerif.geometry import Camera
@@ -15,7 +16,10 @@ from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.measurement import Measurement
 from nerif.reconstruction.refined_numbers import NAMES, UNITS, displaced
 
-__all__ = ["MOVED", "UNTOLD", "check_table", "moved_lines", "with_corrections"]
+if TYPE_CHECKING:
+    from nerif.reconstruction.refinement import Refinement
+
+__all__ = ["MOVED", "UNTOLD", "check_table", "kept_of", "moved_lines", "take_up", "with_corrections"]
 
 MOVED = 3.0  # sigma, by which a view counts as moved
 STILL = 1e-6  # sigma: rounding
@@ -103,3 +107,24 @@ def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
             f"sigma; it looks {row.get('aside_px', 0.0):.2g} px aside; calibrate it again, or state a larger pose_sigma"
         )
     return lines
+
+
+def kept_of(refinement: Refinement | None) -> dict[str, Tensor]:
+    """Return what a checkpoint keeps of a rig that is refined, if it is."""
+    return {} if refinement is None else {f"rig.{name}": value for name, value in refinement.kept().items()}
+
+
+def take_up(refinement: Refinement | None, kept: Mapping[str, Tensor]) -> None:
+    """Go on from what a checkpoint kept of a refined rig (kept_of).
+
+    Raises
+    ------
+    InputError
+        If that run refined a rig and this one does not, or the other way round.
+    """
+    rig = {name.removeprefix("rig."): value for name, value in kept.items() if name.startswith("rig.")}
+    if bool(rig) != (refinement is not None):
+        was = "with" if rig else "without"
+        raise InputError(f"refine: the checkpoint is of a run {was} --refine; give the same settings to resume it")
+    if refinement is not None:
+        refinement.restore(rig)

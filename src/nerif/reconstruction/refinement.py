@@ -116,12 +116,13 @@ class Refinement:
         Parameters
         ----------
         settings : refine, pose_sigma_mm, pose_sigma_deg and shift_sigma_px, by their names
-        table : of the views of the measurement
+        table : of the views of the measurement, and perhaps of others
         """
         sigma = (settings["pose_sigma_mm"], settings["pose_sigma_deg"], settings["shift_sigma_px"])
         found = cls.asked(measurement, settings["refine"], *sigma, gauged=gauged)
-        for v, row in enumerate(table):
-            for name, value in row["values"].items():
+        rows = {row["name"]: row["values"] for row in table}
+        for v, view in enumerate(found.names):
+            for name, value in rows.get(view, {}).items():
                 found.values[v, NAMES.index(name)] = value
         found._corrections = found._of(found.values)
         return found
@@ -234,6 +235,7 @@ class Refinement:
         views, k = len(self.cameras), len(self.columns)
         normal = torch.zeros(views, k, k, dtype=torch.float64)
         right = torch.zeros(views, k, dtype=torch.float64)
+        fits = torch.zeros(views, 4, dtype=torch.float64)  # squares explained, all, numbers that explain them, and all
         for part in parts:
             now, jacobian = self.slopes(part, predict)
             view = part.rays.view.long().cpu()
@@ -247,10 +249,12 @@ class Refinement:
                 level, excess = (max(level, 1.0), max(level - 1, 0.0)) if known else (max(level, 1e-30), 1.0)
                 each = 1 / (level * (1 + ALIKE * min(excess, 1.0)))
                 fitted = torch.linalg.lstsq(w.sqrt()[:, None] * j, w.sqrt() * r).solution
-                explained = float((w.sqrt() * (j @ fitted)).square().sum() / (w * r.square()).sum().clamp(min=1e-30))
-                self.explained[v] = explained - k / len(r)
+                squares = (w.sqrt() * (j @ fitted)).square().sum(), (w * r.square()).sum()
+                fits[v] += torch.stack([*squares, *torch.tensor([k, len(r)], dtype=torch.float64)])
                 normal[v] += each * (j.T * w) @ j
                 right[v] -= each * (j.T * w) @ r
+        explained, whole, numbers, of = fits.clamp(min=1e-30).unbind(dim=1)
+        self.explained = explained / whole - numbers / of
         return normal, right
 
     def slopes(self, part: Part, predict: Predict) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c k"]]:

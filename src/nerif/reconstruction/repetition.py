@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -113,8 +113,8 @@ class Repetitions(Protocol):
     def without_views(self) -> bool:
         """Whether some do without a view, which tells how well it is predicted."""
 
-    def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
-        """Return one of them, from 1 on, by what those before have found; None where one has failed."""
+    def member(self, number: int, found: Found) -> Member:
+        """Return one of them, from 1 on."""
 
     def taken(self, found: Found, main: Volume, gas: GasSettings) -> Taken:
         """Return what takes them in, beside the main result as it is written."""

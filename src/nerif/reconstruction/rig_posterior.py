@@ -66,8 +66,12 @@ def with_posterior(
     there = residuals(rig, measurement, field, faces)
     rig.restore({**rig.kept(), "values": torch.zeros_like(rig.values)})
     before = residuals(rig, measurement, field, faces)
-    k, rows = len(rig.columns), []
-    for v, row in enumerate(table):
+    k, rows = len(rig.columns), list[dict[str, Any]]()
+    for row in table:
+        if row["name"] not in rig.names:  # displacements tell nothing of a view that has none
+            rows.append(row)
+            continue
+        v = rig.names.index(row["name"])
         own = found[v * k : (v + 1) * k, v * k : (v + 1) * k]
         after = own.diagonal().clamp(min=0).sqrt() * rig.sigma[v, rig.columns]
         look = rig.aside(v) * rig.sigma[v, rig.columns]  # px by a standard deviation of each number

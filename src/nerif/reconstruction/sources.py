@@ -21,7 +21,7 @@ from nerif.conventions import InputError
 from nerif.measurement import Measurement
 from nerif.observation import Observation
 
-__all__ = ["SOURCES", "Stage", "check_source", "of_source", "stages"]
+__all__ = ["SOURCES", "Stage", "check_source", "chosen_source", "of_source", "stages"]
 
 SOURCES = ("auto", "pictures", "displacements", "both")
 
@@ -47,7 +47,9 @@ class Stage:
 
 
 def check_source(source: str, measurement: Measurement | None = None) -> None:
-    """Raise InputError unless it is one of SOURCES, and the measurement, if one is given, holds it."""
+    """Raise InputError unless it is one of SOURCES, and a measurement that is given holds the pictures asked for, or
+    displacements beside its pictures where those are.
+    """
     if source not in SOURCES:
         raise InputError(f"from: expected one of {', '.join(SOURCES)}, got '{source}'")
     if measurement is None:
@@ -61,6 +63,12 @@ def check_source(source: str, measurement: Measurement | None = None) -> None:
         )
     if pictures is not None and found is None and source in ("displacements", "both"):
         raise InputError(f"from: expected displacements for '{source}', got pictures alone; give --from pictures")
+
+
+def chosen_source(measurement: Measurement, source: str, preferred: str) -> str:
+    """Return what "auto" means where a measurement holds both displacements and pictures; any other source as it is."""
+    pictures, found = _pair(measurement)
+    return preferred if source == "auto" and pictures is not None and found is not None else source
 
 
 def of_source(
@@ -85,11 +93,10 @@ def of_source(
     pictures, found = _pair(measurement)
     if pictures is None:
         return measurement
-    if source == "auto" and found is not None:
-        source = preferred
+    source = chosen_source(measurement, source, preferred)
     if found is not None and source == "displacements":
-        return found.alone(measurement)
-    whole = measurement if source == "both" else pictures.alone(measurement)
+        return pictures.without(measurement)
+    whole = measurement if source == "both" or found is None else found.without(measurement)
     sizes = [camera.image_size for camera in whole.cameras]
     maps = pictures.technique.softened(whole.maps, sizes, blur)
     measured = pictures.technique.measured

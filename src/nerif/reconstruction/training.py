@@ -91,6 +91,7 @@ class Training:
         self.retries, self.rate = 0, 1.0
         self.drawn = 0  # rays, counted through bins of any size
         self.best: dict[str, Tensor] = {}  # weights at the end of the best cycle
+        self.beside: dict[str, Tensor] = {}  # what was fitted beside them
         self.initial_loss, self.running = float("nan"), float("nan")
         if resume is not None:
             check_fingerprint(resume.scalars.get("fingerprint"), data.fingerprint)
@@ -262,7 +263,7 @@ class Training:
         outcome = cycles.judge(error, float(known), budget.step, budget.seconds, judged)
         self._log({"held_back": math.sqrt(error)})
         if cycles.best:
-            self.best = self._weights()
+            self.best, self.beside = self._weights(), self.data.kept()
         self.objective.settle()
         self.settled = self.edge == 1  # the pace is better known now
         return outcome
@@ -325,13 +326,12 @@ class Training:
         return Step(budget.step, budget.epoch, budget.seconds, progress, values, speed, capture, lambda: self.field)
 
     def _capture(self) -> State:
-        tensors = {f"network.{k}": v for k, v in self._weights().items()}
-        tensors |= {f"optimiser.{k}": v for k, v in self.optimiser.tensors().items()}
+        groups = {"network": self._weights(), "optimiser": self.optimiser.tensors(), "data": self.data.kept()}
+        groups |= {"best": self.best, "beside": self.beside}
+        tensors = {f"{group}.{name}": value for group, some in groups.items() for name, value in some.items()}
         tensors["generator"] = self.generator.get_state().clone()
         if self.objective.density.values is not None:
             tensors["density"] = self.objective.density.values.clone()
-        tensors |= {f"best.{k}": v.clone() for k, v in self.best.items()}
-        tensors |= {f"data.{k}": v for k, v in self.data.kept().items()}
         names = ("retries", "rate", "initial_loss", "running", "settled", "drawn")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
         scalars |= {"scale": self.field.scale, "offset": self.field.offset}
@@ -342,16 +342,15 @@ class Training:
     def _restore(self, state: State) -> None:
         tensors, scalars = state.tensors, {k: v for k, v in state.scalars.items() if k != "fingerprint"}
         try:
-            network = {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}
-            self.best = {k[5:]: v for k, v in tensors.items() if k.startswith("best.")}
-            self.field.network.load_state_dict(network)
+            self.field.network.load_state_dict(state.under("network."))
+            self.best, self.beside = state.under("best."), state.under("beside.")
             self.field.scale, self.field.offset = float(scalars.pop("scale")), float(scalars.pop("offset"))
         except (RuntimeError, KeyError):
             raise InputError(
                 "resume: the checkpoint is of another network; give the same settings (of a run of a version before "
                 "--network.directions there are 3)"
             ) from None
-        self.optimiser.restore({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser.")})
+        self.optimiser.restore(state.under("optimiser."))
         self.generator.set_state(tensors["generator"])
         density = tensors.get("density")
         self.objective.density.values = None if density is None else density.clone().to(self.device)
@@ -361,7 +360,7 @@ class Training:
         if edge != self.edge:
             self._refine(edge)
             self.history.pop()
-        self.data.restore(int(scalars.pop("stage", 0)), {k[5:]: v for k, v in tensors.items() if k.startswith("data.")})
+        self.data.restore(int(scalars.pop("stage", 0)), state.under("data."))
         self._recount()
         self.budget.restore(scalars.pop("budget"))
         for name, value in scalars.items():
@@ -373,6 +372,8 @@ class Training:
             (error,) = self.ranks.decided([self._error()], self.device)
             if not error <= min(cycles.errors):  # or it is none
                 self.field.network.load_state_dict(self.best)
+                if self.beside:
+                    self.data.restore(self.data.stage, self.beside)
         if not outcome.failed:
             again = f"; taken back {self.retries} time(s) to the last good state" if self.retries else ""
             outcome = Outcome(outcome.reason, outcome.message + again + self.watch.remark)

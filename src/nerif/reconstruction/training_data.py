@@ -25,10 +25,12 @@ from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.gauge import AmbientRegion, is_open
+from nerif.reconstruction.refined_numbers import refined_words
+from nerif.reconstruction.refined_rig import kept_of, take_up
 from nerif.reconstruction.refinement import Refinement, drawn
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.some_pixels import hold_back
-from nerif.reconstruction.sources import of_source, stages
+from nerif.reconstruction.sources import chosen_source, of_source, stages
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
 from nerif.techniques.base import ForwardModel
@@ -157,7 +159,9 @@ class FrameData(TrainingData):
         self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, judged: bool = False
     ) -> None:
         measurement = seen_through(measurement, settings.aperture)
-        final = of_source(measurement, settings.source)
+        preferred = "displacements" if "shift" in refined_words(settings.refine) else "pictures"  # these tell no shift
+        source = chosen_source(measurement, settings.source, preferred)
+        final = of_source(measurement, source)
         check_target(final, settings.model)
         super().__init__(
             resolve_device(settings.device), measurement.box, measurement.n_ambient,
@@ -179,13 +183,13 @@ class FrameData(TrainingData):
             rest, held = hold_back(measurement, self.coarsest)
             with suppress(InputError):  # all that would be held back crosses an open face
                 if held is not None:
-                    judges = of_source(held, settings.source)
+                    judges = of_source(held, source)
                     self.judging = judges.names
                     self.held_back = Target.of(
                         judges, settings.open_faces, model=settings.model, single=True
                     ).without_outliers().to(self.device)
                     self.measurement = rest
-        self.stages, self.edge = stages(self.measurement, settings.source), self.coarsest
+        self.stages, self.edge = stages(self.measurement, source), self.coarsest
         self.refine(self.coarsest)
 
     def refine(self, edge: int) -> None:
@@ -215,8 +219,7 @@ class FrameData(TrainingData):
 
     def kept(self) -> dict[str, Tensor]:
         kept = {str(i): model.settled.clone() for i, model in enumerate(_settling(self.target))}
-        rig = {} if self.refinement is None else self.refinement.kept()
-        return kept | {f"rig.{name}": value for name, value in rig.items()}
+        return kept | kept_of(self.refinement)
 
     def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
         if stage != self.stage:
@@ -224,8 +227,7 @@ class FrameData(TrainingData):
             self.refine(self.edge)
         for i, model in enumerate(_settling(self.target)):
             model.adopt(kept[str(i)])
-        if self.refinement is not None:
-            self.refinement.restore({name: kept[f"rig.{name}"] for name in self.refinement.kept()})
+        take_up(self.refinement, kept)
 
     def judge_alike(self) -> None:
         """Let the pictures that are held back be as bright as those that are not."""

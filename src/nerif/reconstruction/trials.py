@@ -82,7 +82,7 @@ class Trials:
     def without_views(self) -> bool:
         return False
 
-    def member(self, number: int, found: Found, earlier: Sequence[Reconstruction | None]) -> Member:
+    def member(self, number: int, found: Found) -> Member:
         """Return a trial: of the field that was found, and what was left of the measurement with other signs."""
         drawn = torch.Generator().manual_seed(2_000_003 + number)
         reconstructor, about = other_seed(found.reconstructor, number), ", of a field that is known"
