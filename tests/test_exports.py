@@ -11,7 +11,7 @@ import xarray as xr
 
 from nerif.exports import FORMATS, export
 from nerif.geometry import Box, Grid
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.quantities import GasChanges, GasSettings, derive
 from nerif.volume import Volume
 from nerif.volume_file import read_volumes
 
@@ -36,6 +36,13 @@ def test_masked_voxels_are_counted_and_explained(volumes):
     assert "Gladstone-Dale" in density.notes["assumption"]
     assert "101325 Pa" in temperature.notes["assumption"]
     assert "N2" in temperature.notes["assumption"]
+
+
+def test_the_gas_is_that_of_the_run_unless_it_is_changed():
+    run = {"gas": {"composition": "CO2", "wavelength_nm": 633.0, "pressure_pa": 9e4}}
+    assert GasChanges().of(run) == GasSettings("CO2", 633.0, 9e4)
+    assert GasChanges(pressure_pa=8e4).of(run) == GasSettings("CO2", 633.0, 8e4)
+    assert GasChanges("N2").of({}) == GasSettings("N2")
 
 
 def test_netcdf_by_xarray(volumes, tmp_path):

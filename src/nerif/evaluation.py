@@ -38,7 +38,10 @@ FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")
 AT_A_TIME = 8e6  # pixels of the views that are scored side by side: a megapixel takes some 0.1 GiB
 
-__all__ = ["FLOW", "evaluate", "evaluate_aligned", "evaluate_views", "evaluate_volume", "rms_text", "score_lines"]
+__all__ = [
+    "FLOW", "check_inside", "evaluate", "evaluate_aligned", "evaluate_views", "evaluate_volume", "rms_text",
+    "score_lines",
+]  # fmt: skip
 
 
 def evaluate(
@@ -202,16 +205,21 @@ def evaluate_aligned(field: Field, truth: Volume, n_ambient: float) -> dict[str,
     return {**scores, "turn_rad": moved.turn.tolist(), "shift_mm": moved.shift.tolist()}
 
 
-def _truth(path: Path, box: Box, n_ambient: float, quantity: str) -> Volume:
-    """The truth, as index excess over the ambient of the reconstruction; refused where it sticks out of the box."""
-    truth = read_volume(path, None if quantity == INDEX else quantity)
-    sides = zip("xyz", truth.grid.box.lower, truth.grid.box.upper, box.lower, box.upper, strict=True)
+def check_inside(path: Path, truth: Box, box: Box) -> None:
+    """Refuse the truth of a file that sticks out of the reconstructed box."""
+    sides = zip("xyz", truth.lower, truth.upper, box.lower, box.upper, strict=True)
     outside = [a for a, low, high, lower, upper in sides if low < lower - 1e-6 or high > upper + 1e-6]
     if outside:
         raise InputError(
             f"{path}: expected a volume inside the reconstructed box ({box.lower} to {box.upper} mm), "
             f"got one that sticks out along {', '.join(outside)}"
         )
+
+
+def _truth(path: Path, box: Box, n_ambient: float, quantity: str) -> Volume:
+    """The truth, as index excess over the ambient of the reconstruction; refused where it sticks out of the box."""
+    truth = read_volume(path, None if quantity == INDEX else quantity)
+    check_inside(path, truth.grid.box, box)
     if quantity != INDEX:
         return truth
     try:

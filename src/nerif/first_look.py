@@ -67,7 +67,7 @@ def kept_apart(
     parts, names = kept_half(measurement, hold_out, None if axis is None else axis.symmetry)
     if axis is not None and parts is not measurement:
         assert isinstance(reconstructor, SharedSettings)
-        reconstructor = with_axis(reconstructor, axis)
+        reconstructor = with_axis(reconstructor, axis.symmetry)
     return parts, reconstructor, kept_out(names, parts.names)
 
 

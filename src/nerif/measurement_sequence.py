@@ -31,6 +31,10 @@ WRITTEN = "written"
 """Variable (time,) that is 1 where a frame is complete; stores of other programs may lack it."""
 
 
+LOOKS = 20
+"""Frames that are looked at for one with every view."""
+
+
 def require_zarr() -> None:
     """Raise InputError, with the remedy, where zarr is not installed."""
     try:
@@ -127,21 +131,33 @@ class MeasurementSequence:
         except InputError as error:
             raise InputError(f"{self.path}, frame {index}: {error}") from None
 
-    def first_good(self) -> Measurement:
-        """Return the first frame that is a measurement: cameras and box are those of all.
+    def fullest(self) -> Measurement:
+        """Return the first frame with all the views and techniques of the store: its cameras and box are those of all.
+
+        Where none of the first LOOKS frames has them all, the one with the most, and where none can be used, the first
+        that can.
 
         Raises
         ------
         InputError
             If there is none, with what is wrong with the first.
         """
-        wrong = None
+        with _opened(self.path) as dataset:
+            most = (dataset.sizes["view"], len(_measured(dataset)))
+        wrong, best, has = None, None, (0, 0)
         for index in range(len(self)):
+            if best is not None and (has == most or index >= LOOKS):
+                break
             try:
-                return self.frame(index)
+                frame = self.frame(index)
             except InputError as error:
                 wrong = wrong or error
-        raise InputError(f"no frame can be used; the first: {wrong}")
+                continue
+            if (own := (len(frame.names), len(frame.techniques))) > has:
+                best, has = frame, own
+        if best is None:
+            raise InputError(f"no frame can be used; the first: {wrong}")
+        return best
 
     # -- writing -------------------------------------------------------------------------------------------------
 

@@ -332,7 +332,7 @@ def _first_look(
         if axis is None or not axis.symmetry.axial:
             return None
         assert isinstance(reconstructor, SharedSettings)
-        reconstructor, training = with_axis(reconstructor, axis), halved(training, axis.symmetry)
+        reconstructor, training = with_axis(reconstructor, axis.symmetry), halved(training, axis.symmetry)
     if repetitions is not None and repetitions.without_views:
         return None
     return FirstLook(out, reconstructor, training, run.checkpoint_every, monitor, afresh)

@@ -199,7 +199,7 @@ def _plan(film: Path, out: Path, chunk: int):
     from nerif.sequence.plan import SequencePlan
 
     sequence = MeasurementSequence.read(film)
-    grid = Grid.of_resolution(sequence.first_good().box, 10)
+    grid = Grid.of_resolution(sequence.fullest().box, 10)
     SequenceStore.begin(out, sequence, grid, ("index_excess",), COLD.network, {})
     settings = SequenceSettings(chunk=chunk, warm_steps=10, voxels=10, quantities=("index_excess",))
     return SequencePlan(film, out, COLD, settings, threads=1)
@@ -342,7 +342,7 @@ def test_from_python_in_one_call(five, tmp_path):
     store = reconstruct_sequence(out, five, COLD, settings, on_progress=told.append, **arguments)
     assert (store.status == DONE).all()
     assert {*store.quantities} == {"index_excess", "density"}
-    assert store.attributes["gas"]["wavelength_nm"] == MeasurementSequence.read(five).first_good().wavelength_nm
+    assert store.attributes["gas"]["wavelength_nm"] == MeasurementSequence.read(five).fullest().wavelength_nm
     assert said[0].endswith("r.zarr: 5 of 5 frames to do, in chunks of 3")
     assert said[-1].startswith("5 of 5 frames done")
     assert told[-1].done == 5

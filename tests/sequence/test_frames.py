@@ -13,12 +13,16 @@ import torch
 import xarray as xr
 import zarr
 
+from nerif.cli import main
 from nerif.conventions import InputError
+from nerif.fields.symmetric import symmetry_of_field
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.reconstruction.symmetry import with_axis
 from nerif.sequence import frames
 from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.plan import SequencePlan, SequenceSettings
+from nerif.sequence.reconstruct import _store
 from nerif.sequence.run import chunks_of, outcome_table
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
 from sequence_films import COLD, blank
@@ -29,7 +33,7 @@ def begun(measurement: Path, out: Path, **changes: object) -> SequencePlan:
     settings = SequenceSettings(warm_steps=15, voxels=10, quantities=("index_excess", "temperature"))
     plan = SequencePlan(measurement, out, COLD, replace(settings, **changes))
     sequence = MeasurementSequence.read(measurement)
-    grid = Grid.of_resolution(sequence.first_good().box, 10)
+    grid = Grid.of_resolution(sequence.fullest().box, 10)
     SequenceStore.begin(out, sequence, grid, plan.settings.quantities, COLD.network, plan.kept)
     return plan
 
@@ -58,6 +62,31 @@ def test_every_frame_is_written_with_what_it_came_from(undisturbed):
         assert float(found["cc"].min()) > 0
         assert np.isfinite(found["rms_px"].values).all()
     assert "5 of 5 frames done" in outcome_table(store)
+
+
+def test_frames_of_a_symmetric_film_share_an_axis_and_are_read_back_as_they_were(short, tmp_path):
+    settings = SequenceSettings(warm_steps=3, voxels=8, quantities=("index_excess",))
+    cold = replace(COLD, symmetry="axis+1", max_steps=5)
+    plan, said = SequencePlan(short, tmp_path / "r.zarr", cold, settings), []
+    sequence = MeasurementSequence.read(short)
+    like = sequence.fullest()
+    store = _store(plan, sequence, like, False, said.append)
+    assert store.symmetry is not None
+    assert any("axis" in line for line in said)
+    assert _store(plan, sequence, like, False, said.append).symmetry == store.symmetry  # gone on with
+    reconstruct_frames(replace(plan, cold=with_axis(cold, store.symmetry)), 0, 2)
+    assert store.status[:2].tolist() == [DONE, DONE]
+    assert store.array("steps")[1] == 3  # warm: the weights are taken over
+    for i in range(2):
+        found, kept = store.field(i).sample(store.grid), store.volume(i, "index_excess").values
+        torch.testing.assert_close(found, kept, rtol=1e-5, atol=1e-9)
+        assert symmetry_of_field(store.field(i)).near(store.symmetry, 1e-9)
+
+
+def test_a_film_of_which_no_frame_is_found_exits_with_1(five, tmp_path, monkeypatch):
+    store = SequenceStore(begun(five, tmp_path / "r.zarr").out)
+    monkeypatch.setattr("nerif.commands.sequence.run", lambda settings: store)
+    assert main(["sequence", str(five), "-o", str(tmp_path / "r.zarr")]) == 1
 
 
 def test_weights_of_another_version_are_refused(undisturbed, tmp_path):

@@ -127,7 +127,7 @@ def begun(film: Path, out: Path, steps: int, **changes: object) -> SequencePlan:
         quantities=("index_excess",),
     )  # fmt: skip
     plan = SequencePlan(film, out, settings, asked)
-    grid = Grid.of_resolution(sequence.first_good().box, 10)
+    grid = Grid.of_resolution(sequence.fullest().box, 10)
     SequenceStore.begin(out, sequence, grid, asked.quantities, SHAPE, plan.kept)
     return plan
 

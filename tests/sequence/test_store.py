@@ -110,7 +110,10 @@ def test_a_view_that_saw_nothing_is_left_out_and_an_empty_frame_refused(short):
     with pytest.raises(InputError, match=r"frame 2: .*no valid pixel"):
         sequence.frame(2)
     blank(short, 0)
-    assert sequence.first_good().names == names[1:]
+    assert sequence.fullest().names == names  # of a later one
+    for later in (3, 4):
+        blank(short, later, view=0)
+    assert sequence.fullest().names == names[1:]
 
 
 def test_a_frame_without_a_view_is_written_with_that_view_empty(short):
@@ -196,11 +199,13 @@ def test_nothing_of_a_sequence_is_nan_but_what_was_not_measured(five):
 
 def test_a_store_of_another_technique_says_what_it_holds(tmp_path):
     """Emission: its own quantity, its unit of the difference, and a page and figures that speak of it."""
+    import zarr
+
     film = tmp_path / "film.zarr"
     words = ["--phantom", "flame", "--times", "0:1e-4:2", "--noise", "0.05", "-o", str(film), *RIG]
     assert main(["simulate", "--technique", "emission", *words]) == 0
     sequence = MeasurementSequence.read(film)
-    like = sequence.first_good()
+    like = sequence.fullest()
     plan = SequencePlan(film, tmp_path / "r.zarr", COLD, SequenceSettings(voxels=8).for_measurement(like))
     grid = Grid.of_resolution(like.box, 8)
     kept = {"bounds": [0.0, None], **plan.kept}
@@ -215,6 +220,11 @@ def test_a_store_of_another_technique_says_what_it_holds(tmp_path):
     assert " px" not in outcome_table(store)
     metrics = evaluate_sequence(plan.out, tmp_path / "film.truth.zarr")
     assert metrics["mean"]["l2"] == pytest.approx(metrics["mean"]["l2_variation"])
+    assert main(["evaluate", str(plan.out), "--truth", str(tmp_path / "film.truth.zarr"), "--align", "rigid"]) == 2
+    attributes = zarr.open_group(tmp_path / "film.truth.zarr", mode="r+").attrs
+    attributes["box_upper_mm"] = [1e3, *attributes["box_upper_mm"][1:]]
+    with pytest.raises(InputError, match=r"inside the reconstructed box .* sticks out along x"):
+        evaluate_sequence(plan.out, tmp_path / "film.truth.zarr")
     text = re.sub(r"<(script|style)\b.*?</\1>", "", render_sequence(store), flags=re.DOTALL)
     assert "Emission tomography" in text
     assert "Radiance per length" in text

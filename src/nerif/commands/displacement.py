@@ -95,7 +95,7 @@ def run(settings: Displacement) -> Measurement:
     box = recording.scene.box
     settings = replace(settings, lower=box.lower, upper=box.upper)
     if settings.frames:
-        return run_over_time(settings, recording).first_good()
+        return run_over_time(settings, recording).fullest()
     picture = settings.out.with_suffix(".png")
     check_file(settings.out, settings.force, picture)
     with counting_bar("finding displacements", len(recording.views)) as bar:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -78,7 +78,7 @@ def run_over_time(settings: Evaluate) -> dict[str, Any]:
     """Print the metrics of every frame of a sequence and return them."""
     from nerif.sequence.evaluation import evaluate_sequence
 
-    if settings.truth is None or settings.measurement is not None:
+    if settings.truth is None or replace(settings, truth=None) != Evaluate(settings.result):
         raise InputError(
             "evaluate: expected --truth NAME.truth.zarr alone for a sequence, whose views are compared already"
         )

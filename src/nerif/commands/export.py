@@ -13,7 +13,7 @@ from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.exports import FORMATS, export
 from nerif.geometry import Box, Grid
-from nerif.physics.quantities import GasSettings, derive, masked_lines
+from nerif.physics.quantities import GasChanges, derive, masked_lines
 from nerif.result import ResultDirectory
 from nerif.volume import Volume, quantities_of
 
@@ -41,7 +41,7 @@ class Export(Settings):
     """Upper corner x y z, mm."""
     force: bool = False
     """Overwrite an existing file."""
-    gas: GasSettings = field(default_factory=GasSettings)
+    gas: GasChanges = field(default_factory=GasChanges)
     """What density and temperature are computed for."""
 
 
@@ -59,7 +59,8 @@ def run(settings: Export) -> None:
     grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
     asked = settings.quantities or tuple(q for q in quantities_of(quantity) if q != "temperature")
     reconstructed = Volume.of(field.sample(grid), grid, quantity, n_ambient)
-    volumes = [derive(reconstructed, q, settings.gas) for q in asked]
+    gas = settings.gas.of(result.settings())
+    volumes = [derive(reconstructed, q, gas) for q in asked]
     export(settings.out, volumes)
     say(f"{settings.out}: {', '.join(asked)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
     for line in masked_lines(volumes):

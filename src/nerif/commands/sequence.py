@@ -15,7 +15,7 @@ from nerif.reconstruction.presets import preset
 from nerif.sequence.plan import SequenceSettings
 from nerif.sequence.reconstruct import reconstruct_sequence
 from nerif.sequence.run import Progress
-from nerif.sequence.store import SequenceStore
+from nerif.sequence.store import DONE, SequenceStore
 
 __all__ = ["Sequence", "main", "run"]
 
@@ -71,4 +71,5 @@ def main(arguments: list[str]) -> None:
     """Parse and run."""
     name = value_given("preset", arguments, "auto")
     default = Sequence(measurement=tyro.MISSING, out=tyro.MISSING, preset=name, reconstructor=preset(name))
-    run(read_settings(default, arguments, "sequence"))
+    if not (run(read_settings(default, arguments, "sequence")).status == DONE).any():
+        raise SystemExit(1)

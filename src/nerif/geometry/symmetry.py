@@ -192,6 +192,17 @@ class Symmetry:
         x, y, z = point.tolist()
         return replace(self, point=(x, y, z), frame=tuple((a, b, c) for a, b, c in rows))
 
+    def near(self, other: Symmetry, apart: float) -> bool:
+        """Return whether another is of the same kind about nearly the same axis.
+
+        Parameters
+        ----------
+        apart : largest difference of its coordinates, in their unit, and of the directions
+        """
+        mine, others = ((*s.point, *(x for row in s.frame for x in row)) for s in (self, other))
+        same = (self.kind, self.harmonics) == (other.kind, other.harmonics)
+        return same and all(abs(a - b) <= apart for a, b in zip(mine, others, strict=True))
+
     def in_units(self, centre: tuple[float, float, float], unit: float) -> Symmetry:
         """Return it in coordinates (x - centre) / unit."""
         x, y, z = ((p - c) / unit for p, c in zip(self.point, centre, strict=True))

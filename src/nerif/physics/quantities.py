@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from nerif.volume import QUANTITIES, Volume, quantities_of
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
-__all__ = ["TEMPERATURE_RANGE", "GasSettings", "derive", "derive_all", "masked_lines"]
+__all__ = ["TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "masked_lines"]
 
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; beyond, gases of the table condense or dissociate, and one composition holds no more."""
@@ -51,6 +52,25 @@ class GasSettings:
         gas = self if wavelength is None else replace(self, wavelength_nm=wavelength)
         density_from_index(0.0, measurement.n_ambient, gladstone_dale(gas.composition, gas.wavelength_nm))
         return gas
+
+
+@dataclass(frozen=True)
+class GasChanges:
+    """What density and temperature are computed for, where it is not what the result was."""
+
+    composition: str | None = None
+    """Gas or mixture by mole fractions, e.g. "CH4:0.11, air:0.89"; default: that of the result."""
+    wavelength_nm: float | None = None
+    """Wavelength of the light, nm; default: that of the result."""
+    pressure_pa: float | None = None
+    """Pressure, Pa; default: that of the result."""
+
+    def of(self, settings: Mapping[str, Any]) -> GasSettings:
+        """Return the gas that the settings of a run (run.toml) hold, with the changes."""
+        kept = settings.get("gas", {})
+        changed = {f.name: getattr(self, f.name) for f in fields(self)}
+        known = {name: kept[name] for name in changed if name in kept}
+        return GasSettings(**known | {name: value for name, value in changed.items() if value is not None})
 
 
 def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 
@@ -17,6 +18,8 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
 
 __all__ = ["axis_of", "check_views", "symmetry_asked", "with_axis"]
+
+Asked = TypeVar("Asked", bound=SharedSettings)
 
 PLACE = 0.03  # of the longest edge of the box: standard deviation of where an axis is, if nothing is said
 ROUNDING = 0.002  # of the longest edge of the box: within this of the axis a field is round
@@ -70,9 +73,8 @@ def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:
     return find_axis(seen, symmetry, sigma, faces, settings.open_faces)
 
 
-def with_axis(settings: SharedSettings, axis: Axis) -> SharedSettings:
-    """Return settings that take the axis that was found as given."""
-    symmetry = axis.symmetry
+def with_axis(settings: Asked, symmetry: Symmetry) -> Asked:
+    """Return settings that take the axis of a symmetry that was found as given."""
     return replace(
         settings, axis_point=symmetry.point, axis_direction=symmetry.direction, axis_sigma_mm=0.0, axis_sigma_deg=0.0
     )

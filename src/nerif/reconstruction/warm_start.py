@@ -15,20 +15,25 @@ from torch import nn
 
 from nerif.fields.base import Field
 from nerif.fields.mlp import UNBOUNDED, NeuralField
+from nerif.fields.symmetric import SymmetricNetwork
 from nerif.reconstruction.adam import Adam
 from nerif.reconstruction.losses import Evaluator
 
 __all__ = ["adopt", "fit_network"]
 
 WARM_UP = 20  # steps
+APART = 0.05  # of half the box: an axis that is found anew may be so far aside
 BETAS = (0.9, 0.999)  # Adam's decay rates
 
 
 def adopt(field: NeuralField, start: Field) -> bool:
-    """Take over the weights of a neural field, exactly; False, and nothing done, if it has another shape or box."""
+    """Take over the weights of a neural field, exactly; False, and nothing done, if shape, box or axis are others."""
     if not isinstance(start, NeuralField) or type(start.network) is not type(field.network):
         return False
     if start.network.shape != field.network.shape or start.box != field.box:
+        return False
+    before, now = (f.network.symmetry if isinstance(f.network, SymmetricNetwork) else None for f in (start, field))
+    if before is not None and now is not None and not now.near(before, APART):
         return False
     bounded = (start.network.limits, field.network.limits) != (UNBOUNDED, UNBOUNDED)
     if bounded and start.bounds != field.bounds:

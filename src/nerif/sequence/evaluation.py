@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.conventions import InputError
+from nerif.evaluation import check_inside
 from nerif.json_file import write_json
 from nerif.metrics import volume_errors
 from nerif.sequence.store import DONE, SequenceStore
@@ -39,6 +40,7 @@ def evaluate_sequence(
     store, true = SequenceStore(Path(result)), VolumeSequence(truth)
     if len(store) != len(true) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, true.times, strict=True)):
         raise InputError(f"{truth}: expected the instants of {result}, {len(store)} frames, got others")
+    check_inside(Path(truth), true.grid.box, store.grid.box)
     quantity = technique(store.attributes.get("techniques", [ASSUMED.name])[0]).quantity
     frames: list[dict[str, Any]] = []
     done = [i for i, status in enumerate(store.status) if status == DONE]

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from nerif.conventions import InputError
 from nerif.geometry import Grid
+from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.symmetry import axis_of, symmetry_asked, with_axis
 from nerif.sequence.cluster import check_workers, open_cluster
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.run import Progress, outcome_table, run_sequence
@@ -78,13 +80,15 @@ def reconstruct_sequence(
             "calibration.toml to the measurement"
         )
     sequence = MeasurementSequence.read(measurement)
-    like = seen_through(sequence.first_good(), reconstructor.aperture)
+    like = seen_through(sequence.fullest(), reconstructor.aperture)
     like.without(settings.hold_out)
     settings = settings.for_measurement(like)
     shape = reconstructor.resolved_by(like).network
     reconstructor = replace(reconstructor, network=shape, wave_pixels=0, source="displacements")
     plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)
-    store = _store(plan, sequence, force)
+    store = _store(plan, sequence, like, force, say)
+    if store.symmetry is not None:
+        plan = replace(plan, cold=with_axis(plan.cold, store.symmetry))
     if retry:
         say(f"{store.forget_failures()} failed frames are tried again")
     missing = int((store.status == MISSING).sum())
@@ -104,14 +108,23 @@ def reconstruct_sequence(
     return store
 
 
-def _store(plan: SequencePlan, sequence: MeasurementSequence, force: bool) -> SequenceStore:
-    """The store that is there if it was begun with the same settings, else a new one."""
-    bounds = field_bounds(sequence.first_good(), plan.cold.lower, plan.cold.upper)
+def _store(
+    plan: SequencePlan, sequence: MeasurementSequence, like: Measurement, force: bool, say: Callable[[str], None]
+) -> SequenceStore:
+    """The store that is there if it was begun with the same settings, else a new one, which has one axis for all."""
+    bounds = field_bounds(like, plan.cold.lower, plan.cold.upper)
     limits = [bound if math.isfinite(bound) else None for bound in bounds]  # JSON knows no infinity
     kept = {"frames": len(sequence), "bounds": limits, **plan.kept}
     if plan.out.exists() and not force:
         store = SequenceStore(plan.out)
         store.check_same(kept)
         return store
-    grid = Grid.of_resolution(sequence.first_good().box, plan.settings.voxels)
+    axis = axis_of(plan.cold, like.without(plan.settings.hold_out))
+    if axis is not None:
+        for line in axis.sentences:
+            say(line)
+        asked = symmetry_asked(with_axis(plan.cold, axis.symmetry), like)
+        assert asked is not None
+        kept["symmetry"] = asdict(asked)
+    grid = Grid.of_resolution(like.box, plan.settings.voxels)
     return SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, plan.cold.network, kept)

@@ -22,7 +22,9 @@ from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
-from nerif.geometry import Grid
+from nerif.fields.symmetric import SymmetricNetwork
+from nerif.geometry import Box, Grid
+from nerif.geometry.symmetry import Symmetry
 from nerif.measurement_sequence import MeasurementSequence, add_frames
 from nerif.netcdf import reading
 from nerif.reconstruction.bounds import in_units
@@ -93,13 +95,13 @@ class SequenceStore(VolumeSequence):
         grid, quantities : of the volumes
         attributes : settings and whatever else is to be kept, JSON
         """
-        like, frames = sequence.first_good(), len(sequence)
+        like, frames = sequence.fullest(), len(sequence)
         shutil.rmtree(_checkpoints(path), ignore_errors=True)
         names = [kind.name for kind in like.techniques]
         about = {"kind": KIND, "network": vars(network), "views": list(like.names), "techniques": names, **attributes}
         with atomic(path) as part:
             group = VolumeSequence.create(part, sequence.times, grid, quantities, like.n_ambient, about).group
-            views, parameters = len(like.names), sum(p.numel() for p in _network(about).parameters())
+            views, parameters = len(like.names), sum(p.numel() for p in _network(about, grid.box).parameters())
 
             def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
                 add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
@@ -126,6 +128,12 @@ class SequenceStore(VolumeSequence):
     def checkpoints(self) -> Path:
         """Where joint networks in training are kept, beside the store."""
         return _checkpoints(self.path)
+
+    @property
+    def symmetry(self) -> Symmetry | None:
+        """Of the fields of all frames, mm, if they have one."""
+        kept = self.attributes.get("symmetry")
+        return Symmetry.kept(kept) if kept else None
 
     @property
     def status(self) -> np.ndarray:
@@ -171,7 +179,7 @@ class SequenceStore(VolumeSequence):
         if int(self.read("status", index)) != DONE:
             raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
         with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
-            network = _network(self.attributes, float(self.read("index_scale", index)))
+            network = _network(self.attributes, self.grid.box, float(self.read("index_scale", index)))
             length = int(self.attributes["chunk"]) if isinstance(network, SpaceTimeNetwork) else 1
         weights, at = torch.from_numpy(self.read("weights", index)), 0
         scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
@@ -216,13 +224,16 @@ def _checkpoints(path: Path) -> Path:
     return path.with_name(path.name + ".joint")
 
 
-def _network(attributes: dict[str, Any], scale: float = 1.0) -> Network:
-    """An empty network of the kind that a store was made with, for a field in units of `scale`."""
+def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0) -> Network:
+    """An empty network of the kind that a store was made with, for a field in a box in units of `scale`."""
     shape = NetworkShape.of(attributes["network"])
     low, high = attributes.get("bounds", (None, None))  # JSON knows no infinity
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
     if attributes.get("temporal") == "joint":
         return SpaceTimeNetwork(shape, int(attributes["time_octaves"]), bounds)
+    if attributes.get("symmetry"):
+        own = Symmetry.kept(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
+        return SymmetricNetwork(shape, own, bounds)
     return Network(shape, bounds=bounds)
 
 
