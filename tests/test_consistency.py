@@ -13,7 +13,7 @@ from nerif.consistency import check_consistency
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring, paper_rig
 from nerif.measurement import Measurement
-from nerif.quick_views import binned, fit
+from nerif.quick_views import binned, fit, without_spikes
 from nerif.simulation import simulate
 from nerif.symptoms import open_faces
 
@@ -179,6 +179,35 @@ def test_camera_shake_and_missing_pixels_are_told(clean):
     found = check_consistency(replace(moved, valid=valid), voxels=20)
     assert any("view 60deg: its rim is displaced by (1." in r for r in found.remarks)
     assert any("view 0deg: only 33% of its pixels" in r for r in found.remarks)
+
+
+def test_a_small_flow_among_zeros_is_no_spike(clean):
+    d = torch.zeros_like(clean.displacement)
+    d[:, 14:17, 14:22] = clean.displacement[:, 14:17, 14:22]  # 2 % of the pixels
+    d[0, 0, 0] = 1e4
+    kept = without_spikes(spoilt(clean, lambda _: d)).displacement
+    assert kept[0, 0, 0].isnan().all()
+    d[0, 0, 0] = torch.nan
+    assert torch.equal(kept.isnan(), d.isnan())
+
+
+def test_views_of_nothing_are_told(clean):
+    found = check_consistency(spoilt(clean.select(clean.names[:3]), torch.zeros_like), voxels=8)
+    assert found.findings == found.views == ()
+    assert found.remarks[-1] == "every displacement of rays through the box is 0: there is nothing to compare"
+
+
+@pytest.mark.parametrize("apart", [2, 4, 8])
+def test_sparse_vectors_are_kept(clean, apart):
+    sparse = torch.full_like(clean.displacement, torch.nan)
+    sparse[:, ::apart, ::apart] = clean.displacement[:, ::apart, ::apart]
+    sparse[2] = clean.displacement[2]
+    sparse[2, :2, :4] = torch.nan
+    sparse[2, 0, 0] = 1.0
+    found = binned(spoilt(clean, lambda _: sparse), 18)
+    assert int(found.usable[0].sum()) == -(-30 // apart) * -(-36 // apart)
+    assert found.usable[2, 0, :2].tolist() == [False, False]  # of a dense view, squares that are empty by half are not
+    torch.testing.assert_close(found.displacement[0, 0, 0], sparse[0, 0, 0] / 2)
 
 
 def test_binning_keeps_rays_and_displacements(clean):

@@ -117,6 +117,29 @@ def test_select(full):
         full.select([])
 
 
+@pytest.fixture(scope="module")
+def two(full) -> Measurement:
+    """Displacements of two views and fringes of the third, all with a background."""
+    d, valid = full.displacement.clone(), torch.ones_like(full.valid)
+    fringes = d[..., 0].clone()
+    d[2], fringes[:2] = torch.nan, torch.nan
+    maps = {"fringes": fringes, "fringes_sigma": torch.full_like(fringes, 0.1)}
+    return replace(full, displacement=d, maps=maps, valid=valid, flow_mask=None)
+
+
+def test_techniques_are_taken_apart(two):
+    deflection, interferometry = two.observations
+    for alone in (interferometry.alone(two), deflection.without(two), two.without(two.names[:2])):
+        assert alone.names == two.names[2:]
+        assert alone.cameras[0].background is None
+        assert [o.technique.name for o in alone.observations] == ["interferometry"]
+    for alone in (deflection.alone(two), interferometry.without(two)):
+        assert alone.names == two.names[:2]
+        assert all(camera.background is not None for camera in alone.cameras)
+    mixed = two.select(two.names[1:])
+    assert all(camera.background is not None for camera in mixed.cameras)
+
+
 def test_sizes_and_numbers_that_cannot_be_right(full, unchecked):
     for change, word in (
         ({"displacement": full.displacement[:2]}, "displacement"),
@@ -158,6 +181,19 @@ def test_normal_that_is_no_unit_vector(full, tmp_path):
     dataset.to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
     with pytest.raises(InputError, match="background_normal of view '60deg'"):
         Measurement.read(tmp_path / "x.nc")
+
+
+def test_a_normal_without_an_offset(full):
+    cameras = tuple(camera.without_background for camera in full.cameras)
+    absorbance = torch.ones(full.shape)
+    plain = replace(full, cameras=cameras, displacement=None, sigma=None, maps={"absorbance": absorbance})
+    dataset = plain.to_dataset()
+    normals = torch.stack([camera.background.normal for camera in full.cameras]).numpy()
+    dataset["background_normal"] = ("view", "i"), normals
+    with pytest.raises(InputError, match=r"background_offset of view '0deg': .*got nan; give it, or leave out"):
+        Measurement.from_dataset(dataset)
+    dataset["background_normal"] = ("view", "i"), np.full_like(normals, np.nan)
+    assert Measurement.from_dataset(dataset).cameras[0].background is None
 
 
 def test_sigma_and_displacement_that_no_camera_measures_are_left_out(full):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
 
 from nerif.cli import main
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.meridian import Meridian
+from nerif.report.meridian_figure import draw_centre_line, draw_profiles
 from nerif.result import ResultDirectory
 from nerif.simulation import simulate
 from nerif.volume import Volume
@@ -31,6 +33,49 @@ def test_it_is_the_field_around_the_axis():
     assert np.linalg.norm(apart) < 0.02 * np.linalg.norm(truth[known])
     line = found.profile("index_excess", 3.1)
     assert line[0] == pytest.approx(float(phantom(torch.tensor([[0.0, 0.0, 3.1]], dtype=torch.float64))), rel=0.02)
+
+
+def of_numbers(axial: bool = True, **quantities: float) -> Meridian:
+    """Quantities that are the same everywhere, but for what they grow along h."""
+    r, h = np.linspace(0 if axial else -3, 3, 7), np.linspace(-2, 2, 5)
+    grown = np.broadcast_to(1e-9 * h[:, None], (5, 7))
+    return Meridian(r, h, {name: value + grown for name, value in quantities.items()}, axial)
+
+
+def test_files_keep_the_digits_of_n(tmp_path):
+    found = of_numbers(n=1.000271234567, n_mean=1.000271234567, density=1.2)
+    found.write(tmp_path / "m.nc")
+    found.write_csv(tmp_path / "m.csv")
+    table = np.genfromtxt(tmp_path / "m.csv", delimiter=",", names=True)
+    with xr.open_dataset(tmp_path / "m.nc") as data:
+        assert data["density"].dtype == np.float32
+        for name in ("n", "n_mean"):
+            np.testing.assert_array_equal(data[name].values, found.quantities[name])
+            np.testing.assert_allclose(table[name], found.quantities[name].ravel(), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "others", "line", "low", "high"),
+    [
+        ("density", {"density_std": 0.1}, 1.2, 1.2 - 0.1645, 1.2 + 0.1645),
+        ("density", {"density_std": 0.1, "density_mean": 1.3}, 1.3, 1.3 - 0.1645, 1.3 + 0.1645),
+        ("temperature", {"temperature_std": 5, "temperature_p05": 280, "temperature_p95": 340}, 300, 280, 340),
+        ("n", {"n_std": 1e-5, "n_mean": 1.0003}, 3e-4, 3e-4 - 1.645e-5, 3e-4 + 1.645e-5),
+    ],
+)
+def test_bands_are_those_of_the_percentiles_else_about_the_mean(quantity, others, line, low, high):
+    found = of_numbers(density=1.2, temperature=300, n=1.00027, **others)
+    for draw in (draw_profiles, draw_centre_line):
+        axes = draw(Figure().subplots(), found, quantity)
+        band = axes.collections[0].get_paths()[0].get_extents()
+        assert axes.get_lines()[0].get_ydata()[0] == pytest.approx(line, rel=1e-4)
+        assert (band.y0, band.y1) == pytest.approx((low, high), rel=1e-4)
+
+
+def test_only_an_axial_flow_has_an_axis():
+    assert draw_centre_line(Figure().subplots(), of_numbers(n=1.1), "n").get_ylabel() == "n − 1 [1] on the axis"
+    planar = draw_centre_line(Figure().subplots(), of_numbers(False, n=1.1), "n")
+    assert planar.get_ylabel() == "n − 1 [1] at r = 0.0 mm"
 
 
 @pytest.mark.slow

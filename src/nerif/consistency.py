@@ -139,7 +139,10 @@ def _check(
             break
         found.append(correction)
         small = _without(correction, small)
-    everything, _ = fit(small, voxels)
+    everything, objective = fit(small, voxels)
+    if not objective > 0:
+        nothing = f"every {kind.measured} of rays through the box is 0: there is nothing to compare"
+        return Consistency((), (), (*remarks, nothing))
     views, findings = [], [f"{_who(c, names)}: {c.words}" for c in found]
     compared = [compare(predicted_by_others(small, [i], voxels)[i], small, i) for i in range(len(names))]
     middle = float(torch.tensor([a for a, _ in compared]).median())
@@ -187,6 +190,8 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
         step(2 * len(views))
     likely += [c for c in exchanges(small.cameras) if _crossed(dict(enumerate(predictions)), small, c) < NO_EXCHANGE]
     _, before = fit(small, voxels, 1e-4)
+    if not before > 0:  # nothing was measured
+        return None
     results = []
     for correction in [*likely, *alike]:
         results.append((fit(_without(correction, small), voxels, 1e-4)[1] / before, correction))

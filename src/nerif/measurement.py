@@ -18,7 +18,7 @@ from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, 
 from nerif.geometry import Box, Camera, Rays
 from nerif.measurement_summary import as_html, summary
 from nerif.netcdf import opened
-from nerif.observation import Observation, arguments_of, check_maps, check_observations
+from nerif.observation import Observation, arguments_of, cameras_of, check_maps, check_observations
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES
 
@@ -306,7 +306,7 @@ class Measurement:
 
         return replace(
             self,
-            cameras=tuple(self.cameras[i] for i in index),
+            cameras=cameras_of(self, index),
             displacement=pick(self.displacement),
             sigma=pick(self.sigma),
             maps={name: value[index] for name, value in self.maps.items()},

@@ -297,8 +297,10 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     sizes = _array(dataset, "image_size") if "image_size" in dataset else whole
     distortion = _array(dataset, "distortion") if "distortion" in dataset else torch.zeros(views, 5).double()
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
-    nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64)
-    normals, offsets = (_array(dataset, n, True) if n in dataset else nowhere for n in BACKGROUND)
+    nowhere = torch.full((views, 3), torch.nan, dtype=torch.float64), torch.full((views,), torch.nan)
+    normals, offsets = (
+        _array(dataset, n, True) if n in dataset else none for n, none in zip(BACKGROUND, nowhere, strict=True)
+    )
     lenses = _lenses(dataset, names)
     sure = _array(dataset, "pose_sigma", True) if "pose_sigma" in dataset else torch.full((views, 6), torch.nan)
     cameras = []
@@ -344,7 +346,10 @@ def _plane(normal: Tensor, offset: Tensor, view: str) -> Plane | None:
     if not 0.99 < length < 1.01:
         raise InputError(f"background_normal of view '{view}': expected a unit vector, got length {length:g}")
     if not bool(offset.isfinite()):
-        raise InputError(f"background_offset of view '{view}': expected a finite number in mm, got {float(offset)}")
+        raise InputError(
+            f"background_offset of view '{view}': expected a finite number in mm beside background_normal, "
+            f"got {float(offset)}; give it, or leave out background_normal of a view without a background"
+        )
     return Plane(normal / length, float(offset) / length)
 
 

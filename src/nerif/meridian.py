@@ -26,6 +26,7 @@ __all__ = ["Meridian"]
 
 AROUND = 12  # places of a ring
 FINER = 2  # points along an edge of a voxel
+FROM_ONE = ("n", "n_mean")  # of which single precision would keep too few digits of n - 1
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,8 @@ class Meridian:
         data = {}
         for name, values in self.quantities.items():
             unit, long_name = describe(name)
-            data[name] = (("h", "r"), values.astype(np.float32), {"units": unit, "long_name": long_name})
+            kept = values if name in FROM_ONE else values.astype(np.float32)
+            data[name] = (("h", "r"), kept, {"units": unit, "long_name": long_name})
         about = ("distance from the axis", "along the axis") if self.axial else ("along e1", "along e3")
         axes = {name: (name, at, {"units": "mm", "long_name": what})
                 for name, at, what in zip("rh", (self.r, self.h), about, strict=True)}  # fmt: skip
@@ -96,8 +98,10 @@ class Meridian:
         r, h = np.meshgrid(self.r, self.h)
         columns = [r, h, *self.quantities.values()]
         table = np.stack([c.ravel() for c in columns], axis=1)
+        names = ("r_mm", "h_mm", *self.quantities)
+        digits = ["%.12g" if name in FROM_ONE else "%.8g" for name in names]
         with atomic(path) as part:
-            np.savetxt(part, table, "%.8g", ",", header=",".join(("r_mm", "h_mm", *self.quantities)), comments="")
+            np.savetxt(part, table, digits, ",", header=",".join(names), comments="")
 
     def profile(self, quantity: str, height: float) -> np.ndarray:
         """Return a quantity over r at a height, mm, between the nearest two."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +11,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.conventions import InputError, unit_shown
+from nerif.geometry import Camera
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES, forward_model
 
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
-__all__ = ["Observation", "arguments_of", "check_maps", "check_observations", "integrals_of"]
+__all__ = ["Observation", "arguments_of", "cameras_of", "check_maps", "check_observations", "integrals_of"]
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,15 @@ def integrals_of(measurement: Measurement) -> tuple[Observation, ...]:
         names = " and ".join(o.technique.measured for o in measurement.observations)
         raise InputError(f"measurement: expected displacements, got {names} alone; nerif displacement finds them")
     return found
+
+
+def cameras_of(measurement: Measurement, views: Sequence[int]) -> tuple[Camera, ...]:
+    """Return the cameras of some views, without their backgrounds where none of these measured by one."""
+    cameras = tuple(measurement.cameras[i] for i in views)
+    some = [o for o in measurement.observations if o.technique.background]
+    if len(some) == len(measurement.observations) or any(bool(measurement.usable_for(o)[views].any()) for o in some):
+        return cameras
+    return tuple(c if c.background is None else c.without_background for c in cameras)
 
 
 def arguments_of(maps: Mapping[str, Tensor]) -> dict[str, Any]:

@@ -43,7 +43,8 @@ def path_integral(small: Measurement) -> PathIntegral:
 def binned(measurement: Measurement, longest: int) -> Measurement:
     """Return the measurement with pixels averaged in squares, so that no picture is longer than about `longest` px.
 
-    Pictures of a few rows keep one, as high as their squares would be or as they are. Sigma and masks are left behind.
+    Pictures of a few rows keep one, as high as their squares would be or as they are. A square counts if half of its
+    pixels do; of a view so sparse that none would, if one does. Sigma and masks are left behind.
     """
     most = -(-max(max(c.image_size) for c in measurement.cameras) // longest)
     down, across = (max(1, min(most, *(c.image_size[i] for c in measurement.cameras))) for i in (0, 1))
@@ -66,7 +67,8 @@ def binned(measurement: Measurement, longest: int) -> Measurement:
         count = good.sum(dim=(1, 3))[..., None]
         mean = parts.sum(dim=(1, 3)) / count.clamp_min(1) / pixels.to(values)
         mean = mean if seen.signed else mean.clamp_min(0)  # below it is noise, which without sigma would be refused
-        maps.append(torch.where(count * 2 >= down * across, mean, torch.nan))
+        enough = count * 2 >= down * across
+        maps.append(torch.where(enough if bool(enough.any()) else count > 0, mean, torch.nan))
     return measurement_of(
         {seen.technique: torch.stack(maps)}, cameras, measurement.box, measurement.n_ambient, measurement.wavelength_nm,
         measurement.ambient_faces,
@@ -74,10 +76,13 @@ def binned(measurement: Measurement, longest: int) -> Measurement:
 
 
 def without_spikes(small: Measurement) -> Measurement:
-    """Return the measurement without the few pixels whose value is far beyond all others."""
+    """Return the measurement without the few pixels whose value is far beyond all others that are not 0."""
     values = values_of(small)
     length = values.norm(dim=-1)
-    limit = SPIKE * torch.nanquantile(length.flatten()[:: max(1, length.numel() // 1_000_000)], 0.95)
+    some = length[length > 0]
+    if not len(some):
+        return small
+    limit = SPIKE * torch.quantile(some[:: max(1, len(some) // 1_000_000)], 0.95)
     return with_values(small, torch.where((length <= limit)[..., None], values, torch.nan))
 
 

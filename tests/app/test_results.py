@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from app.serving import Served, opened
 from app.test_pages import line
 from nerif.app.jobs import Jobs
 from nerif.app.project import Project
+from nerif.app.result_look import ResultLook
 from nerif.app.result_table import rows_of
 from nerif.app.sources import Film, Still
 from nerif.conventions import InputError
@@ -96,6 +99,22 @@ def test_sources_follow_the_files(folder, tmp_path):
     twice = still.volume("index_excess")
     export(copy / "volume.nc", [Volume.of(2 * twice.values, twice.grid, "index_excess", AMBIENT)])
     assert Still(copy).limits("index_excess")[0] == pytest.approx(2 * before[0])
+
+
+def test_films_are_compared_at_the_same_instants(tmp_path):
+    grid = Grid.of_resolution(BOX, 6)
+    for name, times in (("a", [0.0, 1e-3, 2e-3]), ("b", [1e-3, 2.4e-3, 9e-3])):
+        store = VolumeSequence.create(tmp_path / f"{name}.zarr", times, grid, ("index_excess",), AMBIENT)
+        for i, time in enumerate(times):
+            store.write(i, [Volume(torch.full(grid.shape, time), grid)])
+    look = ResultLook(SimpleNamespace(project=Project(tmp_path)), "a.zarr", ["b.zarr"], {}, lambda: None)
+    look.source = Film(tmp_path / "a.zarr")
+    for step, time in ((1, 1e-3), (2, 2.4e-3)):
+        panels, note = look._panels("index_excess", "b.zarr", step)
+        assert [float(panel.volume.values.mean()) for panel in panels[:2]] == pytest.approx([step * 1e-3, time])
+        assert note == ""
+    with pytest.raises(InputError, match=r"b.zarr: expected a frame at 0 ms to compare with, got 1 ms as the nearest"):
+        look._panels("index_excess", "b.zarr", 0)
 
 
 def visit(driver: Any, server: Served) -> None:

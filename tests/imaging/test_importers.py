@@ -14,9 +14,10 @@ import tomli_w
 import torch
 from scipy.spatial.transform import Rotation
 
+from nerif.commands import calibrate
 from nerif.conventions import InputError
-from nerif.geometry import TELECENTRIC, Camera, Lens, Plane
-from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
+from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
+from nerif.imaging.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
 from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
 
 PLANE = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -900.0)
@@ -120,7 +121,12 @@ def test_a_calibration_keeps_the_lenses_and_is_given_some(tmp_path):
     assert first.camera().lens == Lens(3.5)
     assert second.camera().lens == Lens(4.0, 900.0)
     given = import_cameras(path, ImportSettings(aperture_diameter=6.25))
-    assert {camera.lens for camera in given} == {Lens(6.25)}
+    assert [camera.lens for camera in given] == [Lens(6.25), Lens(6.25, 900.0)]
+    given = import_cameras(path, ImportSettings(scale_mm=10.0, aperture_diameter=6.25))
+    assert [camera.lens for camera in given] == [Lens(6.25), Lens(6.25, 9000.0)]
+    given = import_cameras(path, ImportSettings(aperture_diameter=6.25, focus_distance=800.0))
+    assert {camera.lens for camera in given} == {Lens(6.25, 800.0)}
+    assert {camera.lens for camera in import_cameras(path, ImportSettings(aperture_diameter=0.0))} == {None}
     assert [camera.lens for camera in import_cameras(path)] == [Lens(3.5), Lens(4.0, 900.0)]
     path.write_text(path.read_text().replace("aperture_diameter = 3.5", "aperture_diameter = -3.5"))
     with pytest.raises(InputError, match=r"camera '.*': aperture_diameter: expected a lens of 0 mm or more, got -3\.5"):
@@ -129,6 +135,32 @@ def test_a_calibration_keeps_the_lenses_and_is_given_some(tmp_path):
         ImportSettings(focus_distance=900.0)
     with pytest.raises(InputError, match="aperture_diameter: expected a lens"):
         ImportSettings(aperture_diameter=-1.0)
+
+
+def test_lenses_are_added_to_a_calibration_that_keeps_the_rest(tmp_path, monkeypatch):
+    """docs/pixels.md."""
+    monkeypatch.setattr(calibrate, "_draw", lambda *rig: None)
+    path, out, thin = (tmp_path / f"{name}.toml" for name in ("calibration", "with_lenses", "thin"))
+    sure = dataclasses.replace(ONE, pose_sigma=torch.arange(6).double())
+    wide = dataclasses.replace(TWO, lens=Lens(4.0, 900.0))
+    before = [CalibratedCamera.from_camera(camera) for camera in (sure, wide)]
+    write_cameras(path, before, box=Box((-1, -2, -3), (1, 2, 3)))
+    calibrate.main([str(path), "--aperture-diameter", "6.25", "-o", str(out)])
+    after = read_cameras(out)
+    assert [camera.lens for camera in after] == [Lens(6.25), Lens(6.25, 900.0)]
+    assert read_box(out) == Box((-1, -2, -3), (1, 2, 3))
+    for got, camera in zip(after, before, strict=True):
+        assert (got.name, got.image_size) == (camera.name, camera.image_size)
+        assert got.background is not None
+        assert torch.equal(got.background.normal, PLANE.normal)
+        assert got.background.offset == PLANE.offset
+        for name in ("intrinsics", "distortion", "rotation", "translation"):
+            assert torch.equal(getattr(got, name), getattr(camera, name))
+    assert after[0].pose_sigma is not None
+    assert after[0].pose_sigma.tolist() == [0, 1, 2, 3, 4, 5]
+    assert after[1].pose_sigma is None
+    calibrate.main([str(out), "--aperture-diameter", "0", "-o", str(thin)])
+    assert [camera.lens for camera in read_cameras(thin)] == [None, None]
 
 
 def test_how_well_a_pose_is_known_is_said_or_taken_from_the_file_in_its_unit(tmp_path):
@@ -205,6 +237,9 @@ def test_csv(tmp_path, delimiter):
     path.write_text("\n".join(lines).replace("700.0", "far"))
     with pytest.raises(InputError, match="line 2: 'tz': expected a number, got 'far'"):
         import_cameras(path)
+    path.write_text("\n".join([*lines, lines[-1]]))
+    with pytest.raises(InputError, match=r"c.csv: expected cameras of different names, got 2 named 'two'; rename"):
+        import_cameras(path)
     path.write_text("name,fx\n")
     with pytest.raises(InputError, match="one line a camera"):
         import_cameras(path)
@@ -274,12 +309,63 @@ def test_opencv_folder_and_numbered_cameras(tmp_path):
     assert all(same(c, camera) for c, camera in zip(got, (ONE, TWO), strict=True))
 
 
-def test_opencv_stereo_pair(tmp_path):
+def test_opencv_cameras_of_one_name_in_a_folder_are_refused(tmp_path):
+    both = {f"{k}{i}": v for i, camera in ((1, ONE), (2, TWO)) for k, v in arrays(camera).items()}
+    for name in ("left", "right"):
+        write_opencv(tmp_path / f"{name}.yml", both)
+    with pytest.raises(InputError, match=r"right.yml: expected cameras of .*, got 'cam1' here and in left.yml; rename"):
+        import_cameras(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml"])
+def test_opencv_distortion_as_a_plain_sequence(tmp_path, suffix):
+    a, path = arrays(ONE), tmp_path / f"plain{suffix}"
+    write_opencv(path, {"K": a["K"], "R": a["R"], "t": a["t"], "D": 0})
+    row = [float(k) for k in a["D"]]
+    text = path.read_text().replace("D: 0", f"D: {row}").replace("<D>0<", f"<D>{' '.join(map(str, row))}<")
+    path.write_text(text)
+    assert same(import_cameras(path)[0], ONE)
+    path.write_text(text.replace(str(row[2]), '"far"'))
+    with pytest.raises(InputError, match=f"plain{suffix}: camera 1: distortion: expected numbers"):
+        import_cameras(path)
+
+
+@pytest.mark.parametrize("key", ["dist_coeffs", "dist_coeff", "dist", "kc"])
+def test_distortion_under_its_other_names(tmp_path, key):
+    a, path, table = arrays(ONE), tmp_path / "c.yml", tmp_path / "c.mat"
+    values = {key: a["D"], "K": a["K"], "R": a["R"], "t": a["t"]}
+    write_opencv(path, values)
+    assert same(import_cameras(path)[0], ONE)
+    if key != "dist_coeff":
+        for content in (values, {name: np.stack([value, value], axis=-1) for name, value in values.items()}):
+            scipy.io.savemat(table, content)
+            assert all(same(camera, ONE) for camera in import_cameras(table))
+
+
+@pytest.mark.parametrize("key", ["distorsion", "DistCoefs", "D3", "dist_1"])
+def test_distortion_that_is_not_read_is_refused(tmp_path, key):
+    a, path, table = arrays(ONE), tmp_path / "c.yml", tmp_path / "c.mat"
+    pose = {"K": a["K"], "R": a["R"], "t": a["t"]}
+    write_opencv(path, {**pose, key: a["D"]})
+    scipy.io.savemat(table, {**pose, key: a["D"]})
+    for file in (path, table):
+        with pytest.raises(InputError, match=f"expected distortion coefficients as one of .* got '{key}'") as error:
+            import_cameras(file)
+        assert str(file) in str(error.value)
+    write_opencv(path, {**pose, "D": a["D"], "working_distance": 3.0, "undistorted": 0})
+    assert same(import_cameras(path)[0], ONE)
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_opencv_stereo_pair(tmp_path, rectified):
+    """Maybe with what stereoRectify adds, of which R1 and R2 are no poses."""
     a, b = arrays(ONE), arrays(TWO)
     rotation = b["R"] @ a["R"].T
     translation = b["t"] - rotation @ a["t"]
     path = tmp_path / "stereo.yml"
-    write_opencv(path, {"M1": a["K"], "D1": a["D"], "M2": b["K"], "D2": b["D"], "R": rotation, "T": translation})
+    pair = {"M1": a["K"], "D1": a["D"], "M2": b["K"], "D2": b["D"], "R": rotation, "T": translation}
+    more = {"R1": np.eye(3), "R2": np.eye(3), "P1": np.eye(3, 4), "P2": np.eye(3, 4), "Q": np.eye(4)}
+    write_opencv(path, {**pair, **more} if rectified else pair)
     first, second = import_cameras(path)
     points = torch.from_numpy(np.random.default_rng(0).uniform(-25, 25, (9, 3)))
     world = points @ ONE.rotation.T + ONE.translation  # the first camera is the world
@@ -294,6 +380,10 @@ def test_opencv_errors(tmp_path):
         import_cameras(path)
     write_opencv(path, {"K": a["K"], "D": np.arange(8.0), "R": a["R"], "T": a["t"]})
     with pytest.raises(InputError, match="at most 5 distortion coefficients"):
+        import_cameras(path)
+    write_opencv(path, {"R": a["R"], "T": a["t"]})
+    path.write_text(path.read_text() + "K: [ [ 1, 2 ], [ 3 ] ]\n")
+    with pytest.raises(InputError, match=r"bad.yml: camera 1: camera matrix: expected 3 x 3 numbers"):
         import_cameras(path)
     write_opencv(path, {"D": a["D"]})
     with pytest.raises(InputError, match="no camera matrix"):
@@ -351,6 +441,7 @@ def test_nerf_angle_of_view(tmp_path):
         ({"is_fisheye": True}, {}, "is_fisheye"),
         ({"camera_model": "ORTHOPHOTO"}, {}, "ORTHOPHOTO"),
         ({"k4": 0.01}, {}, "at most 5 distortion coefficients"),
+        ({"distortion_params": [-0.1, 0, 0, 0, 0, 0]}, {}, "got 'distortion_params', which is not read"),
     ],
 )
 def test_nerf_cameras_of_other_models_are_refused(tmp_path, above, frame, words):
@@ -554,6 +645,25 @@ def test_stereo_parameters_by_to_struct(tmp_path, pictures):
     for got, struct in ((first, one), (second, two)):
         ours = got.camera(background=PLANE).project(torch.from_numpy(seen)).numpy()  # camera 1 is the world
         assert np.abs(ours - (world_to_image(struct, 2, points) - 1)).max() < 1e-6
+
+
+def test_stereo_parameters_of_two_pairs(tmp_path):
+    """Their cameras bear the names of their structs; without poses each pair would be a world of its own."""
+    path, pairs, known = tmp_path / "pairs.mat", {}, {}
+    for i, name in enumerate(("low", "high")):
+        one, two = camera_parameters(2 * i, "R2021a"), camera_parameters(2 * i + 1, "R2022b")
+        pairs[name] = {"CameraParameters1": one, "CameraParameters2": two, "RotationOfCamera2": np.eye(3),
+                       "TranslationOfCamera2": np.array([-120.0, 5.0, 8.0])}  # fmt: skip
+        known |= {f"{name}_cam1": one, f"{name}_cam2": two}
+    scipy.io.savemat(path, pairs)
+    got = import_cameras(path, ImportSettings(pose=2))
+    assert [camera.name for camera in got] == list(known)
+    assert all(sees(camera, struct, 2) for camera, struct in zip(got, known.values(), strict=True))
+    for pair in pairs.values():
+        pair["CameraParameters1"]["RotationVectors"] = np.zeros((0, 3))
+    scipy.io.savemat(path, pairs)
+    with pytest.raises(InputError, match=r"pairs.mat: expected cameras in one world frame, got low_cam1, high_cam1"):
+        import_cameras(path)
 
 
 def test_fisheye_parameters_are_refused(tmp_path):

@@ -13,15 +13,16 @@ import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.conventions import InputError
-from nerif.geometry import Box, Ring
+from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
 from nerif.imaging.assembly import Scene
 from nerif.imaging.cameras_file import CalibratedCamera
+from nerif.imaging.crop import Crop
 from nerif.imaging.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
-from nerif.imaging.measuring import Recording, RestingView, measure_instant
+from nerif.imaging.measuring import Recording, RestingView, camera_of, measure_instant
 from nerif.imaging.over_time import RestingRecording, measure_recording
-from nerif.imaging.views import find_views
+from nerif.imaging.views import View, find_views
 
 SHAPE = (60, 72)
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))
@@ -77,6 +78,64 @@ def test_a_film_of_one_instant_is_the_measurement(recording, tmp_path):
     assert frame.names == single.names
     for name in ("displacement", "sigma", "valid"):
         assert torch.equal(getattr(frame, name).nan_to_num(), getattr(single, name).nan_to_num()), name
+
+
+OTHER = {
+    "background": Plane(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), -400.0),
+    "translation": torch.tensor([0.0, 0.001, 900.0], dtype=torch.float64),
+    "distortion": torch.tensor([1e-6, 0, 0, 0, 0], dtype=torch.float64),
+    "lens": Lens(3.0),
+    "pose_sigma": torch.ones(6, dtype=torch.float64),
+}
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """A recording of one view, and a film of it."""
+    folder = tmp_path_factory.mktemp("film")
+    whole = write_experiment(folder, frames=1)
+    recording = replace(whole, views=whole.views[:1])
+    measure_recording(recording, range(1), [0.0], folder / "film.zarr")
+    return recording, folder / "film.zarr"
+
+
+@pytest.mark.parametrize("what", [*OTHER, "views"])
+def test_a_film_begun_with_other_cameras_is_not_gone_on_with(begun, what):
+    recording, out = begun
+    view, words = recording.views[0], what
+    if what == "views":
+        other = replace(recording, views=(replace(view, name="60deg"),))
+    else:
+        camera, words = replace(recording.cameras[view.name], **{what: OTHER[what]}), f"{what} of view '{view.name}'"
+        other = replace(recording, cameras={**recording.cameras, view.name: camera})
+    with pytest.raises(InputError, match=f"film.zarr: expected the cameras .* got other {words}.*--out, or --force"):
+        measure_recording(other, range(1), [0.0], out)
+
+
+def test_a_film_is_gone_on_with_whatever_rounding_did_to_its_cameras(begun):
+    recording, out = begun
+    near = {
+        name: replace(camera, rotation=camera.rotation + 1e-13, lens=Lens(0.0, 900.0))
+        for name, camera in recording.cameras.items()
+    }
+    lines: list[str] = []
+    measure_recording(replace(recording, cameras=near), range(1), [0.0], out, say=lines.append)
+    assert any("1 of 1 frames are there already" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("crop", "shape"), [(Crop(column=10), (60, 62)), (Crop(flip="vertical"), SHAPE), (Crop(rotate=180), SHAPE)]
+)
+def test_a_part_of_the_frames_needs_the_image_size_of_the_calibration(tmp_path, crop, shape):
+    (whole,) = Ring(views=1, arc=(0.0, 120.0), image_size=SHAPE, pixel_pitch=0.06).cameras()
+    tifffile.imwrite(tmp_path / "flow.tif", np.zeros(SHAPE, np.uint16))
+    view = View("left", tmp_path, {"flow": "flow.tif"}, crop)
+    unsized = replace(CalibratedCamera.from_camera(whole), image_size=None)
+    size = " ".join(map(str, shape))
+    with pytest.raises(InputError, match=f"view 'left'.*--image-size {size} for the part, 60 72 for the whole frame"):
+        camera_of(view, unsized, shape)
+    assert camera_of(view, replace(unsized, image_size=shape), shape).image_size == shape
+    assert camera_of(replace(view, crop=Crop()), unsized, SHAPE).image_size == SHAPE
 
 
 @pytest.mark.slow

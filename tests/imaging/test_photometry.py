@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from scipy.ndimage import gaussian_filter
 
 from nerif.imaging.displacement import DisplacementSettings, measure
-from nerif.imaging.photometry import CameraNoise
+from nerif.imaging.photometry import CameraNoise, PicturePair
 from nerif.imaging.warping import warp
+from nerif.techniques.pictures import Pictures
 
 READ, ELECTRONS = 6.0, 3.0  # grey values; electrons a grey value
 
@@ -62,6 +64,16 @@ def test_a_pair_holds_the_pictures_and_their_noise(references):
     inner = (slice(20, -15), slice(15, -15))
     left = (pair.flow - 1.04 * warp(pair.reference, -d))[inner] / pair.sigma[inner]
     assert 0.75 < float(np.sqrt(np.nanmean(left**2))) < 1.15
+
+
+def test_noise_told_by_attributes_of_a_file_is_that_of_a_pair():
+    light, everywhere = scene(), np.ones((90, 100), dtype=bool)
+    reference, flow = exposed(light, 1), exposed(1.2 * light, 2)
+    noise = CameraNoise(READ**2, 1 / ELECTRONS)
+    pair = PicturePair.of(reference, flow, np.zeros((*light.shape, 2)), noise, 1, everywhere, everywhere)
+    maps = {"flow": torch.tensor(flow)[None], "reference": torch.tensor(reference)[None]}
+    told = Pictures.completed(maps, {"read_noise": READ, "electrons_per_grey_value": ELECTRONS})["picture_sigma"]
+    np.testing.assert_allclose(told[0].numpy(), pair.sigma, rtol=0.01)
 
 
 def test_shake_is_taken_from_the_reference():

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
@@ -15,7 +16,7 @@ from nerif.geometry import Grid
 from nerif.reconstruction import descent, kernels_numba, kernels_torch
 from nerif.reconstruction import voxels as voxels_module
 from nerif.reconstruction.base import Reconstruction, State, Step
-from nerif.reconstruction.files import read_field, read_state, write_field, write_state
+from nerif.reconstruction.files import CHECKPOINT, read_field, read_state, write_field, write_state
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate
@@ -74,6 +75,16 @@ def test_result_survives_the_disc(fixed, measurement, tmp_path):
     points = Grid(box, (4, 5, 6)).points()
     assert torch.equal(field(points), fixed.field(points))
     assert (box, n_ambient) == (measurement.box, measurement.n_ambient)
+
+
+def test_a_full_disc_is_told_with_the_file(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise SafetensorError("No space left on device (os error 28)")
+
+    monkeypatch.setattr("safetensors.torch.save_file", full)
+    with pytest.raises(OSError, match=r"cannot be written .No space left on device") as refused:
+        write_state(tmp_path, State({}, {}))
+    assert refused.value.filename == str(tmp_path / CHECKPOINT)
 
 
 def test_gauge_is_zero_on_the_ambient_faces(measurement):

@@ -333,12 +333,22 @@ def test_the_noise_of_pictures_may_be_told_by_attributes(tmp_path, taken):
     dataset = replace(taken, maps=plain).to_dataset()
     dataset.attrs |= {"read_noise": 10.0, "electrons_per_grey_value": [2.0, 4.0, 4.0, 4.0]}
     read = Measurement.from_dataset(dataset)
-    flow = taken.maps["flow"]
-    each = torch.tensor([2.0, 4, 4, 4])[:, None, None]
-    assert torch.allclose(read.maps["picture_sigma"], (100 + flow.clamp(min=0) / each).sqrt())
+    sigma = read.maps["picture_sigma"]
+    both = (taken.maps["flow"] + taken.maps["reference"]).clamp(min=0).mean(dim=(1, 2))  # as bright as each other
+    each = torch.tensor([2.0, 4, 4, 4])
+    assert torch.allclose(sigma.square().mean(dim=(1, 2)), 200 + both / each, rtol=0.02)
+    assert float(sigma.std() / sigma.mean()) < 0.3  # a mean over dots, that does not choose among pixels
     dataset.attrs["read_noise"] = [1.0, 2.0]
     with pytest.raises(InputError, match="attribute read_noise: expected a number, or one for each of 4 views"):
         Measurement.from_dataset(dataset)
+
+
+def test_noise_told_by_attributes_has_rounding_in_it_and_no_gaps(taken):
+    flow, reference = (taken.maps[name].clone() for name in ("flow", "reference"))
+    flow[0, :3], reference[1, 5:9, 5:9] = math.nan, math.nan
+    sigma = Pictures.completed({"flow": flow, "reference": 2 * reference}, {"read_noise": 0})["picture_sigma"]
+    assert torch.equal(sigma.isfinite(), flow.isfinite())
+    assert torch.allclose(sigma[2:], torch.tensor(math.sqrt(1.25 / 12)), rtol=0.01)  # half the gain: a quarter
 
 
 def test_what_is_missing_is_told(taken, balls):

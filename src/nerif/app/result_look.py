@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from html import escape
+from itertools import pairwise
+from statistics import median
 from typing import Any
 
 from nicegui import ui
@@ -24,6 +27,7 @@ from nerif.volume import Volume, describe
 __all__ = ["ResultLook"]
 
 PLAY_EVERY = 0.25  # seconds a frame
+CLOSE = 0.5 + 1e-6  # of the time between frames: instants that are compared are no farther apart
 
 
 class ResultLook:
@@ -152,7 +156,7 @@ class ResultLook:
         other = self._open(against)
         if quantity not in other.quantities:
             raise InputError(f"{against}: there is no {describe(quantity)[1]} in it to compare with")
-        second = other.volume(quantity, other.frames[min(step, len(other.frames) - 1)])
+        second = other.volume(quantity, self._at(other, against, step))
         beside = other.limits(quantity)
         limits = min(limits[0], beside[0]), max(limits[1], beside[1])
         grid = common_grid(first, second)
@@ -167,6 +171,20 @@ class ResultLook:
             return panels, ""
         shape = " × ".join(str(n) for n in grid.shape[::-1])
         return panels, f"The grids differ: both are shown on {shape} voxels (x, y, z), trilinear between theirs."
+
+    def _at(self, other: Source, against: str, step: int) -> int:
+        """The frame of another source at the instant of a step."""
+        source = self.source
+        assert source is not None
+        now = source.times[source.frames[step]]
+        nearest = min(other.frames, key=lambda frame: abs(other.times[frame] - now))
+        if abs(other.times[nearest] - now) > CLOSE * min(_interval(source.times), _interval(other.times)):
+            at, closest = (f"{time * 1e3:.4g} ms" for time in (now, other.times[nearest]))
+            raise InputError(
+                f"{against}: expected a frame at {at} to compare with, got {closest} as the nearest that is done; "
+                "choose another instant"
+            )
+        return nearest
 
     # -- in three dimensions -------------------------------------------------------------------------------------
 
@@ -183,7 +201,8 @@ class ResultLook:
         view = SurfaceView(quantity, _unit(volume), limits, level, volume.grid.box)
         shown = [self._shown(self.name, self.frame)]
         if against:
-            shown.append(self._shown(against, self.frame if against.endswith(".zarr") else 0))
+            other = await self.work.beside(self._open, against)
+            shown.append(self._shown(against, self._at(other, against, self.step)))
         view.show(shown)
 
     def _surface(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
@@ -195,6 +214,11 @@ class ResultLook:
         path = self.work.project.path(name)
         file = path / ("zarr.json" if path.suffix == ".zarr" else VOLUME)
         return Surface(name, frame, file.stat().st_mtime_ns if file.is_file() else 0)
+
+
+def _interval(times: Sequence[float]) -> float:
+    """The time between frames; infinite of a single one."""
+    return median(b - a for a, b in pairwise(times)) if len(times) > 1 else math.inf
 
 
 def _unit(volume: Volume) -> str:

@@ -21,7 +21,8 @@ offset = -500.0                         # mm
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,8 +36,8 @@ from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, pr
 from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = [
-    "FORMAT", "CalibratedCamera", "check_model", "checked", "five", "flat", "image_size", "numbers", "plane",
-    "read_box", "read_cameras", "upright", "write_cameras",
+    "FORMAT", "CalibratedCamera", "check_distortion", "check_model", "check_names", "checked", "five", "flat",
+    "image_size", "numbers", "plane", "read_box", "read_cameras", "upright", "write_cameras",
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
@@ -44,6 +45,7 @@ KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotatio
         "aperture_diameter", "focus_distance", "pose_sigma")  # fmt: skip
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
 """Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
+LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)", re.IGNORECASE)  # no undistorted pictures, no distances
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,38 @@ def check_model(model: Any, where: str) -> None:
         )
 
 
+def check_distortion(given: Iterable[str], used: Collection[str], names: Sequence[str], where: str) -> None:
+    """Refuse keys that look like distortion coefficients and are not read.
+
+    Parameters
+    ----------
+    given : keys of a file
+    used : those that are read
+    names : what the coefficients may be called, with or without a number behind
+
+    Raises
+    ------
+    InputError
+        If there is one: without its coefficients the rays would be bent wrongly.
+    """
+    for key in given:
+        if key not in used and (key.rstrip("0123456789") in names or LIKE_DISTORTION.search(key)):
+            raise InputError(
+                f"{where}: expected distortion coefficients as one of {', '.join(names)}, got '{key}', which is not "
+                "read; rename it, or take it out of the file"
+            )
+
+
+def check_names(cameras: Sequence[CalibratedCamera], where: str) -> None:
+    """Refuse two cameras of one name; InputError naming it and where they are from."""
+    names = [camera.name for camera in cameras]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"{where}: expected cameras of different names, got {names.count(name)} named '{name}'; rename them"
+            )
+
+
 def five(values: Any, where: str) -> Tensor:
     """Return OpenCV's five coefficients of 4 to 14; InputError if those beyond are not 0, or one is no number."""
     given = flat(values, where)
@@ -268,9 +302,7 @@ def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise InputError(f"{path}: expected at least one table [[camera]], got none")
     cameras = tuple(_camera(t, i, str(path)) for i, t in enumerate(tables))
-    names = [c.name for c in cameras]
-    if len(set(names)) < len(names):
-        raise InputError(f"{path}: expected cameras of different names, got {', '.join(names)}")
+    check_names(cameras, str(path))
     return cameras
 
 

@@ -16,7 +16,7 @@ import torch
 from nerif.conventions import InputError
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
-from nerif.imaging.cameras_file import CalibratedCamera, checked, read_box
+from nerif.imaging.cameras_file import CalibratedCamera, check_names, checked, read_box
 from nerif.imaging.matlab import read_matlab
 from nerif.imaging.nerfstudio import read_transforms
 from nerif.imaging.opencv import ENDINGS as OPENCV
@@ -43,10 +43,11 @@ class ImportSettings:
     image_size: tuple[int, int] | None = None
     """Height and width of the pictures where the file does not say, px."""
     aperture_diameter: float | None = None
-    """Of the entrance pupils (focal length over f-number), mm, through all of which a pixel then sees; of telecentric
-    lenses of the cone where it passes z_cam = 0, which calibration has at the origin. From target pictures too."""
+    """Of the entrance pupils (focal length over f-number), mm, through all of which a pixel then sees; 0 for thin rays,
+    whatever the file says; of telecentric lenses of the cone where it passes z_cam = 0, which calibration has at the
+    origin. From target pictures too."""
     focus_distance: float | None = None
-    """Where the lenses are focused, mm along the optical axis; default: on the background."""
+    """Where the lenses are focused, mm along the optical axis; default: as the file says, or on the background."""
     pose_sigma_mm: float | None = None
     """How far a camera may stand from where its calibration has it, mm (standard deviation; reconstruct --refine goes
     by it); of target pictures beside their noise, 0.05 by default; 1 with --simple."""
@@ -76,7 +77,7 @@ class ImportSettings:
 
     @property
     def lens(self) -> Lens | None:
-        """The lens of every camera, or None for what the file says."""
+        """The lens that is given, of every camera; None for none, or thin rays."""
         lens = Lens(self.aperture_diameter or 0.0, self.focus_distance)
         return lens if lens.diameter else None
 
@@ -104,8 +105,8 @@ def import_cameras(
     Raises
     ------
     InputError
-        If it cannot be read, or `only` names a camera that is not there; names the file, what was expected and what
-        came.
+        If it cannot be read, two cameras have one name, or `only` names a camera that is not there; names the file,
+        what was expected and what came.
     """
     path = Path(path)
     if not path.exists():
@@ -120,6 +121,7 @@ def import_cameras(
         raise InputError(f"{path}: expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'")
     if not cameras:
         raise InputError(f"{path}: holds no camera")
+    check_names(cameras, str(path))
     for name in only:
         if name not in [c.name for c in cameras]:
             raise InputError(f"views: expected some of {', '.join(c.name for c in cameras)}, got '{name}'")
@@ -141,11 +143,15 @@ def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box |
     return Box((a, b, c), (d, e, f))
 
 
-def _scaled(lens: Lens | None, scale: float) -> Lens | None:
-    """A lens in mm, of lengths in another unit."""
-    if lens is None:
-        return None
-    return replace(lens, diameter=scale * lens.diameter, focus=None if lens.focus is None else scale * lens.focus)
+def _lens(lens: Lens | None, settings: ImportSettings) -> Lens | None:
+    """The lens of a file in mm; what is given wins, the rest stays."""
+    given, scale = settings.lens, settings.scale_mm
+    if lens is None or settings.aperture_diameter == 0:
+        return given
+    own = replace(lens, diameter=scale * lens.diameter, focus=None if lens.focus is None else scale * lens.focus)
+    if given is None:
+        return own
+    return replace(own, diameter=given.diameter, focus=own.focus if given.focus is None else given.focus)
 
 
 def _completed(camera: CalibratedCamera, settings: ImportSettings) -> CalibratedCamera:
@@ -172,6 +178,6 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
         translation=scale * camera.translation,
         image_size=camera.image_size or settings.image_size,
         background=plane,
-        lens=settings.lens or _scaled(camera.lens, scale),
+        lens=_lens(camera.lens, settings),
         pose_sigma=sigma,
     )

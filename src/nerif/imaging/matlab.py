@@ -18,6 +18,7 @@ cameraMatrix and rotationVectorToMatrix (before).
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,24 @@ import numpy as np
 import torch
 
 from nerif.conventions import InputError
-from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, flat, image_size, numbers, upright
+from nerif.imaging.cameras_file import (
+    CalibratedCamera,
+    check_distortion,
+    check_model,
+    five,
+    flat,
+    image_size,
+    numbers,
+    upright,
+)
 
 __all__ = ["read_matlab"]
 
 EXPORT = "in MATLAB run  s = toStruct(params); save('plain.mat', '-struct', 's')  and give plain.mat"
 TOOLBOX = ("IntrinsicMatrix", "RadialDistortion", "RotationVectors", "RotationMatrices")
 """Fields that tell a struct of the toolbox from plain arrays."""
+DISTORTION = ("distortion", "dist", "dist_coeffs", "distCoeffs", "kc", "D")
+"""What the coefficients beside plain K, R, t may be called."""
 
 
 def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
@@ -100,8 +112,20 @@ def _cameras(content: dict[str, Any], name: str, path: Path, pose: int) -> list[
         return [_toolbox(content, name, f"{path}: {name}", pose)]
     if "K" in content:
         return _plain_cameras(content, name, path)
-    structs = {k: v for k, v in content.items() if isinstance(v, dict)}
-    return [camera for key, own in structs.items() for camera in _cameras(own, key, path, pose)]
+    structs = {k: _cameras(v, k, path, pose) for k, v in content.items() if isinstance(v, dict)}
+    names = [camera.name for own in structs.values() for camera in own]
+    cameras = [
+        replace(camera, name=f"{key}_{camera.name}") if names.count(camera.name) > 1 else camera
+        for key, own in structs.items()
+        for camera in own
+    ]
+    worlds = [c.name for c in cameras if c.name not in names and not bool(c.translation.any())]
+    if len(worlds) > 1:
+        raise InputError(
+            f"{path}: expected cameras in one world frame, got {', '.join(worlds)}, each the origin of its own; give "
+            "stereoParameters with the poses of target pictures, the same for all"
+        )
+    return cameras
 
 
 # -- MATLAB's own toolbox ------------------------------------------------------------------------------------------
@@ -209,7 +233,7 @@ def _plain_cameras(content: dict[str, Any], name: str, path: Path) -> list[Calib
     if rotation.ndim == 2:
         return [_plain(content, name, path)]
     count = rotation.shape[-1]
-    single = {"K": 2, "R": 2, "t": 1, "T": 1, "distortion": 1, "D": 1, "image_size": 1}
+    single = {"K": 2, "R": 2, "t": 1, "T": 1, **dict.fromkeys(DISTORTION, 1), "image_size": 1}
     cameras = []
     for i in range(count):
         own = {}
@@ -227,11 +251,13 @@ def _plain(content: dict[str, Any], name: str, path: Path) -> CalibratedCamera:
     translation = content.get("t", content.get("T"))
     if "R" not in content or translation is None:
         raise InputError(f"{where}: expected R and t beside K, got {', '.join(content)}")
+    known = next((key for key in DISTORTION if key in content), "")
+    check_distortion(content, (known,), DISTORTION, where)
     return CalibratedCamera(
         name=name,
         intrinsics=upright(np.asarray(content["K"]).tolist(), f"{where}: K"),
         rotation=numbers(np.asarray(content["R"]).tolist(), (3, 3), f"{where}: R"),
         translation=numbers(np.ravel(translation).tolist(), (3,), f"{where}: t"),
-        distortion=five(content.get("distortion", content.get("D", [])), f"{where}: distortion"),
+        distortion=five(content.get(known, []), f"{where}: {known or 'distortion'}"),
         image_size=_size(content, "image_size", where),
     )

@@ -159,10 +159,17 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
             f"view '{view.name}': its camera has no background plane, which displacements need; calibrate it with a "
             "target laid on the background, or give nerif calibrate --background-distance"
         )
+    crop, frame = view.crop, view.open("flow").shape
+    turned = crop is not None and bool(crop.flip or crop.rotate)
+    if calibrated.image_size is None and crop is not None and (turned or frame != shape):
+        raise InputError(
+            f"view '{view.name}': its pictures are a part of their frames, or turned (views.toml), and its camera has "
+            "no image size, so it does not show whether it was calibrated with the same part; give it one: nerif "
+            f"calibrate FILE --image-size {shape[0]} {shape[1]} for the part, {frame[0]} {frame[1]} for the whole frame"
+        )
     if calibrated.image_size in (None, shape):
         return calibrated.camera(image_size=shape)
-    crop = view.crop
-    if crop is not None and calibrated.image_size == view.open("flow").shape and not crop.flip and not crop.rotate:
+    if crop is not None and calibrated.image_size == frame and not turned:
         return calibrated.camera().view(crop.row, crop.column, *shape)
     raise InputError(
         f"view '{view.name}': its pictures have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from nerif.conventions import InputError
-from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, image_size, numbers
+from nerif.imaging.cameras_file import CalibratedCamera, check_distortion, check_model, five, image_size, numbers
 
 __all__ = ["read_transforms"]
 
@@ -49,6 +49,7 @@ def _camera(given: dict[str, Any], i: int, where: str) -> CalibratedCamera:
     given = {key: value for key, value in given.items() if value is not None}
     for model in (given.get("camera_model", "perspective"), *(k for k in OTHER_MODELS if given.get(k))):
         check_model(model, where)
+    check_distortion(given, COEFFICIENTS, COEFFICIENTS, where)
 
     def number(key: str) -> float:
         return float(numbers(given[key], (), f"{where}: {key}"))

@@ -9,17 +9,27 @@ from typing import Any
 import numpy as np
 
 from nerif.conventions import InputError
-from nerif.imaging.cameras_file import CalibratedCamera, check_model, five, flat, image_size, numbers, upright
+from nerif.imaging.cameras_file import (
+    CalibratedCamera,
+    check_distortion,
+    check_model,
+    five,
+    flat,
+    image_size,
+    numbers,
+    upright,
+)
 
 __all__ = ["ENDINGS", "read_opencv", "read_opencv_folder"]
 
 ENDINGS = (".yml", ".yaml", ".xml")
 WORDS = {
     "intrinsics": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsics", "K", "M"),
-    "distortion": ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "distortion", "dist", "D"),
+    "distortion": ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs", "dist_coeff",
+                   "distortion", "dist", "kc", "D"),
     "rotation": ("rotation_matrix", "rotation", "rvec", "R", "om"),
     "translation": ("translation_vector", "translation", "tvec", "T", "t"),
-}
+}  # fmt: skip
 
 
 MODELS = ("camera_model", "distortion_model", "calibration_model")
@@ -31,11 +41,18 @@ def read_opencv_folder(folder: Path) -> list[CalibratedCamera]:
     files = sorted(p for p in folder.iterdir() if p.suffix in ENDINGS)
     if not files:
         raise InputError(f"{folder}: expected OpenCV files ({' '.join(ENDINGS)}), one a camera, found none")
-    cameras = []
+    cameras: dict[str, CalibratedCamera] = {}
+    origins: dict[str, Path] = {}
     for file in files:
         own = read_opencv(file)
-        cameras += [replace(own[0], name=file.stem)] if len(own) == 1 else own
-    return cameras
+        for camera in [replace(own[0], name=file.stem)] if len(own) == 1 else own:
+            if camera.name in cameras:
+                raise InputError(
+                    f"{file}: expected cameras of different names, got '{camera.name}' here and in "
+                    f"{origins[camera.name].name}; rename one, or take its file out of the folder"
+                )
+            cameras[camera.name], origins[camera.name] = camera, file
+    return list(cameras.values())
 
 
 def read_opencv(path: Path) -> list[CalibratedCamera]:
@@ -52,11 +69,11 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
     values: dict[str, Any] = {}
     for key in keys:
         node = storage.getNode(key)
-        number = node.real() if node.isReal() or node.isInt() else None
         try:
-            values[key] = node.mat() if node.isMap() else node.string() if node.isString() else number
+            value = node.mat() if node.isMap() else _plain(node)
         except cv2.error as error:
             raise InputError(f"{path}: {key}: expected a matrix as FileStorage writes it ({error.err})") from None
+        values[key] = np.asarray(value, dtype=object) if isinstance(value, list) else value  # rows of any lengths
     storage.release()
     for key in MODELS:
         if values.get(key) is not None:
@@ -65,8 +82,11 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
         if np.any(values.get(key)):
             check_model(key, str(path))
 
+    def key_of(what: str, suffix: str) -> str:
+        return next((w + suffix for w in WORDS[what] if values.get(w + suffix) is not None), "")
+
     def find(what: str, suffix: str) -> Any:
-        return next((values[w + suffix] for w in WORDS[what] if values.get(w + suffix) is not None), None)
+        return values.get(key_of(what, suffix))
 
     suffixes = [s for s in ("", *map(str, range(1, 33))) if find("intrinsics", s) is not None]
     if not suffixes:
@@ -75,7 +95,8 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
             f"several cameras), got {', '.join(keys)}"
         )
     size = _size(values, str(path))
-    stereo = suffixes == ["1", "2"] and find("rotation", "2") is None
+    check_distortion(keys, {*(key_of("distortion", s) for s in suffixes), *MODELS}, WORDS["distortion"], str(path))
+    stereo = suffixes == ["1", "2"] and find("translation", "2") is None  # R1 and R2 may be stereoRectify's
     cameras = []
     for suffix in suffixes:
         where = f"{path}: camera {suffix or 1}"
@@ -104,6 +125,15 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
             )
         )
     return cameras
+
+
+def _plain(node: Any) -> Any:
+    """The number, text or sequence of a node; None of any other."""
+    if node.isSeq():
+        return [_plain(node.at(i)) for i in range(node.size())]
+    if node.isString():
+        return node.string()
+    return node.real() if node.isReal() or node.isInt() else None
 
 
 def _size(values: dict[str, Any], where: str) -> tuple[int, int] | None:

@@ -8,15 +8,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from nerif.conventions import InputError
+from nerif.geometry import Camera, Lens
 from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.measuring import Recording, RestingView
 from nerif.imaging.views import View
 from nerif.imaging.workers import work
 from nerif.measurement import Measurement
+from nerif.measurement_file import from_dataset
 from nerif.measurement_sequence import MeasurementSequence
 
 __all__ = ["RestingRecording", "frame_numbers", "instants_of", "measure_recording"]
+
+ROUNDING = 1e-9  # of the largest number of what is compared
 
 
 @dataclass(frozen=True)
@@ -138,7 +145,7 @@ def measure_recording(
     numbers : of the flow pictures
     times : when they were taken, s
     out : Zarr store, made if it is not there
-    settings : kept in the store; a store begun with others is refused
+    settings : kept in the store; a store begun with others, or with other cameras, is refused
     force : begin anew
     say : is told what had to be left out, and why
     on_step : called with the number of views whose references were looked at, plus the frames done
@@ -147,12 +154,14 @@ def measure_recording(
     Raises
     ------
     InputError
-        If the store was begun with other settings, a view has no reference, or no frame can be used in every view.
+        If the store was begun with other settings or cameras, a view has no reference, or no frame can be used in
+        every view.
     """
     wanted = json.loads(json.dumps({**(settings or {}), "frames": [numbers.start, numbers.stop]}, default=str))
     sequence = _begun(out, wanted) if out.exists() and not force else None
     resting = RestingRecording.of(recording, say, on_step, processes)
     if sequence is not None:
+        _check_cameras(out, [view.camera for view in resting.views])
         there = sum(map(sequence.is_written, range(len(numbers))))
         say(f"{out}: {there} of {len(numbers)} frames are there already")
     else:
@@ -179,6 +188,45 @@ def _begun(out: Path, wanted: dict[str, Any]) -> MeasurementSequence:
     if zarr.open_group(out, mode="r").attrs.get("displacement") != wanted:
         raise InputError(f"{out}: exists already, made with other settings; give another --out, or --force")
     return sequence
+
+
+def _check_cameras(out: Path, cameras: Sequence[Camera]) -> None:
+    """Refuse to go on with a store of other cameras."""
+    import xarray as xr
+
+    with xr.open_dataset(out, engine="zarr", chunks=None, consolidated=False, decode_times=False) as dataset:
+        kept = {c.name: c for c in from_dataset(dataset.isel(time=0, row=slice(1), column=slice(1)))["cameras"]}
+    names = [camera.name for camera in cameras]
+    other = [f"views ({', '.join(kept)})"] if set(names) != set(kept) else []
+    for camera in cameras if not other else ():
+        there = _numbers(kept[camera.name])
+        for what, value in _numbers(camera).items():
+            near = ROUNDING * float(value.nan_to_num().abs().max())
+            if not torch.allclose(value, there[what], rtol=0, atol=near, equal_nan=True):
+                other.append(f"{what} of view '{camera.name}'")
+    if other:
+        raise InputError(
+            f"{out}: expected the cameras that the store was begun with, got other {other[0]}; was the calibration "
+            "made anew? Give another --out, or --force"
+        )
+
+
+def _numbers(camera: Camera) -> dict[str, Tensor]:
+    """What a camera is, as a measurement keeps it."""
+    lens = camera.lens if camera.lens is not None and camera.lens.wide else Lens()
+    sigma = torch.full((6,), torch.nan) if camera.pose_sigma is None else camera.pose_sigma
+    groups: dict[str, Any] = {
+        "image size": camera.image_size,
+        "projection": [camera.projection.shows_depth],
+        "intrinsics": camera.intrinsics,
+        "rotation": camera.rotation,
+        "translation": camera.translation,
+        "distortion": camera.distortion,
+        "background": [*camera.plane.normal.tolist(), camera.plane.offset],
+        "lens": [lens.diameter, torch.nan if lens.focus is None else lens.focus],
+        "pose_sigma": sigma,
+    }
+    return {what: torch.as_tensor(value, dtype=torch.float64) for what, value in groups.items()}
 
 
 def _begin(

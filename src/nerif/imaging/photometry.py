@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nerif.imaging.warping import warp
+from nerif.techniques.pictures import LEAST, around, difference_variance, grey_variance
 
 __all__ = ["CameraNoise", "PicturePair"]
 
@@ -31,9 +32,7 @@ Image = Float[np.ndarray, "row column"]
 CLASSES = 16  # of brightness
 FEWEST = 32  # pixels of one
 GAUSSIAN = 0.4549  # the median of the square of a standard normal variable
-LEAST = 1 / 12  # variance of rounding, grey values squared
 TRIMMED = 0.99  # share of the pixels, those with the least residual, that tell a
-AROUND = 4.0  # px, standard deviation of the window of means
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class CameraNoise:
 
     def variance(self, grey: Image) -> Image:
         """Return the variance of grey values."""
-        return self.read + self.shot * np.maximum(grey, 0)
+        return grey_variance(grey, self.read, self.shot)
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ class PicturePair:
         gain, offset = np.polyfit(moved[good], flow[good], 1)
         left = flow - (gain * moved + offset)
         noise = noise or CameraNoise.of_residual(flow, flow - left, good)
-        variance = _around(noise.variance(flow) + gain**2 * noise.variance(reference) / repeats)
+        variance = difference_variance(flow, reference, noise.read, noise.shot, gain, repeats)
         variance += _of_interpolation(gain * moved, left, d, variance, good)
         seen = np.where(usable, flow, np.nan)
         return cls(reference.astype(np.float32), seen.astype(np.float32), np.sqrt(variance).astype(np.float32))
@@ -135,15 +134,8 @@ def _of_interpolation(
 ) -> Image:  # fmt: skip
     """What interpolation between the pixels of the reference adds to the variance of what is left."""
     steep = np.square(np.gradient(moved.astype(np.float64))).sum(axis=0)
-    share = _around(np.square(d - np.round(d)).sum(axis=-1) * steep)
+    share = around(np.square(d - np.round(d)).sum(axis=-1) * steep)
     squares, shares = left[good].astype(np.float64) ** 2, share[good]
     few = squares <= np.quantile(squares, TRIMMED)
     found = float((squares - variance[good])[few].sum() / max(shares[few].sum(), 1e-12))
     return np.asarray(max(found, 0.0) * share)
-
-
-def _around(squares: Image) -> Image:
-    """Mean over the dots around each pixel."""
-    from scipy.ndimage import gaussian_filter
-
-    return np.asarray(gaussian_filter(squares.astype(np.float64), AROUND))

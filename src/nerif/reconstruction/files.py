@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import time
 from dataclasses import asdict
@@ -128,10 +129,14 @@ def read_state(directory: Path) -> State:
 
 
 def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -> None:
+    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     with atomic(path) as part:
-        save_file(tensors, part, metadata={"nerif": json.dumps(about)})
+        try:
+            save_file(tensors, part, metadata={"nerif": json.dumps(about)})
+        except SafetensorError as error:  # a full disc is no OSError to it
+            raise OSError(errno.EIO, f"cannot be written ({error})", str(path)) from None
 
 
 def _load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,13 +17,24 @@ if TYPE_CHECKING:
 __all__ = ["draw_centre_line", "draw_profiles", "draw_section"]
 
 HEIGHTS = (0.25, 0.5, 0.75)  # shares of the height of the box, of profiles
-WIDE = TAILS["p95"]  # standard deviations on either side of a band of 90 %
 
 
 def _shown(meridian: Meridian, quantity: str) -> np.ndarray:
     """The values as they are shown: n as n - 1."""
     values = meridian.quantities[quantity]
-    return values - 1 if quantity == "n" else values
+    return values - 1 if quantity in ("n", "n_mean") else values
+
+
+def _banded(meridian: Meridian, quantity: str) -> Meridian:
+    """The `line` of a quantity, of an ensemble its mean; `low` and `high`, which hold 90 %, where it has deviations."""
+    known = meridian.quantities
+    mean, std = f"{quantity}_mean", f"{quantity}_std"
+    found = {"line": _shown(meridian, mean if mean in known else quantity)}
+    if std in known:
+        for name, (percentile, deviations) in zip(("low", "high"), TAILS.items(), strict=True):
+            end = known.get(f"{quantity}_{percentile}")
+            found[name] = found["line"] + deviations * known[std] if end is None else end
+    return replace(meridian, quantities=found)
 
 
 def draw_section(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
@@ -44,15 +56,13 @@ def draw_section(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
 
 def draw_profiles(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
     """Draw a quantity over r at three heights, with bands that hold 90 % where there are standard deviations."""
-    span = meridian.h[-1] - meridian.h[0]
-    std = f"{quantity}_std"
+    span, drawn = meridian.h[-1] - meridian.h[0], _banded(meridian, quantity)
     for share, colour in zip(HEIGHTS, (COLOURS["blue"], COLOURS["orange"], COLOURS["green"]), strict=True):
         height = meridian.h[0] + share * span
-        line = meridian.profile(quantity, height) - (quantity == "n")
-        axes.plot(meridian.r, line, color=colour, lw=1, label=f"h = {height:z.1f} mm")
-        if std in meridian.quantities:
-            beside = WIDE * meridian.profile(std, height)
-            axes.fill_between(meridian.r, line - beside, line + beside, color=colour, alpha=0.25, lw=0)
+        lines = {name: drawn.profile(name, height) for name in drawn.quantities}
+        axes.plot(meridian.r, lines["line"], color=colour, lw=1, label=f"h = {height:z.1f} mm")
+        if "low" in lines:
+            axes.fill_between(meridian.r, lines["low"], lines["high"], color=colour, alpha=0.25, lw=0)
     axes.set_xlabel("r [mm]")
     axes.set_ylabel(label_of(quantity))
     axes.legend(frameon=False)
@@ -60,13 +70,13 @@ def draw_profiles(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
 
 
 def draw_centre_line(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
-    """Draw a quantity on the axis, with a band that holds 90 % where there are standard deviations."""
+    """Draw a quantity over h at r = 0, with a band that holds 90 % where there are standard deviations."""
     middle = int(np.abs(meridian.r).argmin())
-    line = _shown(meridian, quantity)[:, middle]
-    axes.plot(meridian.h, line, color=COLOURS["blue"], lw=1)
-    if f"{quantity}_std" in meridian.quantities:
-        beside = WIDE * meridian.quantities[f"{quantity}_std"][:, middle]
-        axes.fill_between(meridian.h, line - beside, line + beside, color=COLOURS["blue"], alpha=0.25, lw=0)
+    lines = {name: values[:, middle] for name, values in _banded(meridian, quantity).quantities.items()}
+    axes.plot(meridian.h, lines["line"], color=COLOURS["blue"], lw=1)
+    if "low" in lines:
+        axes.fill_between(meridian.h, lines["low"], lines["high"], color=COLOURS["blue"], alpha=0.25, lw=0)
     axes.set_xlabel("h [mm]")
-    axes.set_ylabel(f"{label_of(quantity)} on the axis")
+    where = "on the axis" if meridian.axial else f"at r = {meridian.r[middle]:z.1f} mm"
+    axes.set_ylabel(f"{label_of(quantity)} {where}")
     return axes

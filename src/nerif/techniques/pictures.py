@@ -30,11 +30,13 @@ from nerif.techniques.base import ForwardModel, Light, Weights
 from nerif.techniques.deflection import LeverArm
 from nerif.techniques.warped import References
 
-__all__ = ["LinearPictures", "Pictures"]
+__all__ = ["LEAST", "LinearPictures", "Pictures", "around", "difference_variance", "grey_variance"]
 
 GUESS = "displacement_guess"
 """Map of what the displacement is about, px: where to begin, and where to be linear."""
-
+LEAST = 1 / 12
+"""Variance of rounding, grey values squared."""
+AROUND = 4.0  # px, standard deviation of the window of means
 
 FEWEST = 256  # pixels that show whether there is a pattern
 PATCHES, LARGEST_PATCH = 64, 4
@@ -158,10 +160,10 @@ class Pictures(LeverArm):
     def completed(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the maps, with picture_sigma by the noise of the cameras where a file tells that instead.
 
-        sigma^2 = read_noise^2 + max(flow, 0) / electrons_per_grey_value
+        That of `difference_variance`, read = read_noise^2 and shot = 1 / electrons_per_grey_value, by one reference.
         """
         names, otherwise = ("read_noise", "electrons_per_grey_value"), (0.0, math.inf)
-        if cls.sigma in maps or not any(name in attributes for name in names):
+        if cls.sigma in maps or "reference" not in maps or not any(name in attributes for name in names):
             return dict(maps)
         views, of_view = len(maps[cls.measured]), []
         for name, default in zip(names, otherwise, strict=True):
@@ -169,8 +171,13 @@ class Pictures(LeverArm):
             good = value.dtype.kind in "fiu" and value.shape in ((), (1,), (views,))
             if not good or not bool(np.all(value > 0 if name == names[1] else value >= 0)):
                 raise InputError(f"attribute {name}: expected a number, or one for each of {views} views, got {value}")
-            of_view.append(torch.tensor(value, dtype=torch.float32).expand(views)[:, None, None])
-        return {**maps, cls.sigma: (of_view[0].square() + maps[cls.measured].clamp(min=0) / of_view[1]).sqrt()}
+            of_view.append(np.broadcast_to(value.astype(np.float64), (views,)))
+        sigma = torch.full_like(maps[cls.measured], math.nan)
+        for i, (flow, reference) in enumerate(zip(maps[cls.measured], maps["reference"], strict=True)):
+            one, other, read, electrons = flow.numpy(), reference.numpy(), of_view[0][i], of_view[1][i]
+            variance = difference_variance(one, other, read**2, 1 / electrons, _gain(one, other))
+            sigma[i] = torch.where(flow.isfinite(), torch.from_numpy(variance).sqrt().to(flow), math.nan)
+        return {**maps, cls.sigma: sigma}
 
     @classmethod
     def softened(
@@ -293,3 +300,46 @@ def _of_patches(rays: Rays, pixels: int) -> tuple[Tensor, Float[Tensor, "m 2"]]:
     row, column = torch.meshgrid(within, within, indexing="ij")
     pixel = corner[:, None] + torch.stack([column, row], dim=-1).reshape(-1, 2)
     return rays.view.repeat_interleave(pixels), pixel.reshape(-1, 2)
+
+
+def grey_variance(grey: Float[np.ndarray, "row column"], read: float, shot: float) -> Float[np.ndarray, "row column"]:
+    """Return the variance of grey values: read + shot max(grey, 0), and read no less than that of rounding."""
+    return max(read, LEAST) + shot * np.maximum(grey, 0)
+
+
+def difference_variance(
+    flow: Float[np.ndarray, "row column"],
+    reference: Float[np.ndarray, "row column"],
+    read: float,
+    shot: float,
+    gain: float,
+    repeats: int = 1,
+) -> Float[np.ndarray, "row column"]:
+    """Return <var(flow) + gain^2 var(reference) / repeats>, the mean over the dots around each pixel.
+
+    Parameters
+    ----------
+    flow, reference : grey values; NaN where not known
+    read, shot : variance without light, grey values squared, and what a grey value adds, grey values
+    gain : factor that makes the reference as bright as the flow picture
+    repeats : pictures that the reference is the mean of
+    """
+    return around(grey_variance(flow, read, shot) + gain**2 * grey_variance(reference, read, shot) / repeats)
+
+
+def around(squares: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
+    """Return the mean over the dots around each pixel, of what is known; NaN where nothing is."""
+    from scipy.ndimage import gaussian_filter
+
+    squares, known = squares.astype(np.float64), np.isfinite(squares)
+    if bool(known.all()):
+        return np.asarray(gaussian_filter(squares, AROUND))
+    total, share = (gaussian_filter(x, AROUND) for x in (np.where(known, squares, 0.0), known.astype(np.float64)))
+    return np.where(share > 1e-6, total / np.maximum(share, 1e-6), np.nan)
+
+
+def _gain(flow: Float[np.ndarray, "row column"], reference: Float[np.ndarray, "row column"]) -> float:
+    """How much more contrast the flow picture has than the reference; 1 where that cannot be told."""
+    both = np.isfinite(flow) & np.isfinite(reference)
+    spread = float(reference[both].std()) if bool(both.any()) else 0.0
+    return float(flow[both].std()) / spread if spread > 0 else 1.0
