@@ -61,6 +61,7 @@ LONGEST = ("test_style", "pictures", "films", "report", "test_cluster", "test_co
 
 
 WHOLE = ("test_cli", "test_docs", "test_examples", "test_workflow", "sequence", "mutation", "benchmarks", "report")
+WHOLE += ("app", "test_first_look", "test_halves", "test_convergence", "test_refined_rig", "test_residuals")
 """Files and folders of tests that run whole commands: what these call is checked call by call in the other tests."""
 
 

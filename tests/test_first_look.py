@@ -103,6 +103,7 @@ def test_views_may_be_called_none():
     assert kept_out(("a",), ("a", "b")) == ("a",)
 
 
+@pytest.mark.slow
 def test_interrupted_in_the_short_run(measurement, whole, tmp_path):
     """What it has found is there to look at, its view marked as not seen; --resume ends as if nothing had been."""
     broken = ResultDirectory(tmp_path / "broken")

@@ -25,7 +25,7 @@ def measurement():
     return Simulation(phantom="gaussians", truth_voxels=6)(RING.cameras())[0]
 
 
-METHODS = [NeRIF(max_steps=10, points_per_batch=256), Tikhonov(voxels=8, iterations=10)]
+METHODS = [NeRIF(max_steps=10, points_per_batch=256), Tikhonov(voxels=8, iterations=10, regularisation=0.1)]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=["nerif", "voxels"])

@@ -151,7 +151,7 @@ def test_the_best_cycle_is_kept_with_the_rig_it_had(measurement, monkeypatch):
     assert not torch.equal(kept, last[:, : kept.shape[1]])
 
 
-@pytest.mark.parametrize("interrupted", [False, True])
+@pytest.mark.parametrize("interrupted", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_best_cycle_is_kept(measurement, monkeypatch, interrupted):
     """A cycle that the rays held back like less than the one before gives it back, one that was broken off too."""
     errors, fields = itertools.chain([2.0], itertools.repeat(3.0)), []

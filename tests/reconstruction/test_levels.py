@@ -74,6 +74,7 @@ def test_coarse_grids_and_bins_change_the_way_and_not_the_end(flame):
     assert float((a - b).norm() / b.norm()) < 5e-3
 
 
+@pytest.mark.slow
 def test_bins_bring_no_noise_into_a_field_that_is_regularised_by_stopping_alone(flame):
     truth = make_phantom("flame", flame.box, 0).sample(Grid.of_resolution(flame.box, 24))
     noise = 0.4 * torch.randn(flame.displacement.shape, generator=torch.Generator().manual_seed(1))

@@ -67,7 +67,9 @@ def problem() -> Problem:
     return Problem(operators, target)
 
 
-@pytest.mark.parametrize("kind", Penalty.KINDS)
+@pytest.mark.parametrize(
+    "kind", [k if k == "gradient" else pytest.param(k, marks=pytest.mark.slow) for k in Penalty.KINDS]
+)
 def test_the_minimum_is_the_same_and_found_in_fewer_iterations(problem, kind, monkeypatch):
     weight = {"identity": 1e-2, "gradient": 1e-3, "laplacian": 1e-6}[kind]
 

@@ -131,7 +131,7 @@ def test_no_bounded_iterate_is_worse_than_the_one_before(measurement):
     assert path[30] < 1.01 * path[-1]
 
 
-@pytest.mark.parametrize("momentum", [False, True])
+@pytest.mark.parametrize("momentum", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_landweber_comes_to_the_least_residual(problem, momentum):
     matrix = columns(problem.forward, SHAPE)
     right = problem.data.numpy().ravel()

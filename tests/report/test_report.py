@@ -142,7 +142,7 @@ def test_pictures_of_views_share_their_scales(whole):
     assert all(address.startswith("data:image/png") for v in views for row in v.rows.values() for address in row)
 
 
-QUICK = [("gone", "run.toml"), ("truncated", "reprojection.nc"), ("nonsense", "volume.nc")]
+QUICK = [("gone", "run.toml"), ("nonsense", "volume.nc")]
 BROKEN = [(how, name) for how in ("gone", "truncated", "nonsense") for name in PARTS]
 
 
@@ -284,9 +284,9 @@ def test_a_truth_that_moved_with_the_result_is_found(copy):
     ("name", "text", "words"),
     [
         ("metrics.json", '{"views": [1]}', "views"),
-        ("metrics.json", '{"ensemble": 2}', "ensemble"),
-        ("metrics.json", '{"coverage": {}}', "coverage"),
-        ("metrics.json", "[]", "table"),
+        pytest.param("metrics.json", '{"ensemble": 2}', "ensemble", marks=pytest.mark.slow),
+        pytest.param("metrics.json", '{"coverage": {}}', "coverage", marks=pytest.mark.slow),
+        pytest.param("metrics.json", "[]", "table", marks=pytest.mark.slow),
         ("history.csv", "a,b\n1,2\n", "seconds"),
     ],
 )

@@ -237,7 +237,7 @@ def error(result, balls, kind) -> float:
     return float((result.field.sample(grid) - truth).norm() / truth.norm())
 
 
-@pytest.mark.parametrize("kind", [Emission, Interferometry], ids=lambda k: k.name)
+@pytest.mark.parametrize("kind", [pytest.param(Emission, marks=pytest.mark.slow), Interferometry])
 def test_every_method_finds_the_field(kind, measured, balls):
     methods: dict[str, Reconstructor] = {"tv": TotalVariation(voxels=16, device="cpu")}
     if kind.additive:  # a network for the others: two techniques of one index, below
