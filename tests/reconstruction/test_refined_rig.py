@@ -104,7 +104,7 @@ def test_what_a_view_shows_of_the_middle_moves_as_its_camera_says(measured):
 
 @pytest.mark.parametrize(
     "case",
-    ["noise above the signal", pytest.param("a column that is the same around and along its axis", marks=pytest.mark.slow)],
+    ["noise above the signal", pytest.param("a column the same around and along its axis", marks=pytest.mark.slow)],
 )
 def test_where_the_data_tell_nothing_it_is_said(measured, case):
     if case.startswith("noise"):
