@@ -8,9 +8,11 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
-from nerif.app.jobs import Job, Jobs, command_line
+from nerif.app import runner
+from nerif.app.jobs import LAUNCHED, Job, Jobs, command_line
 from nerif.app.jobs_drawer import film_progress
 from nerif.cli import main
 from nerif.conventions import InputError
@@ -120,6 +122,19 @@ def test_what_is_paused_goes_on_from_its_checkpoint(tmp_path, process):
     other = jobs.add(HELP, "x")
     with pytest.raises(InputError, match="only nerif reconstruct and sequence can be paused"):
         jobs.pause(other.id)
+
+
+def test_what_is_asked_while_a_run_starts_is_heard(tmp_path):
+    jobs = Jobs(tmp_path)
+    job = jobs.add(["demo", "--out", "demo"], "a demo", "demo")
+    where = jobs.directory / job.id
+    own = psutil.Process()
+    write_json(where / LAUNCHED, {"pid": own.pid, "began": own.create_time()})
+    assert jobs.get(job.id).state == "running"
+    jobs.stop(job.id)
+    runner.main(where)
+    assert jobs.get(job.id).state == "stopped"
+    assert not (tmp_path / "demo").exists()
 
 
 def test_a_run_outlives_the_server(tmp_path):

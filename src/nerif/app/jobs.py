@@ -277,8 +277,9 @@ class Jobs:
         if job.state not in ("queued", "running", "paused"):
             return
         self._keep(replace(job, asked=what))
-        if job.state == "running" and job.pid:
-            os.kill(job.pid, signal.SIGINT)
+        now = self._read(id)  # it may have begun meanwhile; one that begins later looks at what is asked
+        if job.state == "running" and now is not None and now.state == "running" and now.pid:
+            os.kill(now.pid, signal.SIGINT)
 
     def _keep(self, job: Job) -> None:
         write_json(self._of(job) / JOB, {k: v for k, v in asdict(job).items() if k in KEPT})

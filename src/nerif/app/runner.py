@@ -34,6 +34,8 @@ def main(directory: Path) -> None:
         )
         began = psutil.Process(process.pid).create_time()
         write_json(directory / STARTED, {"pid": process.pid, "began": began, "time": time.time()})
+        if json.loads((directory / JOB).read_text())["asked"]:  # to stop, before it could be told itself
+            process.send_signal(signal.SIGINT)
         code = process.wait()
     write_json(directory / ENDED, {"code": code, "time": time.time()})
 
