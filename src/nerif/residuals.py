@@ -30,7 +30,7 @@ NAMED = {BLOCK: 0.2, FINE: 0.12}  # of what is alike, that a pattern has to take
 CAUSES = {
     "offset": "the whole picture is displaced (a shaken camera): --refine shift, or nerif displacement --shake-border",
     "calibration": "the view is looked at from elsewhere than the calibration says: --refine cameras",
-    "scale": "all of it is too large or too small: distances, pixel pitch or sensitivity",
+    "scale": "all of it is too large or too small: distances, pixel pitch, sensitivity, or a method that flattens",
     "blur": "what was measured is smoother or sharper than the field's: windows of optical flow, the lens (--aperture)",
 }
 """Patterns of residuals, and what leaves them."""
