@@ -99,6 +99,7 @@ def test_bands_are_among_the_figures(result):
     assert {"bands_density", "bands_temperature", "reliability", "slices_density_std"} <= names
 
 
+@pytest.mark.slow
 def test_trials_that_are_there_are_not_done_again(measured, tmp_path):
     out = tmp_path / "r"
     words = ["--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--points-per-batch", "600"]

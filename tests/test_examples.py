@@ -69,6 +69,7 @@ def test_knocked_camera(tmp_path):
 SPRAY = Path(__file__).parents[2] / "shared" / "data" / "spray_absorption" / "spray_Re6700.hdf5"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SPRAY.is_file(), reason="the data of the spray are not beside the project (shared/data)")
 def test_spray(tmp_path, monkeypatch, capsys):
     """Two jets of water: their density is that of water, though nothing was told of it."""

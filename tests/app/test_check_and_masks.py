@@ -68,6 +68,7 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     assert errors(browser) == []
 
 
+@pytest.mark.slow
 def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     own = folder / "masks" / "good" / "0deg.png"  # drawn elsewhere, with another program
     own.parent.mkdir(parents=True)

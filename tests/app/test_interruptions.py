@@ -39,6 +39,7 @@ def press(driver: Any, label: str) -> None:
     driver.find_element("xpath", f"//section[@aria-label='The run']//button[contains(., '{label}')]").click()
 
 
+@pytest.mark.slow
 def test_what_is_typed_in_one_tab_is_there_in_the_next(browser, server):
     visit(browser, server, "design")
     put(browser, "focal_length", "85")

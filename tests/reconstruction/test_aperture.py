@@ -203,6 +203,7 @@ def test_a_run_through_lenses_is_repeated_exactly_and_resumed(wide):
         settings(seen_through(wide, "off"), resume=half.state)
 
 
+@pytest.mark.slow
 def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
     path, out = tmp_path / "m.nc", tmp_path / "r"
     wide.write(path)

@@ -162,6 +162,7 @@ def test_a_view_that_displacements_do_not_show_has_no_posterior(measured):
     assert [row for i, row in enumerate(found) if i != 1] == alone
 
 
+@pytest.mark.slow
 def test_voxels_that_are_stopped_while_the_rig_is_refined_go_on_undisturbed(measured):
     settings = Tikhonov(voxels=12, regularisation=1e-3, iterations=12, refine=("cameras", "shift"), device="cpu")
     whole = settings(measured)

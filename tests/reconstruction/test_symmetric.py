@@ -86,6 +86,7 @@ def test_one_view_is_enough(jet, method, most):
     assert result.axis.told == (True, False, True, False)
 
 
+@pytest.mark.slow
 def test_emission_from_one_view():
     cameras, box = paper_rig(40)
     cameras = [camera.without_background for camera in cameras[:1]]

@@ -187,6 +187,7 @@ def test_a_broken_result_opens_without_an_error(browser, copy):
     assert "The run has not ended" in text(browser, ".statements")
 
 
+@pytest.mark.slow
 def test_without_webgl_it_says_so_and_the_slices_stay(whole, tmp_path):
     driver = open_browser(tmp_path / "profile", "--disable-3d-apis")
     try:
@@ -199,6 +200,7 @@ def test_without_webgl_it_says_so_and_the_slices_stay(whole, tmp_path):
         driver.quit()
 
 
+@pytest.mark.slow
 def test_a_field_that_is_no_index_is_drawn_as_it_is(browser, tmp_path):
     grid = Grid(Box((-5.0, -4.0, -3.0), (5.0, 4.0, 3.0)), (8, 10, 12))
     x, y, z = grid.points().unbind(-1)

@@ -227,6 +227,7 @@ def interrupted(plan: SequencePlan, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (SequenceStore(plan.out).checkpoints / "0" / "checkpoint.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_settings_or_data_is_not_gone_on_with(five, tmp_path, monkeypatch):
     fresh, other = begun(five, tmp_path / "fresh.zarr", 4), begun(five, tmp_path / "r.zarr", 4, seed=3)
     reconstruct_jointly(fresh, 0, 2)
