@@ -66,15 +66,17 @@ class Observation:
         unit = f", in {kind.unit}" if unit_shown(kind.unit) else ""
         return f"{kind.measured.capitalize()} {names}".rstrip() + f" of each view{unit}"
 
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Names of what a file holds of it."""
+        return (self.technique.measured, self.technique.sigma, *self.technique.beside)
+
     def alone(self, measurement: Measurement) -> Measurement:
         """Return the measurement by this technique alone, of the views that measured something by it."""
         if len(measurement.observations) == 1:
             return measurement
-        kind = self.technique
-        usable = measurement.usable_for(self).flatten(1).any(dim=1).tolist()
-        some = measurement.select([name for name, seen in zip(measurement.names, usable, strict=True) if seen])
-        names = (kind.measured, kind.sigma, *kind.beside)
-        own = {name: value for name, value in some.measured_maps.items() if name in names}
+        some, kind = _of_views_with(measurement, [self]), self.technique
+        own = {name: value for name, value in some.measured_maps.items() if name in self.maps}
         return replace(some, cameras=tuple(kind.seen_by(c) for c in some.cameras), **arguments_of(own))
 
     def without(self, measurement: Measurement) -> Measurement:
@@ -82,11 +84,9 @@ class Observation:
         others = [o for o in measurement.observations if o.technique is not self.technique]
         if len(others) == 1:
             return others[0].alone(measurement)
-        usable = torch.stack([measurement.usable_for(o).flatten(1).any(dim=1) for o in others]).any(dim=0).tolist()
-        some = measurement.select([name for name, seen in zip(measurement.names, usable, strict=True) if seen])
-        kind = self.technique
-        names = (kind.measured, kind.sigma, *kind.beside)
-        return replace(some, **arguments_of({k: v for k, v in some.measured_maps.items() if k not in names}))
+        some = _of_views_with(measurement, others)
+        rest = {name: value for name, value in some.measured_maps.items() if name not in self.maps}
+        return replace(some, **arguments_of(rest))
 
     def measured(self, view: int) -> Bool[Tensor, "row column"]:
         """Which pixels of a view have a value and, where it is known, a sigma within the limits of the technique."""
@@ -110,6 +110,12 @@ def integrals_of(measurement: Measurement) -> tuple[Observation, ...]:
         names = " and ".join(o.technique.measured for o in measurement.observations)
         raise InputError(f"measurement: expected displacements, got {names} alone; nerif displacement finds them")
     return found
+
+
+def _of_views_with(measurement: Measurement, observations: Sequence[Observation]) -> Measurement:
+    """The measurement of the views that measured something by any of some techniques."""
+    seen = torch.stack([measurement.usable_for(o).flatten(1).any(dim=1) for o in observations]).any(dim=0)
+    return measurement.select([name for name, any_ in zip(measurement.names, seen.tolist(), strict=True) if any_])
 
 
 def cameras_of(measurement: Measurement, views: Sequence[int]) -> tuple[Camera, ...]:

@@ -69,7 +69,7 @@ def verdict(result: Result) -> Verdict:
     error, by = _error(result, views, seen)
     doubt, grave = _contradicted(seen)
     symmetry = (metrics.get("axis") or {}).get("symmetry") or {}
-    alike = symmetry.get("kind") == "axis" and not symmetry.get("harmonics")  # with harmonics halves may differ
+    alike = bool(symmetry) and not symmetry.get("harmonics")  # one view shows it all; with harmonics halves may differ
     if alike and any(d["departure"] > ODD for d in metrics.get("departures") or []):
         uneven, alien = _asymmetric(metrics["departures"])
         doubt, grave = "; ".join(filter(None, (uneven, doubt))), grave or alien
@@ -81,7 +81,7 @@ def verdict(result: Result) -> Verdict:
         why = "no view was kept out, and there are no standard deviations (--uncertainty fast)"
         return Verdict("use with care" if doubt else "cannot tell", None, doubt or why)
     cameras = len({v["name"] for v in seen})  # a view has an entry for each technique
-    if cameras < FEW and not alike:  # what they do not show is in no figure; one view shows an axisymmetric flow
+    if cameras < FEW and not alike:  # what they do not show is in no figure
         open_ = f"{cameras} view{'s leave' if cameras > 1 else ' leaves'} much open"
         doubt = "; ".join(filter(None, (doubt, open_)))
     doubts = [by, *([doubt] if doubt else []), *(["the run was interrupted"] if outcome == "interrupted" else [])]
