@@ -7,8 +7,6 @@ largest) the share of voxels whose truth lies within one and two standard deviat
 the rank correlation (Spearman) of errors and deviations over all voxels and, of errors averaged as the deviations are,
 in the flow; rms deviation over rms error; and the time of the whole command over that without them. Steps end a run, so
 that what else the machine does changes the seconds alone. None of these flows scales the deviations (deviations.py).
-
-Then the verdicts (verdicts.py) on measurements that are good and spoiled.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-import verdicts
 from bench import N_AMBIENT, Table, add_write, alone
 from nerif.conventions import InputError
 from nerif.reconstruction.base import Reconstructor
@@ -112,7 +109,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600, help="of NeRIF")
     parser.add_argument("--pixels", type=int, default=64, help="of an edge of each view")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--verdicts", type=int, default=200, help="how many measurements are judged; 0 for none")
     add_write(parser)
     asked = parser.parse_args()
     if not all(f >= 0 for f in asked.f_numbers):
@@ -133,11 +129,6 @@ def main() -> None:
     one, two = (sum(column) for column in zip(*met, strict=True))
     both = sum(all(row) for row in met)
     table.text("", f"Of {len(met)} cases the goal is met within one in {one}, within two in {two}, both in {both}.")
-    if asked.verdicts:
-        table.text("")
-        table.begin(verdicts.columns())
-        numbers = range(verdicts.FIRST, verdicts.FIRST + asked.verdicts)
-        verdicts.judge(table, numbers, "nerif", verdicts.STEPS, processes=2)
 
 
 if __name__ == "__main__":

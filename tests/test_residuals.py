@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, shift
 from nerif.fields.grid import VoxelField
 from nerif.measurement import Measurement
 from nerif.prediction import predict
-from nerif.residuals import BLOCK, leftover
+from nerif.residuals import BLOCK, leftover, white_noise
 from nerif.volume_file import read_volume
 
 RIGS = Path(__file__).parents[2] / "shared" / "data" / "rigs"
@@ -112,3 +112,19 @@ def test_on_measurements_made_by_others(file, cause, views):
         assert found is not None
         causes.append(found.cause)
     assert causes.count(cause) >= views, causes
+
+
+def test_white_noise_is_what_differs_from_pixel_to_pixel():
+    rng = np.random.default_rng(5)
+    mask = np.ones(SHAPE, dtype=bool)
+    mask[:, :7] = False
+    noise = SIGMA * rng.standard_normal((*SHAPE, 2))
+    misfit = 0.2 * seen(rng)
+    detail = np.zeros_like(noise)
+    detail[30:60, 20:50] = 0.5 * rng.standard_normal((30, 30, 2))
+    beyond = np.where(mask[..., None], 0.0, 1e3)
+    assert white_noise(noise + misfit + beyond, mask) == pytest.approx(SIGMA, rel=0.06)
+    assert white_noise(noise + detail, mask) == pytest.approx(SIGMA, rel=0.25)
+    assert white_noise(misfit, mask) < 0.02 * SIGMA / 0.05
+    assert white_noise(gaussian_filter(noise, (1, 1, 0)), mask) < 0.2 * SIGMA
+    assert white_noise(noise[:1], mask[:1]) is None

@@ -28,7 +28,7 @@ from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.refined_rig import with_corrections
 from nerif.reprojection import Reprojection
-from nerif.residuals import leftover
+from nerif.residuals import leftover, white_noise
 from nerif.result import METRICS, VOLUME, ResultDirectory
 from nerif.techniques.registry import AUTO, forward_model
 from nerif.volume import INDEX, Volume
@@ -115,7 +115,9 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
 
     The rms is in the unit of what was measured, and also called rms_px where that is px. Where sigma is known,
     rms_over_sigma tells whether the residual is the noise (1) or more; leftover, where there are enough pixels, whether
-    it is white, and of what it has the pattern if not (residuals.py). rms_predicted is that of what is predicted.
+    it is white, and of what it has the pattern if not (residuals.py). rms_measured, rms_predicted and rms_sigma are
+    those of what was measured, of what is predicted and of sigma; rms_white that of the pixel-to-pixel noise. pixels
+    counts what was compared.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -137,10 +139,15 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         if kind.unit != "1":
             found[f"rms_{kind.unit}"] = found["rms"]
         residual = measured - predicted
-        found["rms_predicted"] = float(predicted[mask].square().mean().sqrt()) if bool(mask.any()) else float("nan")
+        found["pixels"] = int(mask.sum())
+        found["rms_predicted"] = _rms(predicted[mask])
+        found["rms_measured"] = _rms(measured[mask])
+        if (white := white_noise(residual.nan_to_num(0.0, 0.0, 0.0).numpy(), mask.numpy())) is not None:
+            found["rms_white"] = white
         if observation.sigma is not None and bool(mask.any()):
+            found["rms_sigma"] = _rms(observation.sigma[inside][mask])
             residual = residual / observation.sigma[inside]
-            found["rms_over_sigma"] = float(residual[mask].square().mean().sqrt())
+            found["rms_over_sigma"] = _rms(residual[mask])
         patterns = None if kind.derived else predicted.numpy()
         left = leftover(residual.nan_to_num(0.0, 0.0, 0.0).numpy(), patterns, mask.numpy())
         return found if left is None else {**found, "leftover": {**asdict(left), "alike": left.alike}}
@@ -154,6 +161,10 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         with ThreadPoolExecutor(max(side_by_side, 1)) as threads:
             views += threads.map(lambda i, o=o, compared=compared: scores(i, o, compared), chosen)
     return views
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())  # NaN of no pixels
 
 
 def rms_text(view: dict[str, Any], digits: int = 4) -> str:

@@ -26,7 +26,9 @@ from nerif.geometry.symmetry import Symmetry
 from nerif.measurement import Measurement
 from nerif.observation import Observation
 
-__all__ = ["HALVES", "Reflection", "departure_sentence", "departures", "halved", "kept_half", "left_of_axis"]
+__all__ = [
+    "HALVES", "Reflection", "camera_of", "departure_sentence", "departures", "halved", "kept_half", "left_of_axis",
+]  # fmt: skip
 
 HALVES = ("left", "right")
 """Of a picture, beside the axis as it runs in its direction."""
@@ -107,6 +109,12 @@ def halved(measurement: Measurement, symmetry: Symmetry) -> Measurement:
         valid=torch.stack(valid),
         flow_mask=twice(measurement.flow_mask),
     )
+
+
+def camera_of(view: str) -> str:
+    """Return the name of the camera of a view, which may be one of its HALVES."""
+    name, _, half = view.rpartition(" ")
+    return name if half in HALVES and name else view
 
 
 def kept_half(

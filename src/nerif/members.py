@@ -67,7 +67,7 @@ class Members:
         noise = cache(lambda: self._noise(main))  # which not every kind asks for
         found = Found(main, self.reconstructor, self.training, lambda: noise()[0], lambda f: self._seen(f, main))
         quantities = all_quantities(main, gas, voxels)
-        taken = self.kind.taken(found, quantities[0], gas)
+        taken = self.kind.taken(found, quantities[0], gas.for_field(quantities[0]))
         left_out, diverged = [], []
         for number in range(1, self.kind.members + 1):
             member = self.kind.member(number, found)

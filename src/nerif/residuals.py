@@ -13,16 +13,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["CAUSES", "Leftover", "leftover"]
+__all__ = ["CAUSES", "Leftover", "leftover", "white_noise"]
 
 Map = Float[np.ndarray, "row column c"]
 
 BLOCK, FINE = 8, 2  # px: some windows of optical flow, and what a lens or a window smears
 FEWEST = 12  # blocks of which something can be said
+QUARTILE = NormalDist().inv_cdf(0.625)  # of the absolute value of a standard normal variate
 SURE = 4.0  # standard deviations of the grain of white noise
 GRAIN = {BLOCK: 1.25, FINE: 1.1}  # below these what is alike is at most about half of what noise leaves in a block
 NAMED = {BLOCK: 0.2, FINE: 0.12}  # of what is alike, that a pattern has to take away to be named
@@ -80,6 +82,32 @@ def leftover(residual: Map, predicted: Map | None, mask: Bool[np.ndarray, "row c
         if share < NAMED[BLOCK]:
             cause, share = "", 0.0
     return Leftover(coarse.grain, not (coarse.alike or fine.alike), cause, min(share, 1.0), coarse.row, coarse.column)
+
+
+def white_noise(residual: Map, mask: Bool[np.ndarray, "row column"]) -> float | None:
+    """Estimate the rms of the noise that differs from pixel to pixel, by the mixed second difference.
+
+        m = r_ij - r_i+1,j - r_i,j+1 + r_i+1,j+1,      s = q / (2 c),      q the quartile of |m|
+
+    with c the quartile of the absolute value of a standard normal variate. What varies over several pixels cancels in
+    m, and fine detail that the field leaves unexplained in part of an image does not move the quartile. Of noise that
+    is correlated among neighbours it is less than the rms.
+
+    Parameters
+    ----------
+    residual : measured less predicted
+    mask : pixels that count
+
+    Returns
+    -------
+    In the unit of the residual; None where there are no four neighbours.
+
+    Source: after J. Immerkaer, Comput. Vis. Image Underst. 64 (1996) 300.
+    """
+    full = mask[:-1, :-1] & mask[1:, :-1] & mask[:-1, 1:] & mask[1:, 1:]
+    r = residual.astype(np.float64)
+    mixed = np.abs(r[:-1, :-1] - r[1:, :-1] - r[:-1, 1:] + r[1:, 1:])
+    return float(np.quantile(mixed[full], 0.25)) / (2 * QUARTILE) if full.any() else None
 
 
 def _most(shares: dict[str, float]) -> tuple[str, float]:

@@ -1,11 +1,16 @@
-"""The verdict on a reconstruction, in one of a few words, by figures that any measurement has.
+"""The verdict on a result, in one of four words, from figures that any measurement has; no truth is used.
 
-    e = sqrt(max(r_unseen^2 - r_seen^2, 0)) / rms predicted,      error of the field, over its variation = ratio e
+    error^2 = (A e)^2 + (B f)^2 + (C s)^2        over the variation of the field
 
-r_unseen is the rms error of a view that was not seen, r_seen that of the views that were, which is their noise whatever
-was stated. Standard deviations, where there are some, count if they tell more. The ratios, and the limits below, are
-those of simulated measurements, good and spoiled; what they are worth on others is in
-benchmarks/results/verdicts-cpu.md. No truth is looked at.
+with, each an rms over that of the signal,
+
+    s    the noise of a view,
+    f    the residual of the fitted views beyond the noise: detail that the field lacks, or views that contradict it,
+    e    the residual of a withheld view beyond the noise: what the views leave open between them.
+
+A withheld view cannot show an error below the scatter of its mean square residual, so e is at least s (2 / n)^(1/4) for
+n pixels. The coefficients are those of simulated measurements, good and spoiled; how well they hold on others is in
+benchmarks/results/verdicts-cpu.md. Standard deviations, where there are some, count if they are larger.
 """
 
 from __future__ import annotations
@@ -16,23 +21,62 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nerif.halves import camera_of
 from nerif.residuals import CAUSES
 from nerif.result import Result
+from nerif.techniques.registry import TECHNIQUES
 from nerif.volume import field_of
 
-__all__ = ["WORDS", "Verdict", "verdict"]
+__all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 
 WORDS = ("use", "use with care", "do not use", "cannot tell")
 
-RATIO = 0.3  # error of the field over e of a view that a whole run has not seen
-HASTE = {"nerif": 0.08}  # of e in a first, short run, which a network ends far from where it will be
-USE, NOT = 0.035, 0.12  # of the variation: below it is to be used, above not
-DOUBT, GRAVE = (1.7, 0.005), (2.2, 0.02)  # grain of a view's residual, and what is alike over what is predicted
-FEW = 4  # views
-STANDS = 1.5  # times what is alike in the median view
-ODD, ALIEN = 0.25, 0.4  # what is odd about the axis, over what was measured, of a flow taken as axisymmetric
-UNEVEN = 1.35  # residual of the worst view over that of the median one, each over what is predicted
+WITHHELD = 0.3
+"""A, for a view that was withheld from the whole run."""
+FIRST_RUN = 0.08
+"""A, for a view that was withheld from a first, short run of a network only, whose error the whole run reduces."""
+MISFIT = 0.5
+"""B"""
+NOISE = 0.2
+"""C"""
+SPREAD = {"views": 2.0, "deviations": 1.5}
+"""Factor, up and down, within which nine in ten estimates hold, from views and from standard deviations."""
+
+EXPLAINED = 0.5  # of the squared signal; a field that explains less is no reconstruction of these data
+USE, NOT = 0.035, 0.12  # of the variation: up to which it is to be used, and above which not
+DOUBT, GRAVE = (1.7, 0.005), (2.2, 0.02)  # grain of a view's residual, and its correlated part over the signal
+FEW = 4  # cameras
+STANDS = 1.5  # times the correlated part in the median view
+ASYMMETRIC, NOT_SYMMETRIC = 0.25, 0.4  # antisymmetric part of the signal of a flow taken as axisymmetric
+UNEVEN = 1.35  # residual of the worst view over that of the median one, each over the signal
 FLOW = 0.02  # share of the largest value above which a voxel counts as flow
+
+ONE_CAMERA = (
+    "with one camera no other view checks the calibration: lengths scale with its mm per px, and the index excess with "
+    "the mm per px at the background over the distance from flow to background"
+)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The relative error of a field, over its variation.
+
+    Parameters
+    ----------
+    error : estimate
+    low, high : range that holds in nine of ten cases like those of the benchmark
+    basis : what it was estimated from
+    """
+
+    error: float
+    low: float
+    high: float
+    basis: str
+
+    @classmethod
+    def within(cls, error: float, factor: float, basis: str) -> Estimate:
+        """Return the estimate with a range of a factor up and down."""
+        return cls(error, error / factor, error * factor, basis)
 
 
 @dataclass(frozen=True)
@@ -42,19 +86,34 @@ class Verdict:
     Parameters
     ----------
     word : one of WORDS
-    error : likely error of the field over its variation, or None
-    why : what speaks for it, in words
+    error : estimated error of the field over its variation, or None
+    why : the reasons, in words
+    low, high : range of the error, or None
     """
 
     word: str
     error: float | None
     why: str
+    low: float | None = None
+    high: float | None = None
+
+    @classmethod
+    def of(cls, word: str, estimate: Estimate | None, reasons: Sequence[str], joint: str = "; ") -> Verdict:
+        """Return a verdict with its reasons, the basis of the estimate first."""
+        why = joint.join(reason for reason in reasons if reason)
+        if estimate is None:
+            return cls(word, None, why)
+        basis = f"{estimate.basis}{joint if why else ''}{why}"
+        return cls(word, estimate.error, basis, estimate.low, estimate.high)
 
     @property
     def sentence(self) -> str:
         """The verdict and what it rests on."""
-        error = "" if self.error is None else f"its error is likely some {self.error:.1%} of the variation, judged by "
-        return f"{self.word[0].upper()}{self.word[1:]}: {error}{self.why}."
+        head = f"{self.word[0].upper()}{self.word[1:]}: "
+        if self.error is None:
+            return f"{head}{self.why}."
+        span = "" if self.low is None or self.high is None else f" ({percent(self.low)} to {percent(self.high)})"
+        return f"{head}estimated error {percent(self.error)} of the variation{span}, {self.why}."
 
 
 def verdict(result: Result) -> Verdict:
@@ -62,72 +121,158 @@ def verdict(result: Result) -> Verdict:
     metrics = result.metrics
     outcome = metrics.get("outcome")
     if outcome in ("diverged", "collapsed"):
-        return Verdict("do not use", None, f"the run {outcome}")
+        return Verdict.of("do not use", None, [f"the run {outcome}"])
     views = metrics.get("views")
-    views = [v for v in views if _known(v)] if isinstance(views, list) else []
-    seen = [v for v in views if not v["held_out"]]
-    error, by = _error(result, views, seen)
-    doubt, grave = _contradicted(seen)
+    views = [v for v in views if _complete(v)] if isinstance(views, list) else []
+    fitted = [v for v in views if not v["held_out"]]
+    for group, whose in ((fitted, "fitted views"), ([v for v in views if v["held_out"]], "withheld views")):
+        share = _explained(group, _noise(fitted))
+        if share is not None and share < EXPLAINED:
+            text = f"the field explains {max(share, 0.0):.0%} of the squared signal of the {whose}, noise apart"
+            return Verdict.of("do not use", None, [text])
+    estimate, void = _estimate(result, views, fitted)
+    doubt, grave = _contradiction(fitted)
     symmetry = (metrics.get("axis") or {}).get("symmetry") or {}
     alike = bool(symmetry) and not symmetry.get("harmonics")  # one view shows it all; with harmonics halves may differ
-    if alike and any(d["departure"] > ODD for d in metrics.get("departures") or []):
-        uneven, alien = _asymmetric(metrics["departures"])
-        doubt, grave = "; ".join(filter(None, (uneven, doubt))), grave or alien
+    if alike and any(d["departure"] > ASYMMETRIC for d in metrics.get("departures") or []):
+        uneven, none = _asymmetry(metrics["departures"])
+        doubt, grave = "; ".join(filter(None, (uneven, doubt))), grave or none
     if grave:
-        return Verdict("do not use", None, doubt)
-    if error is not None and error > NOT:
-        return Verdict("do not use", error, "; ".join(filter(None, (by, doubt))))
-    if error is None:
-        why = "no view was kept out, and there are no standard deviations (--uncertainty fast)"
-        return Verdict("use with care" if doubt else "cannot tell", None, doubt or why)
-    cameras = len({v["name"] for v in seen})  # a view has an entry for each technique
-    if cameras < FEW and not alike:  # what they do not show is in no figure
-        open_ = f"{cameras} view{'s leave' if cameras > 1 else ' leaves'} much open"
-        doubt = "; ".join(filter(None, (doubt, open_)))
-    doubts = [by, *([doubt] if doubt else []), *(["the run was interrupted"] if outcome == "interrupted" else [])]
-    if len(doubts) > 1 or error > USE:
-        return Verdict("use with care", error, "; but ".join(doubts))
-    return Verdict("use", error, f"{by}; no view contradicts the others")
+        return Verdict.of("do not use", None, [doubt])
+    if estimate is not None and estimate.error > NOT:
+        return Verdict.of("do not use", estimate, [doubt])
+    if estimate is None:
+        if doubt:
+            return Verdict.of("use with care", None, [doubt, void])
+        remedy = "--uncertainty fast computes standard deviations"
+        return Verdict.of("cannot tell", None, [void or "no view was withheld", remedy])
+    cameras = len({camera_of(v["name"]) for v in fitted})  # a view has an entry for each technique, or each half
+    doubts = [doubt]
+    if cameras == 1:
+        doubts.append(ONE_CAMERA)
+    elif cameras < FEW and not alike:  # what they do not show is in no figure
+        doubts.append(f"{cameras} views leave much of the field undetermined")
+    if outcome == "interrupted":
+        doubts.append("the run was interrupted")
+    if any(doubts) or estimate.error > USE:
+        return Verdict.of("use with care", estimate, doubts, "; but ")
+    return Verdict.of("use", estimate, ["no view contradicts the others"])
 
 
-def _known(view: Any) -> bool:
+def percent(share: float) -> str:
+    """Return a share in percent, two digits."""
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+
+
+def _complete(view: Any) -> bool:
     return isinstance(view, dict) and bool(view.get("rms_predicted")) and view.get("rms") is not None
 
 
-def _error(result: Result, views: Sequence[dict[str, Any]], seen: Sequence[dict[str, Any]]) -> tuple[float | None, str]:
-    """The likely error over the variation, and what it is judged by."""
-    told = [(deviation, "its standard deviations")] if (deviation := _deviation(result)) is not None else []
-    predicted, by = _unseen(result, views, seen)
-    told += [(predicted, by)] if predicted is not None else []
-    return max(told) if told else (None, "")
+def _kinds(views: Sequence[dict[str, Any]]) -> list[str]:
+    """What was measured; not what was derived from images that are there too: its windows blur it."""
+    measured = list(dict.fromkeys(v["measured"] for v in views))
+    coarser = {
+        TECHNIQUES[kind.derived].measured for kind in TECHNIQUES.values() if kind.derived and kind.measured in measured
+    }
+    return [name for name in measured if name not in coarser]
 
 
-def _unseen(
-    result: Result, views: Sequence[dict[str, Any]], seen: Sequence[dict[str, Any]]
-) -> tuple[float | None, str]:
-    """The same by how well a view was predicted that had not been seen."""
-    if not seen:
-        return None, ""
-    noise = {name: statistics.median(v["rms"] for v in seen if v["measured"] == name) for name in _measured(seen)}
-    left_out = (result.metrics.get("ensemble") or {}).get("left_out") or []
-    looked = (result.metrics.get("first_look") or {}).get("views") or []
-    haste = HASTE.get(str(result.settings.get("method", "")), RATIO)
-    for unseen, ratio, by in (
-        ([v for v in views if v["held_out"]], RATIO, "what is predicted of a view that was held out"),
-        (left_out, RATIO, "what is predicted of views that were left out"),
-        (looked, haste, "what was predicted of a view before it was used"),
+def _noise(fitted: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """The rms noise of a view, by what was measured.
+
+    It is what differs from pixel to pixel in the residuals or, where that is larger (correlated noise), the stated
+    sigma, but no more than the residuals of the fitted views.
+    """
+    noise = {}
+    for name in dict.fromkeys(v["measured"] for v in fitted):
+        own = [v for v in fitted if v["measured"] == name]
+        residual = statistics.median(v["rms"] for v in own)
+        white = statistics.median(v.get("rms_white", residual) for v in own)
+        stated = statistics.median(v.get("rms_sigma", white) for v in own)
+        noise[name] = max(white, min(stated, residual))
+    return noise
+
+
+def _squares(view: dict[str, Any], noise: float) -> tuple[float, float]:
+    """Mean squares of the residual and of the signal of a view, noise apart."""
+    signal = view["rms_predicted"] ** 2
+    if "rms_measured" in view:
+        signal = view["rms_measured"] ** 2 - noise**2
+    return max(view["rms"] ** 2 - noise**2, 0.0), max(signal, 0.0)
+
+
+def _explained(views: Sequence[dict[str, Any]], noise: dict[str, float]) -> float | None:
+    """The smallest share, of any kind, of the squared signal that is explained; None where there is no signal."""
+    shares = []
+    for name in _kinds(views):
+        squares = [_squares(v, noise[name]) for v in views if v["measured"] == name and name in noise]
+        signal = sum(s for _, s in squares)
+        if signal > 0:
+            shares.append(1 - sum(r for r, _ in squares) / signal)
+    return min(shares, default=None)
+
+
+def _estimate(
+    result: Result, views: Sequence[dict[str, Any]], fitted: Sequence[dict[str, Any]]
+) -> tuple[Estimate | None, str]:
+    """The estimated error, or None, and why a withheld view gives none."""
+    by_views, void = _from_views(result, views, fitted)
+    deviation = _deviation(result)
+    known = [] if by_views is None else [by_views]
+    if deviation is not None:
+        known.append(Estimate.within(deviation, SPREAD["deviations"], "from its standard deviations"))
+    return max(known, key=lambda e: e.error, default=None), void
+
+
+def _from_views(
+    result: Result, views: Sequence[dict[str, Any]], fitted: Sequence[dict[str, Any]]
+) -> tuple[Estimate | None, str]:
+    """The estimate from views that were withheld, of the whole run or of others."""
+    metrics = result.metrics
+    first = metrics.get("first_look") or {}
+    noise = _noise(fitted)
+    ahead = FIRST_RUN if str(result.settings.get("method", "")) == "nerif" else WITHHELD
+    left_out = (metrics.get("ensemble") or {}).get("left_out") or []
+    ahead_of = first.get("views") or [], first.get("fitted_views") or []
+    for withheld, own, factor, basis in (
+        ([v for v in views if v["held_out"]], fitted, WITHHELD, "cross-validated on a withheld view"),
+        (left_out, fitted, WITHHELD, "cross-validated view by view"),
+        (*ahead_of, ahead, "cross-validated in a first run without a view"),
     ):
-        known = [v for v in unseen if _known(v) and v["measured"] in noise]
-        if known:
-            largest = max(
-                math.sqrt(max(v["rms"] ** 2 - noise[v["measured"]] ** 2, 0.0)) / v["rms_predicted"] for v in known
-            )
-            return ratio * largest, by
+        shown = [v for v in withheld if _complete(v) and v["measured"] in noise and v["measured"] in _kinds(withheld)]
+        if not shown:
+            continue
+        share = _explained([v for v in own if _complete(v)], noise)
+        if share is not None and share < EXPLAINED:
+            short = f"it explains {max(share, 0.0):.0%} of its data"
+            return None, f"the first run, without view {shown[0]['name']}, was too short for cross-validation: {short}"
+        squares = [(*_squares(v, noise[v["measured"]]), noise[v["measured"]] ** 2, v) for v in shown]
+        open_ = max(_ratio(max(r, n * _scatter(v)), signal) for r, signal, n, v in squares)
+        misfit, white = _of_fitted(fitted, noise)
+        error = math.hypot(factor * open_, MISFIT * misfit, NOISE * white)
+        if not math.isfinite(error):
+            return None, "a view shows no signal above the noise"
+        return Estimate.within(error, SPREAD["views"], basis), ""
     return None, ""
 
 
-def _measured(views: Sequence[dict[str, Any]]) -> list[str]:
-    return list(dict.fromkeys(v["measured"] for v in views))
+def _scatter(view: dict[str, Any]) -> float:
+    """Standard deviation of the mean square of white noise in a view, over the mean square."""
+    return math.sqrt(2 / view["pixels"]) if view.get("pixels") else 0.0
+
+
+def _ratio(square: float, signal: float) -> float:
+    return math.sqrt(square / signal) if signal > 0 else math.inf
+
+
+def _of_fitted(fitted: Sequence[dict[str, Any]], noise: dict[str, float]) -> tuple[float, float]:
+    """f and s: misfit and noise of the fitted views over their signal, of the kind where the misfit is largest."""
+    found = []
+    for name in _kinds(fitted):
+        squares = [_squares(v, noise[name]) for v in fitted if v["measured"] == name]
+        signal = statistics.fmean(s for _, s in squares)
+        found.append((_ratio(statistics.fmean(r for r, _ in squares), signal), _ratio(noise[name] ** 2, signal)))
+    return max(found)
 
 
 def _deviation(result: Result) -> float | None:
@@ -142,43 +287,43 @@ def _deviation(result: Result) -> float | None:
     return float(std.values.double()[flow].norm()) / size if size > 0 else None
 
 
-def _contradicted(seen: Sequence[dict[str, Any]]) -> tuple[str, bool]:
+def _contradiction(fitted: Sequence[dict[str, Any]]) -> tuple[str, bool]:
     """Which view the others contradict, in words, and whether gravely.
 
-    Noise that is alike, as windows leave it, is so in every view; what contradicts stands out, or has a pattern.
+    Correlated noise, as windows leave it, is in every view; a contradiction stands out, or has a pattern.
     """
-    for name in _measured(seen):
-        own = [v for v in seen if v["measured"] == name]
-        alike = {v["name"]: _alike(v) for v in own}
-        middle, worst = statistics.median(alike.values()), max(alike, key=lambda k: alike[k])
-        lefts = {v["name"]: v.get("leftover") or {"grain": 1.0, "cause": ""} for v in own}
+    for name in dict.fromkeys(v["measured"] for v in fitted):
+        own = [v for v in fitted if v["measured"] == name]
+        parts = {v["name"]: _correlated(v) for v in own}
+        middle, worst = statistics.median(parts.values()), max(parts, key=lambda k: parts[k])
+        tests = {v["name"]: v.get("leftover") or {"grain": 1.0, "cause": ""} for v in own}
         out = [
-            view for view, left in lefts.items()
-            if left["grain"] > DOUBT[0] and alike[view] > DOUBT[1] and (left["cause"] or alike[view] > STANDS * middle)
+            view for view, test in tests.items()
+            if test["grain"] > DOUBT[0] and parts[view] > DOUBT[1] and (test["cause"] or parts[view] > STANDS * middle)
         ]  # fmt: skip
         if out:
-            views = f"{len(out)} view{'s' if len(out) > 1 else ''}"
-            text = f"what is left of {views} is no noise, {alike[worst]:.1%} of what {worst} shows"
-            grain, cause = lefts[worst]["grain"], lefts[worst]["cause"]
-            text += f", as where {CAUSES[cause]}" if cause else "; nerif check may tell what is wrong with it"
-            return text, grain > GRAVE[0] and alike[worst] > GRAVE[1] and alike[worst] > STANDS * middle
+            views = f"residuals of {len(out)} views are" if len(out) > 1 else f"the residual of view {out[0]} is"
+            text = f"{views} spatially correlated, in {worst} {parts[worst]:.1%} of the signal"
+            grain, cause = tests[worst]["grain"], tests[worst]["cause"]
+            text += f", as where {CAUSES[cause]}" if cause else "; nerif check compares the views with one another"
+            return text, grain > GRAVE[0] and parts[worst] > GRAVE[1] and parts[worst] > STANDS * middle
         shares = {v["name"]: v["rms"] / v["rms_predicted"] for v in own}
         worst, middle = max(shares, key=lambda k: shares[k]), statistics.median(shares.values())
         if middle > 0 and shares[worst] > UNEVEN * middle:
-            return f"view {worst} is met {shares[worst] / middle:.1f} times worse than others", False
+            return f"view {worst}: residual {shares[worst] / middle:.1f} × the median of all views", False
     return "", False
 
 
-def _asymmetric(departures: Sequence[dict[str, Any]]) -> tuple[str, bool]:
-    """How far what was measured is from that of an axisymmetric flow, in words, and whether it is none."""
+def _asymmetry(departures: Sequence[dict[str, Any]]) -> tuple[str, bool]:
+    """How far the measurement is from that of an axisymmetric flow, in words, and whether it is none."""
     worst = max(departures, key=lambda d: d["departure"])
-    cc, odd = min(worst["cc"].values()), worst["departure"]
-    halves = f"the halves of {worst['name']} correlate by {cc:.2f}, and {odd:.0%} of it is odd about the axis"
-    alien = odd > ALIEN
-    return (f"the flow is {'not' if alien else 'only roughly'} axisymmetric: {halves}"), alien
+    cc, share = min(worst["cc"].values()), worst["departure"]
+    halves = f"the halves of {worst['name']} correlate by {cc:.2f}, and {share:.0%} of the signal is antisymmetric"
+    none = share > NOT_SYMMETRIC
+    return f"the flow is {'not' if none else 'only roughly'} axisymmetric: {halves}", none
 
 
-def _alike(view: dict[str, Any]) -> float:
-    """What is alike in the residual of a view, over what is predicted."""
-    left = view.get("leftover")
-    return float(left["alike"] * view["rms"] / view["rms_predicted"]) if left else 0.0
+def _correlated(view: dict[str, Any]) -> float:
+    """The spatially correlated part of the residual of a view, over the signal."""
+    test = view.get("leftover")
+    return float(test["alike"] * view["rms"] / view["rms_predicted"]) if test else 0.0

@@ -19,7 +19,7 @@ from nerif.live import Live
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
-from nerif.physics.quantities import GasSettings, masked_lines
+from nerif.physics.quantities import NOT_UNIFORM, GasSettings, masked_lines
 from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
@@ -57,7 +57,6 @@ METHODS: dict[str, type[Reconstructor]] = {
     "mlem": MLEM,
     "mart": MART,
 }
-
 
 @dataclass(frozen=True)
 class Run:
@@ -177,7 +176,7 @@ def reconstruct_into(
             callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
             result = method(training, compose(*callbacks), state, origin if state is None else None)
     begin(None)
-    scores = {} if look is None else look.scores()
+    scores = {} if look is None else look.scores(result.field)
     _write(out, measurement, result, run, settings, gains, voxels, monitor, {"first_look": scores} if scores else {})
     _tell_axis(out, result, whole, monitor)
     try:
@@ -251,6 +250,8 @@ def _write(
     out.write_volumes(volumes)
     for line in masked_lines(volumes):
         monitor.say(line)
+    if "temperature" in quantities_of(measurement.quantity) and all(v.quantity != "temperature" for v in volumes):
+        monitor.say(f"temperature: not computed: {NOT_UNIFORM}")
     metrics = {
         **metrics,
         "seconds": result.seconds,

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from nerif.conventions import InputError
+from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid
 from nerif.physics.gas_optics import ambient_index
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.quantities import NOT_UNIFORM, GasChanges, GasSettings, derive, derive_all
 from nerif.volume import Volume
 
 
@@ -28,6 +29,38 @@ def test_hot_air_from_its_index():
     assert temperature.attributes["pressure_pa"] == 101325.0
     assert density.unit == "kg m-3"
     assert derive(volume, "index_excess", GasSettings()) is volume
+
+
+def flow(values: torch.Tensor) -> Volume:
+    return Volume(values, Grid(Box.cube(20.0), values.shape), attributes={"n_ambient": 1.00027})
+
+
+@pytest.mark.parametrize("phantom", ["underexpanded", "flame", "plume"])
+def test_no_temperature_of_a_flow_with_compression_and_expansion(phantom):
+    """A shock-cell jet has density above and below ambient; a hot flow has not, even with a field error of a tenth."""
+    grid = Grid(Box.cube(50.0), (20, 21, 22))
+    values = make_phantom(phantom, grid.box).sample(grid)
+    error = torch.randn(values.shape, generator=torch.Generator().manual_seed(1)) * values.square().mean().sqrt() / 10
+    excess = Volume(values + error, grid, attributes={"n_ambient": 1.00027})
+    names = [v.quantity for v in derive_all(excess, GasSettings())]
+    temperature = derive(excess, "temperature", GasSettings())
+    if phantom == "underexpanded":
+        assert names == ["index_excess", "n", "density"]
+        assert bool(temperature.values.isnan().all())
+        assert temperature.notes["masked_where"] == NOT_UNIFORM
+    else:
+        assert names[-1] == "temperature"
+        assert bool(temperature.values.isfinite().any())
+    assert derive_all(excess, GasSettings(uniform_pressure="yes"))[-1].quantity == "temperature"
+    assert derive_all(excess, GasSettings(uniform_pressure="no"))[-1].quantity == "density"
+
+
+def test_a_flow_is_judged_once_for_all_its_repetitions():
+    both = flow(torch.tensor([1e-5, -1e-5] * 12).reshape(2, 3, 4))
+    assert GasSettings().for_field(both).uniform_pressure == "no"
+    assert GasSettings().for_field(flow(torch.full((2, 3, 4), -1e-5))).uniform_pressure == "yes"
+    assert GasChanges(uniform_pressure="yes").of({"gas": {"uniform_pressure": "no"}}).uniform_pressure == "yes"
+    assert GasChanges().of({"gas": {"uniform_pressure": "no"}}).uniform_pressure == "no"
 
 
 def test_refusals():

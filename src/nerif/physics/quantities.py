@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -17,10 +17,19 @@ from nerif.volume import QUANTITIES, Volume, quantities_of
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
-__all__ = ["TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "masked_lines"]
+__all__ = ["NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "masked_lines"]
 
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; beyond, gases of the table condense or dissociate, and one composition holds no more."""
+
+BOTH_SIGNS = 0.3
+"""Root of the share of the squared density difference, above or below ambient, from which compression or expansion is
+assumed: of a hot or cold flow at uniform pressure the other sign is the error of the field."""
+
+NOT_UNIFORM = (
+    "the pressure is not uniform (density is both above and below ambient, as behind compression and expansion waves); "
+    "--gas.uniform-pressure yes computes temperature all the same"
+)
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,9 @@ class GasSettings:
     """Wavelength of the light, nm."""
     pressure_pa: float = 101325.0
     """Pressure, Pa; assumed uniform."""
+    uniform_pressure: Literal["auto", "yes", "no"] = "auto"
+    """Whether the pressure is uniform, so that temperature follows from density; auto: yes, unless density is both well
+    above and well below ambient, as behind compression and expansion waves."""
 
     def __post_init__(self) -> None:
         if not 0 < self.pressure_pa < math.inf:
@@ -53,6 +65,20 @@ class GasSettings:
         density_from_index(0.0, measurement.n_ambient, gladstone_dale(gas.composition, gas.wavelength_nm))
         return gas
 
+    def for_field(self, excess: Volume) -> GasSettings:
+        """Return the settings for a flow, with yes or no for whether its pressure is uniform."""
+        if self.uniform_pressure != "auto":
+            return self
+        values = excess.values.double().nan_to_num(0.0)
+        total, above = float(values.square().sum()), float(values.clamp(min=0).square().sum())
+        both = total > 0 and min(above, total - above) > BOTH_SIGNS**2 * total
+        return replace(self, uniform_pressure="no" if both else "yes")
+
+    def quantities_of(self, excess: Volume) -> tuple[str, ...]:
+        """Return the quantities that follow from a field: without temperature where the pressure is not uniform."""
+        uniform = self.for_field(excess).uniform_pressure == "yes"
+        return tuple(q for q in quantities_of(excess.quantity) if uniform or q != "temperature")
+
 
 @dataclass(frozen=True)
 class GasChanges:
@@ -64,6 +90,8 @@ class GasChanges:
     """Wavelength of the light, nm; default: that of the result."""
     pressure_pa: float | None = None
     """Pressure, Pa; default: that of the result."""
+    uniform_pressure: Literal["auto", "yes", "no"] | None = None
+    """Whether the pressure is uniform, so that temperature follows from density; default: that of the result."""
 
     def of(self, settings: Mapping[str, Any]) -> GasSettings:
         """Return the gas that the settings of a run (run.toml) hold, with the changes."""
@@ -78,8 +106,8 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
 
         rho = (n - 1) / K,      T = p M / (R rho)
 
-    Where the relations break down (n - 1 <= 0, temperature beyond 200 to 4000 K) values are NaN; how many, and what was
-    assumed, stands in the notes.
+    Where the relations break down (n - 1 <= 0, temperature beyond 200 to 4000 K or in a flow whose pressure is not
+    uniform) values are NaN; how many, and what was assumed, stands in the notes.
 
     Parameters
     ----------
@@ -117,17 +145,19 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
     temperature = temperature_from_density(density, gas.pressure_pa, mass)
     low, high = TEMPERATURE_RANGE
     temperature = temperature.masked_fill((temperature < low) | (temperature > high), math.nan)
+    where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
+    if gas.for_field(excess).uniform_pressure == "no":
+        temperature, where = torch.full_like(temperature, math.nan), NOT_UNIFORM
     assumption = (
         f"T = p M / (R rho), an ideal gas of M = {mass * 1e3:.4g} g/mol ({gas.composition}) "
         f"at a uniform pressure of {gas.pressure_pa:g} Pa; {_density_assumption(gas, k)}"
     )
-    where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
     return _quantity(excess, "temperature", temperature, attributes, assumption, where)
 
 
 def derive_all(excess: Volume, gas: GasSettings) -> list[Volume]:
-    """Return index_excess, n, density and temperature, see `derive`; a volume of anything else alone."""
-    return [derive(excess, quantity, gas) for quantity in quantities_of(excess.quantity)]
+    """Return index_excess, n, density and, at uniform pressure, temperature; a volume of anything else alone."""
+    return [derive(excess, quantity, gas) for quantity in gas.quantities_of(excess)]
 
 
 def masked_lines(volumes: list[Volume]) -> list[str]:

@@ -36,7 +36,7 @@ from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings, derive
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.repetition import Found, Maps, Member, other_seed
-from nerif.volume import Volume, describe, quantities_of
+from nerif.volume import Volume, describe
 
 __all__ = ["KINDS", "Deviations", "Trials", "best_covered"]
 
@@ -220,7 +220,7 @@ class Deviations:
         """
         std = self.std().values.double()
         found = []
-        for quantity in quantities_of(self.main.quantity):
+        for quantity in self.gas.quantities_of(self.main):
             below, above = (self._derived(quantity, z * std) for z in (-1, 1))
             found.append(self._statistic(quantity, "std", 0.5 * (above - below).abs()))
             if quantity == "temperature":
