@@ -16,6 +16,7 @@ from nerif.geometry import Box, Lens
 from nerif.imaging.cameras_file import read_box, read_cameras, write_cameras
 from nerif.imaging.importers import ImportSettings, import_box, import_cameras
 from nerif.imaging.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
+from nerif.measurement import Measurement
 
 SIZE = (320, 240)
 BEHIND = ImportSettings(background_distance=300.0)
@@ -99,9 +100,18 @@ def test_boxes_of_an_upright_axis():
     aside = dataclasses.replace(RULED, axis_from=(59.5, 300.0), axis_to=(59.5, 100.0))
     assert box_about_axis(simple_camera(aside, SIZE, BEHIND)) == Box((-6, -6, -16), (6, 6, 16))
     near = ImportSettings(background_distance=5.0)
-    assert box_about_axis(simple_camera(RULED, SIZE, near)) == Box((-5, -5, -16), (5, 5, 16))
+    assert box_about_axis(simple_camera(RULED, SIZE, near)) == Box((-4.99, -4.99, -16), (4.99, 4.99, 16))
     coarse = dataclasses.replace(RULED, mm_per_px=1.2345)
     assert box_about_axis(simple_camera(coarse, SIZE, BEHIND)) == Box((-148, -148, -197), (148, 148, 197))
+
+
+@pytest.mark.parametrize("distance", [3.0, 5.0, 7.3, 12.0, 1 / 3])
+def test_a_measurement_takes_the_box_before_a_near_background(distance):
+    calibrated = simple_camera(RULED, SIZE, ImportSettings(background_distance=distance))
+    box = box_about_axis(calibrated)
+    assert 0.98 * distance < box.upper[1] < distance
+    values = torch.zeros(1, *SIZE, 2)
+    assert Measurement((calibrated.camera(),), values, box, 1.0003).box == box
 
 
 def test_an_axis_beside_the_picture_has_no_box():

@@ -208,7 +208,7 @@ def simple_camera(
 def box_about_axis(camera: CalibratedCamera) -> Box:
     """Return the largest box about the axis, square across it, that the picture shows whole in the axis's plane.
 
-    Along x it reaches as far as the nearer side of the picture allows, along y as far as that, though not beyond the
+    Along x it reaches as far as the nearer side of the picture allows, along y as far as that, but ends before the
     background; the corners are rounded inwards.
 
     Parameters
@@ -230,14 +230,16 @@ def box_about_axis(camera: CalibratedCamera) -> Box:
     sideways = np.abs(np.concatenate([across, across]))
     room = np.concatenate([far - origin, origin + 0.5])
     half, bottom, top = _largest(upward, sideways, room)
-    half = min(half, whole.depth(whole.plane) - float(camera.translation[2]))
+    behind = whole.depth(whole.plane) - float(camera.translation[2])  # the axis to the background, mm
+    half = min(half, behind)
     if not min(half, top - bottom) * np.linalg.norm(across) > 1:
         raise InputError(
             f"axis_from, axis_to: expected an axis inside the picture of {width} x {height} px (width x height), got "
             "one beside it or at its edge; check the order, COLUMN ROW, or give the box by --lower and --upper"
         )
     unit = 10.0 ** -math.floor(math.log10(min(half, top - bottom) / PARTS))
-    half, top = (math.floor(value * unit + SLACK) / unit for value in (half, top))
+    before = math.ceil(behind * unit - SLACK) - 1  # a box that touches the background is none before it
+    half, top = min(math.floor(half * unit + SLACK), before) / unit, math.floor(top * unit + SLACK) / unit
     bottom = math.ceil(bottom * unit - SLACK) / unit
     return Box((-half, -half, bottom), (half, half, top))
 
