@@ -94,6 +94,18 @@ def test_angles_that_are_cut_off_are_not_counted_on():
         replace(scan, readings=np.where(np.arange(len(ANGLES))[:, None] < 2, scan.readings, 1.0)).axis()
 
 
+def test_every_angle_has_a_name_of_its_own():
+    assert true_scan().measurement(AXIS).names[:3] == ("0deg", "12deg", "24deg")
+    degrees = 150 + 0.01 * np.arange(8)  # as of a scan of many angles
+    scan = LineScan(np.radians(degrees), POSITIONS, np.ones((8, len(POSITIONS))))
+    names = scan.measurement(AXIS).names
+    assert [float(name.removesuffix("deg")) for name in names] == pytest.approx(degrees, abs=1e-6)
+    assert len(set(names)) == len(names)
+    twice = replace(scan, angles=np.radians([*degrees[:7], 150.0]))
+    with pytest.raises(InputError, match=r"angles: expected different angles, got 150deg 2 times; average"):
+        twice.measurement(AXIS)
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_scans_that_cannot_be():
     scan = true_scan()

@@ -12,6 +12,7 @@ of the source, scatter and the detector let it seem smaller. What the scan itsel
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -31,6 +32,7 @@ ENDS = 3  # readings at either end of an angle that are beside the medium
 EMPTY = 0.02  # of the largest reading, below which an end is beside the medium
 LARGEST_BEND, BENDS = 0.3, 301  # tried
 DIGITS = 1e-4  # of the largest reading, to which no scan is better
+NAMED = 10  # digits of an angle in the name of its view: rounding of radians lies beyond, no two angles look alike
 EVEN = 1e-3  # of a step: how far positions may be from evenly spaced
 
 
@@ -176,10 +178,18 @@ class LineScan:
         Parameters
         ----------
         axis : position of the axis of rotation, mm
+
+        Raises
+        ------
+        InputError
+            If two angles are the same.
         """
         half = float(np.abs(self.positions - axis).max()) + self.spacing / 2
         thickness = self.spacing / 2
         cameras = [self._camera(float(angle), axis) for angle in self.angles]
+        name, times = Counter(camera.name for camera in cameras).most_common(1)[0]
+        if times > 1:
+            raise InputError(f"angles: expected different angles, got {name} {times} times; average their readings")
         values = torch.from_numpy(self.readings).float()[:, None, :, None]
         measurement = measurement_of(
             {Absorption: values}, cameras, Box((-half, -half, -thickness), (half, half, thickness)), 1.0
@@ -198,6 +208,6 @@ class LineScan:
             image_size=(1, len(self.positions)),
             background=None,
             distortion=torch.zeros(5, dtype=torch.float64),
-            name=f"{np.degrees(angle):.4g}deg",
+            name=f"{np.degrees(angle):.{NAMED}g}deg",
             projection=TELECENTRIC,
         )
