@@ -18,7 +18,7 @@ from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
-from nerif.report.movie import Movie, _points, _surfaces, frames_there
+from nerif.report.movie import Movie, _points, _surfaces, frames_there, instants
 from nerif.volume import Volume
 from nerif.volume_sequence import VolumeSequence
 
@@ -91,6 +91,12 @@ def test_only_frames_that_are_there_are_drawn(store, tmp_path):
         Movie(quantity="index_excess").write(tmp_path / "m.mp4", partial, frames_there(partial))
     partial.array("status")[1] = 1
     assert frames_there(partial) == [1]
+
+
+def test_no_two_frames_show_the_same_instant():
+    assert instants([0.0, 1e-4, 2e-4]) == ["0.000 ms", "0.100 ms", "0.200 ms"]
+    assert instants([1.0, 1.0 + 2e-7, 1.0 + 4e-7]) == ["1000.00000 ms", "1000.00020 ms", "1000.00040 ms"]
+    assert instants([0.5]) == ["500.000 ms"]
 
 
 @pytest.mark.parametrize(

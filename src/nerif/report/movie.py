@@ -73,9 +73,9 @@ class Movie:
         quantity = self.quantity_of(store)
         limits, found = ranges_over_time(store, quantity, frames)
         level = found if self.level is None else self.level
-        for i in frames:
+        for i, instant in zip(frames, instants([store.times[i] for i in frames]), strict=True):
             volume = store.volume(i, quantity)
-            yield self._picture(volume, f"t = {store.times[i] * 1e3:.3f} ms", limits, level)
+            yield self._picture(volume, f"t = {instant}", limits, level)
 
     def _picture(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
         import pyvista as pv
@@ -162,6 +162,13 @@ class Movie:
             for done, picture in enumerate(self.pictures(store, frames), start=1):
                 writer.append_data(picture)
                 on_frame(done)
+
+
+def instants(times: Sequence[float]) -> list[str]:
+    """Return instants (s) in ms, with three decimals or as many as resolve the shortest time between them."""
+    steps = np.diff(np.unique(times)) * 1e3
+    decimals = max(3, 1 - int(np.floor(np.log10(steps.min())))) if len(steps) else 3
+    return [f"{time * 1e3:.{decimals}f} ms" for time in times]
 
 
 def ranges_over_time(
