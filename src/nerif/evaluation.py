@@ -123,6 +123,8 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
 
     measurement, sees_box = reprojection.measurement, reprojection.measurement.sees_box
     models = {kind: forward_model(kind, measurement) for kind in measurement.techniques if kind.derived}
+    for model in models.values():
+        model.prepare()
 
     def scores(view: int, observation: Observation, compared: Bool[Tensor, "view row column"]) -> dict[str, Any]:
         camera, kind = measurement.cameras[view], observation.technique

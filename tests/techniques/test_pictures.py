@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -308,6 +309,19 @@ def test_views_are_compared_as_pictures(balls, taken):
     assert [v["held_out"] for v in scores] == [v["name"] == "cam1" for v in scores]
     assert min(v["cc"] for v in scores) > 0.99
     assert max(v["rms_over_sigma"] for v in scores) < 1.1
+
+
+def test_threads_that_score_views_share_what_one_built(balls, taken, monkeypatch):
+    built, init = [], References.__init__
+
+    def recorded(self, *arguments):
+        built.append(threading.current_thread())
+        init(self, *arguments)
+
+    views = reproject(balls, taken)
+    monkeypatch.setattr(References, "__init__", recorded)
+    evaluate_views(views)
+    assert built == [threading.main_thread()]
 
 
 # -- files, and what is refused --------------------------------------------------------------------------------------

@@ -295,6 +295,10 @@ class ForwardModel(ABC):
         """
         return dict(maps)
 
+    def prepare(self) -> None:
+        """Compute what the maps of all views share, before threads make them side by side."""
+        return
+
     def mapped(self, integral: Float[Tensor, "row column k"], view: int) -> Float[Tensor, "row column c"]:
         """Return what the map of a view holds of the integral: the integral itself."""
         return integral

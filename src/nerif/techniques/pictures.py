@@ -203,6 +203,10 @@ class Pictures(LeverArm):
                     found[name][i, :height, :width] = blurred(maps[name][i, :height, :width], name == cls.sigma)
         return found
 
+    def prepare(self) -> None:
+        """Build the references: `mapped` fits the brightness of its own view in them, and they have no lock."""
+        _ = self.references
+
     def mapped(self, integral: Float[Tensor, "row column k"], view: int) -> Float[Tensor, "row column c"]:
         """Return the flow picture that displacements make, gain and offset fitted to the one that was taken."""
         height, width, _ = integral.shape
