@@ -9,7 +9,7 @@ __all__ = ["eight_bit", "first_at_a_black_square", "first_at_the_upper_left", "s
 
 def eight_bit(image: np.ndarray) -> np.ndarray:
     """Stretch the picture to eight bits."""
-    low, high = np.percentile(image, (0.2, 99.8))
+    low, high = np.percentile(image.astype(np.float64), (0.2, 99.8))
     scaled = (image.astype(np.float32) - low) * (255 / max(float(high - low), 1e-6))
     return np.clip(np.round(scaled), 0, 255).astype(np.uint8)
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerif.conventions import InputError
+from nerif.imaging.frames import as_float
 from nerif.imaging.warping import warp
 
 __all__ = ["Vectors", "correlate", "normalised_median_outliers", "window_correlation"]
@@ -168,7 +169,7 @@ def normalised_median_outliers(vectors: np.ndarray, threshold: float = 2.0, nois
 
     |d - median| / (median |d_i - median| + noise) > threshold, `noise` in px (Westerweel & Scarano 2005).
     """
-    nodes = vectors.shape[:-1]
+    vectors, nodes = as_float(vectors), vectors.shape[:-1]
     padded = np.pad(vectors, (*((1, 1),) * len(nodes), (0, 0)), constant_values=np.nan)
     around = np.stack(
         [

@@ -15,10 +15,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from nerif.conventions import InputError
 from nerif.imaging.exposure import saturated
+from nerif.imaging.frames import as_float
 from nerif.imaging.noise import FLOOR, local_correlation, smoothed_away, structure_variance
 from nerif.imaging.optical_flow import FLOWS
 from nerif.imaging.photometry import CameraNoise, PicturePair
@@ -34,6 +35,7 @@ __all__ = [
     "measure_against",
 ]
 
+Grey = Shaped[np.ndarray, "row column"]
 Image = Float[np.ndarray, "row column"]
 REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.8}
 """Standard deviation (px) of the window over which each method averages, smoothness 1 (benchmarks/displacement.py)."""
@@ -98,8 +100,10 @@ class DisplacementMap:
     pair: PicturePair | None = None
 
 
-def displacement(reference: Image, flow: Image, settings: DisplacementSettings) -> Float[np.ndarray, "row column 2"]:
-    """Return d (px) of one flow picture against one reference, both of any scale.
+def displacement(
+    reference: Grey, flow: Grey, settings: DisplacementSettings
+) -> Float[np.ndarray, "row column 2"]:  # fmt: skip
+    """Return d (px) of one flow picture against one reference, both of any scale and type.
 
     Raises
     ------
@@ -110,7 +114,7 @@ def displacement(reference: Image, flow: Image, settings: DisplacementSettings) 
         raise InputError(
             f"pictures: expected reference and flow of one size, at least 16 px, got {reference.shape} and {flow.shape}"
         )
-    first, second = _even_out(flow, reference, settings.local_contrast)
+    first, second = _even_out(as_float(flow), as_float(reference), settings.local_contrast)
     return -FLOWS[settings.method](first, second, settings.smoothness).astype(np.float32)
 
 

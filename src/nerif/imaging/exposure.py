@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from nerif.imaging.frames import Frames
+from nerif.imaging.frames import Frames, as_float
 
 __all__ = ["check_exposure", "effective_bits", "full_scale", "saturated"]
 
@@ -56,7 +56,7 @@ def saturated(image: np.ndarray, full: float) -> Bool[np.ndarray, "row column"]:
     """
     top = float(image.max())
     level = full if full > 1 and top <= full else np.inf
-    return np.asarray(image >= (top if _is_plateau(image) else level))
+    return np.asarray(as_float(image) >= (top if _is_plateau(image) else level))
 
 
 def _is_plateau(image: np.ndarray) -> bool:
@@ -75,10 +75,10 @@ def _is_plateau(image: np.ndarray) -> bool:
 
 def check_exposure(image: np.ndarray, full: float, name: str, limit: float = 0.01) -> str | None:
     """Return a line naming the picture if more than `limit` of it is over-exposed, or it is nearly black, else None."""
-    share = float(np.mean(saturated(image, full) | (image >= full)))
+    share = float(np.mean(saturated(image, full) | (as_float(image) >= full)))
     if share > limit:
         return f"{name}: {share:.1%} of the pixels are over-exposed (full scale {full:g}); lower the exposure"
-    top = float(np.percentile(image, 99.9))  # a few hot pixels do not make light
+    top = float(np.percentile(image.astype(np.float64), 99.9))  # a few hot pixels do not make light
     if top < 0.02 * full:
         return f"{name}: nearly black, {top / full:.1%} of the range is used (full scale {full:g}); raise the exposure"
     return None

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerif.conventions import InputError
 
-__all__ = ["Frames", "Layout", "SelectedFrames", "read_each", "size_in_words"]
+__all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "read_each", "size_in_words"]
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
 
@@ -148,6 +148,14 @@ class SelectedFrames(Frames):
     @property
     def known_bits(self) -> int | None:
         return self._frames.known_bits
+
+
+def as_float(values: np.ndarray) -> np.ndarray:
+    """Return an array in single precision, or in double where its values need that.
+
+    Differences, squares and filters of integers wrap around or are cut off.
+    """
+    return np.asarray(values, dtype=np.result_type(values.dtype, np.float32))
 
 
 def size_in_words(shape: Sequence[int]) -> str:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Shaped
 
 from nerif.conventions import InputError, unit_shown
+from nerif.imaging.frames import as_float
 from nerif.imaging.readers import open_frames
 from nerif.measurement import Measurement
 from nerif.observation import Observation, integrals_of
@@ -41,8 +42,8 @@ STANDARD = MaskSettings()
 
 
 def flow_mask(
-    values: Float[np.ndarray, "row column c"],
-    sigma: Float[np.ndarray, "row column c"],
+    values: Shaped[np.ndarray, "row column c"],
+    sigma: Shaped[np.ndarray, "row column c"],
     settings: MaskSettings = STANDARD,
 ) -> Bool[np.ndarray, "row column"]:
     """Return where |values| / sigma exceeds a threshold, cleaned up, and where that is not known.
@@ -57,7 +58,7 @@ def flow_mask(
     from skimage.morphology import remove_small_holes, remove_small_objects
 
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = values / np.where(sigma > 0, sigma, np.nan)
+        ratio = as_float(values) / np.where(sigma > 0, as_float(sigma), np.nan)
     known = np.isfinite(ratio).all(axis=-1)
     ratio[~known] = 0
     if settings.smooth:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
+
+from nerif.imaging.frames import as_float
 
 __all__ = ["FLOOR", "local_correlation", "smoothed_away", "structure_variance"]
 
-Image = Float[np.ndarray, "row column"]
+Grey = Shaped[np.ndarray, "row column"]
 FLOOR = 1e-3  # px: no optical flow is better than that
 
 
-def structure_variance(flow: Image, moved: Image, reach: float) -> Float[np.ndarray, "row column 2"]:
+def structure_variance(flow: Grey, moved: Grey, reach: float) -> Float[np.ndarray, "row column 2"]:
     """Return the variance (px^2) of a shift by the gradients of the moved picture and what is left of the difference.
 
     cov = <r^2> (sum grad(I) grad(I)^T)^-1 with r the difference, over Gaussian windows of standard deviation `reach`.
@@ -21,20 +23,21 @@ def structure_variance(flow: Image, moved: Image, reach: float) -> Float[np.ndar
     pixels = 4 * np.pi * reach**2  # effective number in a Gaussian window
     gv, gu = np.gradient(moved.astype(np.float64))
     uu, vv, uv = (gaussian_filter(g, reach) * pixels for g in (gu * gu, gv * gv, gu * gv))
-    left = gaussian_filter((flow - moved).astype(np.float64) ** 2, max(4.0, 2 * reach))
+    left = gaussian_filter((as_float(flow) - as_float(moved)).astype(np.float64) ** 2, max(4.0, 2 * reach))
     determinant = np.maximum(uu * vv - uv**2, 1e-9 * (uu + vv) ** 2 + 1e-12)
     return np.stack([left * vv / determinant, left * uu / determinant], axis=-1)
 
 
-def smoothed_away(d: Float[np.ndarray, "row column 2"], reach: float) -> Float[np.ndarray, "row column 2"]:
+def smoothed_away(d: Shaped[np.ndarray, "row column 2"], reach: float) -> Float[np.ndarray, "row column 2"]:
     """Rms over a Gaussian window of what that window takes from d, px."""
     from scipy.ndimage import gaussian_filter
 
+    d = as_float(d)
     parts = [gaussian_filter((d[..., k] - gaussian_filter(d[..., k], reach)) ** 2, reach) for k in range(2)]
     return np.sqrt(np.stack(parts, axis=-1))
 
 
-def local_correlation(a: Image, b: Image, reach: float) -> Image:
+def local_correlation(a: Grey, b: Grey, reach: float) -> Float[np.ndarray, "row column"]:
     """Correlation coefficient of two pictures over a Gaussian window."""
     from scipy.ndimage import gaussian_filter
 

@@ -20,13 +20,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
+from nerif.imaging.frames import as_float
 from nerif.imaging.warping import warp
 from nerif.techniques.pictures import LEAST, around, difference_variance, grey_variance
 
 __all__ = ["CameraNoise", "PicturePair"]
 
+Grey = Shaped[np.ndarray, "row column"]
 Image = Float[np.ndarray, "row column"]
 
 CLASSES = 16  # of brightness
@@ -49,7 +51,7 @@ class CameraNoise:
     shot: float
 
     @classmethod
-    def of_repeats(cls, pictures: Sequence[np.ndarray], mean: Image) -> CameraNoise:
+    def of_repeats(cls, pictures: Sequence[np.ndarray], mean: Grey) -> CameraNoise:
         """Return the noise by the variance of pictures of one thing, each as bright as their mean."""
         squares, level = np.zeros(mean.shape), float(mean.mean())
         for picture in pictures:
@@ -58,9 +60,10 @@ class CameraNoise:
         return cls._fitted(mean, squares / (len(pictures) - 1), 1.0)
 
     @classmethod
-    def of_residual(cls, flow: Image, predicted: Image, good: Bool[np.ndarray, "row column"]) -> CameraNoise:
+    def of_residual(cls, flow: Grey, predicted: Grey, good: Bool[np.ndarray, "row column"]) -> CameraNoise:
         """Return the noise by what is left of a flow picture, half of it the reference's."""
-        return cls._fitted(flow[good], (flow - predicted)[good].astype(np.float64) ** 2 / 2, GAUSSIAN)
+        left = as_float(flow) - as_float(predicted)
+        return cls._fitted(flow[good], left[good].astype(np.float64) ** 2 / 2, GAUSSIAN)
 
     @classmethod
     def _fitted(cls, grey: np.ndarray, squares: np.ndarray, median: float) -> CameraNoise:
@@ -100,8 +103,8 @@ class PicturePair:
     @classmethod
     def of(
         cls,
-        reference: Image,
-        flow: Image,
+        reference: Grey,
+        flow: Grey,
         d: Float[np.ndarray, "row column 2"],
         noise: CameraNoise | None,
         repeats: int,
@@ -118,6 +121,7 @@ class PicturePair:
         usable : pixels of the flow picture that were exposed well and see the background
         valid : pixels where d holds
         """
+        reference, flow = as_float(reference), as_float(flow)
         moved, good = warp(reference, -d), valid & usable if bool((valid & usable).any()) else usable
         gain, offset = np.polyfit(moved[good], flow[good], 1)
         left = flow - (gain * moved + offset)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from nerif.conventions import InputError
 from nerif.imaging.exposure import check_exposure, full_scale, saturated
-from nerif.imaging.frames import read_each
+from nerif.imaging.frames import as_float, read_each
 from nerif.imaging.views import View
 
 __all__ = ["SourceLook", "address_of", "look_at", "reduced"]
@@ -101,7 +101,7 @@ def reduced(image: np.ndarray, largest: int) -> np.ndarray:
     if factor >= 1:
         return image
     height, width = (max(1, round(n * factor)) for n in image.shape)
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.resize(as_float(image), (width, height), interpolation=cv2.INTER_AREA))
 
 
 def address_of(image: np.ndarray, largest: int, white: float = 0.0) -> str:

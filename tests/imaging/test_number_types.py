@@ -1,0 +1,94 @@
+"""Pictures of any number type and layout in memory give what the same grey values in double precision give."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from nerif.imaging.corners import eight_bit, saddle_points
+from nerif.imaging.correlation import correlate, normalised_median_outliers
+from nerif.imaging.displacement import AtRest, DisplacementSettings, displacement, measure
+from nerif.imaging.exposure import check_exposure, saturated
+from nerif.imaging.masks import MaskSettings, flow_mask
+from nerif.imaging.noise import local_correlation, smoothed_away, structure_variance
+from nerif.imaging.photometry import CameraNoise, PicturePair
+from nerif.imaging.picture_looks import reduced
+from nerif.imaging.shake import border, remove_shake
+from nerif.imaging.warping import warp
+
+SHAPE = 32, 36
+ALL = np.ones(SHAPE, dtype=bool)
+LOCAL, WHOLE = DisplacementSettings("dis", local_contrast=9), DisplacementSettings("dis")
+MASKS = MaskSettings(threshold=2.0, smallest=4)
+SHIFT = np.full((*SHAPE, 2), 0.25, dtype=np.float32)
+
+TYPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    **{name: lambda x, name=name: x.astype(name) for name in ("u1", ">u2", "i4", "f2", "f4")},
+    "columns first": lambda x: np.asfortranarray(x.astype("u1")),
+    "backwards": lambda x: x[::-1, ::-1].astype("u1")[::-1, ::-1],
+}
+
+
+def stacked(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.stack([a, b], axis=-1)
+
+
+def camera_noise(found: CameraNoise) -> np.ndarray:
+    return np.array([found.read, found.shot])
+
+
+FUNCTIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "displacement": lambda a, b: displacement(a, b, WHOLE),
+    "displacement, local contrast": lambda a, b: displacement(a, b, LOCAL),
+    "measure": lambda a, b: measure([a], [b], WHOLE, 255.0).displacement,
+    "at rest": lambda a, b: AtRest.of([a, b], WHOLE, 255.0).mean,
+    "structure variance": lambda a, b: structure_variance(a, b, 1.8),
+    "local correlation": lambda a, b: local_correlation(a, b, 3.0),
+    "smoothed away": lambda a, b: smoothed_away(stacked(a, b), 1.8),
+    "outliers": lambda a, b: normalised_median_outliers(stacked(a, b)),
+    "correlate": lambda a, b: correlate(a, b, 12, passes=1).movement,
+    "warp": lambda a, b: warp(a, SHIFT),
+    "shake": lambda a, b: remove_shake(stacked(a, b), border(SHAPE, 4)),
+    "noise of repeats": lambda a, b: camera_noise(CameraNoise.of_repeats([a, b], (a + 1.0 * b) / 2)),
+    "noise of what is left": lambda a, b: camera_noise(CameraNoise.of_residual(a, b, ALL)),
+    "pair": lambda a, b: PicturePair.of(a, b, SHIFT, None, 1, ALL, ALL).sigma,
+    "saturated": lambda a, b: saturated(a, 240.0),
+    "exposure": lambda a, b: np.array([check_exposure(a, full, "p") is None for full in (240.0, 65535.0)]),
+    "mask": lambda a, b: flow_mask(stacked(a, b), stacked(np.maximum(b, 9), np.maximum(a, 9)), MASKS),
+    "eight bit": lambda a, b: eight_bit(a),
+    "saddle points": lambda a, b: saddle_points(a, np.array([[9.0, 12.0], [20.3, 22.1]]), 5.0)[0],
+    "reduced": lambda a, b: reduced(a, 23),
+}
+
+
+@pytest.fixture(scope="module")
+def greys() -> tuple[np.ndarray, np.ndarray]:
+    """A pattern and the same a little to the side, with noise; grey values 4 to 250, 30 pixels of them full."""
+    pattern = gaussian_filter(np.random.default_rng(0).normal(size=SHAPE), 1.2)
+    both = [np.interp(x, (pattern.min(), pattern.max()), (4, 250)) for x in (pattern, warp(pattern, SHIFT))]
+    noise = np.random.default_rng(1).normal(0, 2, (2, *SHAPE))
+    first, second = (np.clip(np.round(x + n), 0, 255) for x, n in zip(both, noise, strict=True))
+    return first, second
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_the_type_of_the_numbers_does_not_matter(greys, name):
+    function = FUNCTIONS[name]
+    right = np.asarray(function(*greys), dtype=np.float64)
+    for kind, given in TYPES.items():
+        got = np.asarray(function(*(given(grey) for grey in greys)), dtype=np.float64)
+        assert np.allclose(got, right, rtol=1e-3, atol=1e-3, equal_nan=True), kind
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_picture_of_black_and_white_is_one_of_0_and_1(greys, name):
+    black_and_white = [grey > 128 for grey in greys]
+    function = FUNCTIONS[name]
+    right = np.asarray(function(*(x.astype(np.float64) for x in black_and_white)), dtype=np.float64)
+    got = np.asarray(function(*black_and_white), dtype=np.float64)
+    assert np.allclose(got, right, rtol=1e-3, atol=1e-3, equal_nan=True)
