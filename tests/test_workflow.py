@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from nerif.monitor import Monitor
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.report.rig_figure import picture_corners
 from nerif.result import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
 from nerif.workflow import Run, reconstruct_into
 
@@ -80,6 +82,27 @@ def test_the_monitor_hears_lines_and_counts(measurement, tmp_path):
     reconstruct_into(tmp_path / "r", measurement, QUICK, Run(report=False), monitor=monitor)
     assert counts == [(i, 5) for i in range(1, 6)]
     assert any("5 training views" in line for line in said)
+
+
+def test_corners_that_a_distortion_folds_back_are_left_out_with_a_word(measurement, tmp_path):
+    camera = measurement.cameras[0]
+    corner = float((torch.tensor(camera.image_size) / 2 / camera.intrinsics.diagonal()[:2]).norm())
+    folded = torch.tensor([-1 / (3 * (1.35 * corner) ** 2), 0, 0, 0, 0], dtype=torch.float64)  # at 0.9 of the way to it
+    distorted = replace(camera, distortion=folded)
+    whole = replace(measurement, cameras=(distorted, *measurement.cameras[1:]))
+    assert 0 < distorted.unseen < 0.1
+    assert bool(whole.rays()[0].direction.isfinite().all())
+    assert not bool(whole.sees_box[0, 0, 0])
+    corners, straight = (picture_corners(c, np.zeros(3)) for c in (distorted, camera))
+    assert np.allclose(corners.end, straight.end)
+    said: list[str] = []
+    run = Run(report=False, hold_out=("144deg",))
+    reconstruct_into(tmp_path / "r", whole, QUICK, run, monitor=Monitor(said.append))
+    share = f"view '{camera.name}': {distorted.unseen:.1%} of its pixels left out, for which its distortion"
+    assert sum(line.startswith(share) for line in said) == 1
+    most = replace(camera, distortion=16 * folded)
+    with pytest.raises(InputError, match=r"distortion of view .* check their order"):
+        replace(measurement, cameras=(most, *measurement.cameras[1:]))
 
 
 def test_projecting_takes_the_model_of_the_run(made, measurement, tmp_path):

@@ -108,6 +108,7 @@ class Measurement:
         )
         crossing = False
         for camera in self.cameras:
+            camera.check_distortion()
             height, width = camera.image_size
             u = torch.linspace(0, width - 1, min(width, 33), dtype=torch.float64)
             v = torch.linspace(0, height - 1, min(height, 33), dtype=torch.float64)

@@ -146,6 +146,12 @@ def reconstruct_into(
         seen = " or ".join(o.technique.measured for o in measurement.observations)
         what = f"pixels left out whose {seen} or sigma is NaN, infinite or impossible"
         monitor.say(f"{where}: {measurement.bad_pixels} {what}")
+    for camera in measurement.cameras:
+        if camera.unseen:
+            monitor.say(
+                f"view '{camera.name}': {camera.unseen:.1%} of its pixels left out, for which its distortion cannot be "
+                "inverted; calibrate it with pictures of a target that reaches into its corners"
+            )
     look = _first_look(out, run, reconstructor, training, repetitions, not resume, monitor)
     state = out.state() if resume and (look is None or out.has(CHECKPOINT) or not look.begun) else None
     start = _start(run, measurement) if repetitions is not None or not resume else None

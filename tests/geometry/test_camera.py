@@ -10,6 +10,7 @@ import torch
 
 from nerif.conventions import InputError
 from nerif.geometry import PROJECTIONS, Box, Camera, Plane, projection_named
+from nerif.geometry.distortion import distort, fold, undistort
 
 F64 = torch.float64
 
@@ -190,6 +191,39 @@ def test_intrinsics_that_cannot_be_right(camera):
         projection_named("fish", "view 'a': projection")
 
 
-def test_distortion_that_folds_the_image_is_refused(camera, pixels):
-    with pytest.raises(InputError, match="distortion"):
-        replace(camera, distortion=torch.tensor([-900.0, 0, 0, 0, 0], dtype=F64)).rays(pixels)
+def test_distortion_that_folds_the_image_is_refused(camera):
+    with pytest.raises(InputError, match=r"distortion of view 'camera': .* check their order"):
+        replace(camera, distortion=torch.tensor([-900.0, 0, 0, 0, 0], dtype=F64)).check_distortion()
+
+
+@pytest.mark.parametrize("k", [(-0.6, 0.0, 0.0, 0.0, 0.0), (-1.2, 0.9, 4e-3, -3e-3, -0.1), (0.5, -0.9, 0.0, 2e-3, 0.0)])
+def test_pixels_beyond_the_fold_of_a_distortion_have_no_ray(k):
+    """Each ray has the one root before the fold, or there is none: the polynomial, tried everywhere, says which."""
+    coefficients = torch.tensor(k, dtype=F64)
+    radius = torch.linspace(0, fold(coefficients), 400, dtype=F64)
+    angle = torch.linspace(0, 2 * math.pi, 90, dtype=F64)[:, None]
+    x, y = radius * angle.cos(), radius * angle.sin()
+    xd, yd, (xx, cross, yy) = distort(x, y, coefficients)
+    assert bool((xx + yy > 0).all())
+    assert bool((xx * yy - cross * cross > -1e-9).all())
+    found = undistort(torch.stack([xd, yd], dim=-1)[:, :-1], coefficients)
+    assert torch.allclose(found, torch.stack([x, y], dim=-1)[:, :-1], atol=1e-5)
+    beyond = torch.stack([xd, yd], dim=-1)[:, -1] * torch.tensor([1.02, 1.2, 3.0], dtype=F64)[:, None, None]
+    assert bool(undistort(beyond, coefficients).isnan().all())
+
+
+def test_what_folds_back_into_a_picture_is_not_seen_in_it(rotation_about):
+    intrinsics = torch.tensor([[100.0, 0, 100], [0, 100, 100], [0, 0, 1]], dtype=F64)
+    camera = Camera(
+        intrinsics, torch.eye(3, dtype=F64), torch.tensor([0.0, 0, 100], dtype=F64), (201, 201),
+        Plane(torch.tensor([0.0, 0, 1], dtype=F64), 50.0), torch.tensor([-0.4, 0, 0, 0, 0], dtype=F64),
+    )  # fmt: skip
+    end = 100 * fold(camera.distortion)  # mm from the axis
+    assert end == pytest.approx(100 / math.sqrt(1.2))
+    points = torch.tensor([[0.99, 0, 0], [1.01, 0, 0], [1.6, 0, 0], [0, -2.0, 0]], dtype=F64) * end
+    assert camera.project(points).isnan().any(dim=-1).tolist() == [False, True, True, True]
+    rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(Box.cube(60.0))
+    seen = (rays.pixel - 100).norm(dim=-1) < 100 * 2 / 3 / math.sqrt(1.2)
+    assert bool((rays.direction.isfinite().all(dim=-1) == seen).all())
+    assert bool((rays.crosses <= seen).all())
+    assert camera.unseen == pytest.approx(1 - float(seen.double().mean()), abs=0.03)

@@ -77,6 +77,9 @@ def _measurement(path: Path, m: Measurement) -> None:
         noise = "unknown" if sigma is None else f"rms {_rms(sigma, kind.unit)}"
         say(f"  {kind.name:<14} {len(rays)} rays cross the box; rms {kind.measured} {rms}; sigma {noise}")
     say(f"  masked         {m.bad_pixels} pixels whose value or sigma is NaN, infinite or impossible")
+    for camera in m.cameras:
+        if camera.unseen:
+            say(f"  distortion     cannot be inverted for {camera.unseen:.1%} of the pixels of '{camera.name}'")
     lenses = {c.lens for c in m.cameras if c.lens is not None}
     for edge in sorted({lens.window for lens in lenses if lens.window}):
         say(f"  window         {edge:g} px, over which displacements are means")

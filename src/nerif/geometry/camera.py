@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
-from nerif.geometry.distortion import distort, undistort
+from nerif.geometry.distortion import distort, fold, undistort
 from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.projection import PERSPECTIVE, Projection
 from nerif.geometry.rays import BackgroundPoints, Rays
@@ -20,6 +20,7 @@ from nerif.geometry.rays import BackgroundPoints, Rays
 __all__ = ["Camera", "Plane"]
 
 LARGEST_IMAGE = 100_000  # px
+EVENLY = 33  # pixels along either edge that stand for a picture
 
 
 @dataclass(frozen=True)
@@ -175,12 +176,30 @@ class Camera:
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         return torch.stack([u, v], dim=-1).to(self.intrinsics.dtype)
 
+    @property
+    def unseen(self) -> float:
+        """Share of the picture for which the distortion cannot be inverted, by EVENLY x EVENLY of its pixels."""
+        height, width = self.image_size
+        u, v = (torch.linspace(0, n - 1, min(n, EVENLY), dtype=torch.float64) for n in (width, height))
+        rays = self.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False)
+        return 1 - float((rays.origin + rays.direction).isfinite().all(dim=-1).double().mean())
+
+    def check_distortion(self) -> None:
+        """Refuse a distortion that cannot be inverted over most of the picture."""
+        if self.unseen > 0.5:
+            raise InputError(
+                f"distortion of view '{self.name}': expected coefficients that can be inverted over the image, "
+                f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)"
+            )
+
     def project(self, points: Points) -> Pixels:
-        """Project world points (mm) to pixels (px)."""
+        """Project world points (mm) to pixels (px); NaN where the distortion folds the image back."""
         return self._project_jacobian(points)[0]
 
     def rays(self, pixels: Float[Tensor, "n 2"], sensitivity: bool = True, view: int = 0) -> Rays:
         """Back-trace the rays seen by `pixels` (px), to the background where there is one; not yet clipped to a box.
+
+        A pixel for which the distortion cannot be inverted has a ray of NaN, which crosses no box.
 
         Parameters
         ----------
@@ -191,11 +210,6 @@ class Camera:
         y = (pixels[..., 1] - k[1, 2]) / k[1, 1]
         x = (pixels[..., 0] - k[0, 2] - k[0, 1] * y) / k[0, 0]
         ideal = undistort(torch.stack([x, y], dim=-1), self.distortion)
-        if ideal is None:
-            raise InputError(
-                f"distortion of view '{self.name}': expected coefficients that can be inverted over the image, "
-                f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)"
-            )
         start, heading = self.projection.lines(ideal)
         direction = heading @ self.rotation
         direction = direction / direction.norm(dim=-1, keepdim=True)
@@ -277,7 +291,8 @@ class Camera:
         """Pixels and d pixel / d X (px/mm)."""
         local = self.local(points)
         image, slope = self.projection.image(local), self.projection.slope
-        x, y, (xx, cross, yy) = distort(image[..., 0], image[..., 1], self.distortion)
+        folded = image.norm(dim=-1, keepdim=True) > fold(self.distortion)
+        x, y, (xx, cross, yy) = distort(*image.masked_fill(folded, torch.nan).unbind(-1), self.distortion)
         k = self.intrinsics
         pixels = torch.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], dim=-1)
         # row by row: small matrix products are slow in a batch

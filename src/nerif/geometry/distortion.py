@@ -6,9 +6,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,10 +18,12 @@ from torch import Tensor
 from nerif.conventions import Pixels
 from nerif.geometry.projection import Array
 
-__all__ = ["POWERS", "distort", "undistort"]
+__all__ = ["POWERS", "distort", "fold", "undistort"]
 
 POWERS = (2, 4, 1, 1, 6)
 """Of the unit of (x, y), by which k1, k2, p1, p2, k3 are divided."""
+REAL = 1e-6  # imaginary part over absolute value, below which a root is real
+START, STEP = 0.9, 0.25  # of the radius of the fold: how far out Newton's method starts, and its longest step
 
 
 def distort(x: Array, y: Array, coefficients: Iterable[Any]) -> tuple[Array, Array, tuple[Array, Array, Array]]:
@@ -42,19 +46,42 @@ def distort(x: Array, y: Array, coefficients: Iterable[Any]) -> tuple[Array, Arr
     return xd, yd, (xx, cross, yy)
 
 
-def undistort(distorted: Pixels, coefficients: Float[Tensor, 5]) -> Pixels | None:
-    """Return the ideal coordinates by Newton's method (at most 20 steps); None where they cannot be found."""
+def fold(coefficients: Float[Tensor, 5]) -> float:
+    """Return the radius r up to which no two points (x, y) are distorted to the same; infinite where there is no end.
+
+    Beyond, the image that a polynomial makes folds back. The derivatives are a symmetric matrix, and as long as that is
+    positive definite points stay apart. Its lowest eigenvalue is at least
+
+        1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 - 6 (p1^2 + p2^2)^(1/2) r
+    """
+    k1, k2, p1, p2, k3 = coefficients.tolist()
+    roots = np.roots([7 * k3, 0.0, 5 * k2, 0.0, 3 * k1, -6 * math.hypot(p1, p2), 1.0])
+    real = roots.real[(roots.real > 0) & (np.abs(roots.imag) < REAL * np.abs(roots))]
+    return float(real.min(initial=math.inf))
+
+
+def undistort(distorted: Pixels, coefficients: Float[Tensor, 5]) -> Pixels:
+    """Return the ideal coordinates by Newton's method (at most 20 steps); NaN where there are none before the fold."""
     if not (distorted.numel() and bool(coefficients.any())):
         return distorted
+    end = fold(coefficients)
     size = max(1.0, float(distorted.abs().amax()))
-    x, y = distorted.unbind(-1)
+    x, y = _within(*distorted.unbind(-1), START * end)
     for _ in range(20):
         xd, yd, (xx, cross, yy) = distort(x, y, coefficients)
         left, below = distorted[..., 0] - xd, distorted[..., 1] - yd
         if float(torch.maximum(left.abs(), below.abs()).amax()) < 1e-14 * size:
             break
         determinant = xx * yy - cross * cross
-        x, y = x + (yy * left - cross * below) / determinant, y + (xx * below - cross * left) / determinant
-    found = torch.stack([x, y], dim=-1)
+        step = (yy * left - cross * below) / determinant, (xx * below - cross * left) / determinant
+        aside, down = _within(*step, STEP * end)
+        x, y = _within(x + aside, y + down, end)
     xd, yd, _ = distort(x, y, coefficients)
-    return found if float((distorted - torch.stack([xd, yd], dim=-1)).abs().amax()) < 1e-9 * size else None
+    error = (distorted - torch.stack([xd, yd], dim=-1)).abs().amax(dim=-1, keepdim=True)
+    return torch.where(error < 1e-9 * size, torch.stack([x, y], dim=-1), torch.nan)
+
+
+def _within(x: Tensor, y: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """The vector (x, y), no longer than that."""
+    share = (radius / torch.hypot(x, y)).clamp(max=1)
+    return x * share, y * share

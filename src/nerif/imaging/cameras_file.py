@@ -106,7 +106,9 @@ class CalibratedCamera:
 def checked(camera: CalibratedCamera, source: str) -> CalibratedCamera:
     """Return the camera if it can be one, else raise an InputError that names the source."""
     try:
-        replace(camera, lens=None).camera(camera.image_size or (1, 1))  # a background may come, to focus it on
+        whole = replace(camera, lens=None).camera(camera.image_size or (1, 1))  # a background may come, to focus it on
+        if camera.image_size is not None:
+            whole.check_distortion()
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
     return camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -128,13 +128,15 @@ def picture_corners(camera: Camera, middle: Float[np.ndarray, 3]) -> PictureCorn
     """Return the lines to the corners of the picture of a camera that looks at `middle` (mm).
 
     Lines without a beginning are drawn from where the camera's frame is, or from twice the diagonal of the picture
-    before the middle if that is further off.
+    before the middle if that is further off. Where the distortion of a corner cannot be inverted, it is left out.
     """
     height, width = camera.image_size
     pixels = torch.tensor(
         [[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=torch.float64
     )  # fmt: skip
     rays = camera.rays(pixels, sensitivity=False)
+    if not bool((rays.origin + rays.direction).isfinite().all()):
+        rays = replace(camera, distortion=torch.zeros_like(camera.distortion)).rays(pixels, sensitivity=False)
     origin, direction = rays.origin.numpy(), rays.direction.numpy()
     abreast = ((middle - origin) * direction).sum(axis=1, keepdims=True)
     first = np.minimum(0.0, abreast - 2 * np.linalg.norm(origin[2] - origin[0])) if math.isinf(rays.begin) else 0.0
