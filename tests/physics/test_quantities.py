@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from nerif.conventions import InputError
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid
 from nerif.physics.gas_optics import ambient_index
-from nerif.physics.quantities import NOT_UNIFORM, GasChanges, GasSettings, derive, derive_all
+from nerif.physics.quantities import NOT_UNIFORM, GasChanges, GasSettings, derive, derive_all, deviation
 from nerif.volume import Volume
 
 
@@ -73,3 +75,20 @@ def test_refusals():
         GasSettings(pressure_pa=-1)
     with pytest.raises(InputError, match="pressure_pa"):
         GasSettings(pressure_pa=float("inf"))
+
+
+@pytest.mark.parametrize("quantity", ["index_excess", "n", "density", "temperature"])
+def test_standard_deviations_are_those_of_the_index_to_first_order(quantity):
+    """A small change of the index is the change of each quantity; a large one masks none of what is known."""
+    excess = torch.linspace(-2.9e-4, 2e-4, 24, dtype=torch.float64).reshape(2, 3, 4)
+    volume = Volume(excess, Grid(Box.cube(4.0), (2, 3, 4)), attributes={"n_ambient": 1.00027})
+    step = torch.full_like(excess, 1e-9)
+    above, below, middle = (
+        derive(replace(volume, values=excess + move * step), quantity, GasSettings()).values.double()
+        for move in (100, -100, 0)
+    )
+    found = deviation(volume, step, quantity, GasSettings())
+    assert torch.equal(found.isnan(), middle.isnan())
+    torch.testing.assert_close(found, (above - below).abs() / 200, rtol=1e-2, atol=0, equal_nan=True)
+    large = deviation(volume, 3e5 * step, quantity, GasSettings())
+    torch.testing.assert_close(large, 3e5 * found, rtol=1e-9, atol=0, equal_nan=True)

@@ -163,6 +163,8 @@ def test_temperatures_beyond_the_relation_are_masked_and_counted(found):
     deviations.add(Member(NeRIF(), found.measurement, (), expected), plain)
     told = {v.quantity: v for v in deviations.volumes()}
     assert told["temperature_p95"].notes["masked_voxels"] == grid.shape[0] ** 3
+    k = told["density_std"].attributes["gladstone_dale_m3_kg-1"]
+    torch.testing.assert_close(told["density_std"].values, told["index_excess_std"].values / k, rtol=1e-4, atol=1e-9)
     assert float(told["index_excess_std"].values.mean()) == pytest.approx(deviations.better * 3e-5, rel=1e-3)
 
 

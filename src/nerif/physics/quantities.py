@@ -17,7 +17,10 @@ from nerif.volume import QUANTITIES, Volume, quantities_of
 if TYPE_CHECKING:
     from nerif.measurement import Measurement
 
-__all__ = ["NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "masked_lines"]
+__all__ = [
+    "LINEAR", "NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "deviation",
+    "masked_lines",
+]  # fmt: skip
 
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; beyond, gases of the table condense or dissociate, and one composition holds no more."""
@@ -30,6 +33,9 @@ NOT_UNIFORM = (
     "the pressure is not uniform (density is both above and below ambient, as behind compression and expansion waves); "
     "--gas.uniform-pressure yes computes temperature all the same"
 )
+
+LINEAR = "n", "density"
+"""Quantities that are linear functions of the index excess."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +159,27 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
         f"at a uniform pressure of {gas.pressure_pa:g} Pa; {_density_assumption(gas, k)}"
     )
     return _quantity(excess, "temperature", temperature, attributes, assumption, where)
+
+
+def deviation(excess: Volume, std: Tensor, quantity: str, gas: GasSettings) -> Tensor:
+    """Return the standard deviation of n, density or temperature by that of the index excess, to first order.
+
+        std(n) = std,      std(rho) = std / K,      std(T) = T std(rho) / rho
+
+    It is NaN where the quantity itself is.
+
+    Parameters
+    ----------
+    excess : Volume of index excess, or of what is no index
+    std : (z, y, x) of its values
+    quantity : as `derive` takes it
+    gas : composition, wavelength and pressure
+    """
+    if quantity in (excess.quantity, "n"):
+        return std
+    derived, density = derive(excess, quantity, gas), derive(excess, "density", gas)
+    of_density = std / float(derived.attributes["gladstone_dale_m3_kg-1"])
+    return of_density * derived.values.double() / density.values.double()
 
 
 def derive_all(excess: Volume, gas: GasSettings) -> list[Volume]:

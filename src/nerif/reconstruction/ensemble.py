@@ -10,7 +10,7 @@ the method smooths away.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
-from nerif.physics.quantities import GasSettings, derive_all
+from nerif.physics.quantities import LINEAR, GasSettings, derive, derive_all, deviation
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.repetition import Found, Member, other_seed
 from nerif.volume import Volume, describe
@@ -85,7 +85,9 @@ class Ensemble:
 
 @dataclass
 class Spread:
-    """Running mean and standard deviation of volumes by quantity (Welford's update); NaN where any member is masked.
+    """Running mean and standard deviation of the field and of its temperature (Welford's update).
+
+    n and density are linear functions of the field: theirs follow. Temperature is NaN where any member is masked.
 
     Parameters
     ----------
@@ -104,9 +106,11 @@ class Spread:
         """Take in the quantities of one more member."""
         self.count += 1
         for v in derive_all(result.volume(self.grid), self.gas):
+            new = self.first.setdefault(v.quantity, v) is v
+            if v.quantity in LINEAR:
+                continue
             values = v.values.double()
-            if v.quantity not in self.first:
-                self.first[v.quantity] = v
+            if new:
                 self.mean[v.quantity], self.squares[v.quantity] = torch.zeros_like(values), torch.zeros_like(values)
             change = values - self.mean[v.quantity]
             self.mean[v.quantity] += change / self.count
@@ -115,16 +119,23 @@ class Spread:
     def volumes(self) -> list[Volume]:
         """Return mean and standard deviation of every quantity, as density_mean, density_std and so on."""
         found = []
+        stds = {quantity: (squares / max(self.count - 1, 1)).sqrt() for quantity, squares in self.squares.items()}
+        one = next(iter(self.first.values()))  # the field of a member
+        average = replace(one, values=self.mean[one.quantity])
         for quantity, first in self.first.items():
-            std = (self.squares[quantity] / max(self.count - 1, 1)).sqrt()
-            for name, values in (("mean", self.mean[quantity]), ("std", std)):
+            if quantity in LINEAR:
+                mean = derive(average, quantity, self.gas).values
+                std, where = deviation(average, stds[one.quantity], quantity, self.gas), "in the mean"
+            else:
+                mean, std, where = self.mean[quantity], stds[quantity], "in any member"
+            for name, values in (("mean", mean), ("std", std)):
                 label = f"{quantity}_{name}"
                 notes: dict[str, float | str] = {"members": self.count}
                 if "assumption" in first.notes:
                     notes |= {
                         "assumption": first.notes["assumption"],
                         "masked_voxels": int(torch.isnan(values).sum()),
-                        "masked_where": f"{first.notes['masked_where']}, in any member",
+                        "masked_where": f"{first.notes['masked_where']}, {where}",
                     }
                 kept = values if label == "n_mean" else values.float()
                 found.append(Volume(kept, first.grid, label, describe(label)[0], first.attributes, notes))

@@ -33,7 +33,7 @@ from nerif.conventions import InputError
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera, Grid
 from nerif.measurement import Measurement
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.quantities import GasSettings, derive, deviation
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.repetition import Found, Maps, Member, other_seed
 from nerif.volume import Volume, describe
@@ -215,14 +215,12 @@ class Deviations:
     def volumes(self) -> list[Volume]:
         """Return standard deviations as density_std and so on; of what is no linear function, percentiles too.
 
-        A field x has the percentiles x + z std, and T(x) theirs; its standard deviation is half of T(x - std) less
-        T(x + std).
+        A field x has the percentiles x + z std, and T(x) theirs.
         """
         std = self.std().values.double()
         found = []
         for quantity in self.gas.quantities_of(self.main):
-            below, above = (self._derived(quantity, z * std) for z in (-1, 1))
-            found.append(self._statistic(quantity, "std", 0.5 * (above - below).abs()))
+            found.append(self._statistic(quantity, "std", deviation(self.main, std, quantity, self.gas)))
             if quantity == "temperature":
                 for name, z in TAILS.items():
                     end = self._derived(quantity, -z * std)  # temperature falls as the index rises
