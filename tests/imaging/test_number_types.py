@@ -52,7 +52,7 @@ FUNCTIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "correlate": lambda a, b: correlate(a, b, 12, passes=1).movement,
     "warp": lambda a, b: warp(a, SHIFT),
     "shake": lambda a, b: remove_shake(stacked(a, b), border(SHAPE, 4)),
-    "noise of repeats": lambda a, b: camera_noise(CameraNoise.of_repeats([a, b], (a + 1.0 * b) / 2)),
+    "noise of repeats": lambda a, b: camera_noise(CameraNoise.of_repeats([a, b], (a + 1.0 * b) / 2, 2)),
     "noise of what is left": lambda a, b: camera_noise(CameraNoise.of_residual(a, b, ALL)),
     "pair": lambda a, b: PicturePair.of(a, b, SHIFT, None, 1, ALL, ALL).sigma,
     "saturated": lambda a, b: saturated(a, 240.0),

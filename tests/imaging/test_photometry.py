@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from nerif.imaging.displacement import DisplacementSettings, measure
+from nerif.imaging.displacement import AtRest, DisplacementSettings, measure
 from nerif.imaging.photometry import CameraNoise, PicturePair
 from nerif.imaging.warping import warp
 from nerif.techniques.pictures import Pictures
@@ -34,8 +34,18 @@ def variance(light: np.ndarray) -> np.ndarray:
 def test_repeats_tell_the_noise_of_a_flickering_lamp(repeats):
     light = scene()
     pictures = [exposed(light * (1 + 0.02 * (-1) ** i), i) for i in range(repeats)]
-    noise = CameraNoise.of_repeats(pictures, np.mean(pictures, axis=0))
+    noise = CameraNoise.of_repeats(pictures, np.mean(pictures, axis=0), repeats)
     assert noise.variance(light) == pytest.approx(variance(light), rel=0.15)
+
+
+@pytest.mark.parametrize("references", [6, 12, 40])
+def test_the_noise_does_not_change_with_the_number_of_references(references, monkeypatch):
+    """Of many only some are compared with the mean of all."""
+    monkeypatch.setattr("nerif.imaging.displacement._repeat_sigma", lambda *_: None)  # which takes its time
+    light, draw = scene(), np.random.default_rng(0)
+    pictures = [light + np.sqrt(variance(light)) * draw.standard_normal(light.shape) for _ in range(references)]
+    noise = AtRest.of(pictures, DisplacementSettings()).camera
+    assert float(np.mean(noise.variance(light) / variance(light))) == pytest.approx(1, abs=0.03)
 
 
 def test_a_single_reference_leaves_it_to_what_is_left():

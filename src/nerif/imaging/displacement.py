@@ -160,7 +160,7 @@ class AtRest:
             full |= saturated(picture, full_scale)
         noise = _repeat_sigma(reference, total, averaged, settings) if len(reference) >= 3 else None
         mean, count = total / len(reference), len(reference)
-        camera = CameraNoise.of_repeats(reference[:MOST_REPEATS], mean) if count >= 2 else None
+        camera = CameraNoise.of_repeats(reference[:MOST_REPEATS], mean, count) if count >= 2 else None
         return cls(mean.astype(np.float32), settings, full, full_scale, averaged, noise, count, camera)
 
 

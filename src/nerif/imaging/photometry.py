@@ -51,13 +51,16 @@ class CameraNoise:
     shot: float
 
     @classmethod
-    def of_repeats(cls, pictures: Sequence[np.ndarray], mean: Grey) -> CameraNoise:
-        """Return the noise by the variance of pictures of one thing, each as bright as their mean."""
+    def of_repeats(cls, pictures: Sequence[np.ndarray], mean: Grey, count: int) -> CameraNoise:
+        """Return the noise by the variance of pictures of one thing, each as bright as a mean that they are part of.
+
+        A picture of variance s^2 differs from the mean of `count` by s^2 (1 - 1/count).
+        """
         squares, level = np.zeros(mean.shape), float(mean.mean())
         for picture in pictures:
             grey = np.asarray(picture, dtype=np.float64)
             squares += (grey * (level / max(float(grey.mean()), 1e-9)) - mean) ** 2
-        return cls._fitted(mean, squares / (len(pictures) - 1), 1.0)
+        return cls._fitted(mean, squares / (len(pictures) * (count - 1) / count), 1.0)
 
     @classmethod
     def of_residual(cls, flow: Grey, predicted: Grey, good: Bool[np.ndarray, "row column"]) -> CameraNoise:
