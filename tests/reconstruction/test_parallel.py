@@ -5,14 +5,22 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from nerif.cli import main
+from nerif.fields.mlp import NetworkShape
+from nerif.measurement import Measurement
 from nerif.reconstruction.files import read_field
+from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.objective import Draw, Objective
 from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.precision import MixedPrecision
+from nerif.reconstruction.settings import LossWeights
+from nerif.reconstruction.training_data import FrameData
 
 SMALL = [
     "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "30",
@@ -64,3 +72,37 @@ def test_every_ray_is_in_one_share():
     rays = torch.arange(11)
     shares = [rays[Ranks(rank, 3).share] for rank in range(3)]
     assert sorted(torch.cat(shares).tolist()) == rays.tolist()
+
+
+def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_and_counts_for_nothing(measured):
+    """One ray of a technique that measures the gradient and one of a technique that does not, for three processes."""
+    m = Measurement.read(measured)
+    fringes = torch.zeros(m.shape)
+    both = replace(m, maps={"fringes": fringes, "fringes_sigma": torch.ones(m.shape)}, wavelength_nm=532.0)
+    weights, heads = LossWeights(1.0, 1.0, 1.0, 1.0), NetworkShape(width=24, depth=2, gradient_head=True)
+    settings = NeRIF(device="cpu", precision="float32", weights=weights, network=heads)
+    data = FrameData(settings, both, coarsest=1)
+    torch.manual_seed(0)
+    field = data.untrained()
+    network = MixedPrecision(field.network, data.device, settings.precision, settings.compile)
+    index = torch.tensor([0, len(data) - 1])
+
+    def of(ranks: Ranks) -> tuple[dict[str, float], set[str], float]:
+        drawn = torch.Generator().manual_seed(1)
+        objective = Objective(settings, data, field, network, drawn, ranks)
+        pieces, whole = objective.batch(index, Draw(1, 8))
+        terms = objective.terms(pieces)
+        field.network.zero_grad()
+        sum(terms.values()).backward()
+        weighed = {name for name, p in field.network.named_parameters() if p.grad is not None}
+        share = sum(piece.numbers for piece in pieces) / whole
+        assert share or float(objective.of_nothing(pieces)) == 0
+        return {name: share * float(term.detach()) for name, term in terms.items()}, weighed, share
+
+    alone, weighed, _ = of(Ranks())
+    shared = [of(Ranks(rank, 3)) for rank in range(3)]
+    assert [share for _, _, share in shared] == [1.0, 0.0, 0.0]
+    for terms, others, _ in shared:
+        assert list(terms) == list(alone)
+        assert others == weighed
+    assert {name: sum(terms[name] for terms, _, _ in shared) for name in alone} == pytest.approx(alone)

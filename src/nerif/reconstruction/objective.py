@@ -71,6 +71,8 @@ class Piece:
     rays : theirs, or several through the lens in a row for each
     tau : (n,) instants of the rays, or None
     s, interval : (n, m) path lengths of the samples, and the length that each stands for, mm
+    numbers : measured numbers of this process; 0 where it has no ray of the technique, and one of another process
+        stands in, which counts for nothing: all processes average the same terms, and gradients of the same weights
     """
 
     part: Part
@@ -78,6 +80,7 @@ class Piece:
     tau: Tensor | None
     s: Tensor
     interval: Tensor
+    numbers: int
 
 
 class Objective:
@@ -122,11 +125,13 @@ class Objective:
         """
         batch = self.data.batch(index)
         pieces = [self._piece(part, tau, draw) for part, tau in batch]
-        return [p for p in pieces if len(p.part)], sum(part.measured.numel() for part, _ in batch)
+        return pieces, sum(part.measured.numel() for part, _ in batch)
 
     def _piece(self, part: Part, tau: Tensor | None, draw: Draw) -> Piece:
         """This process's share of a part, with its samples."""
         rays, mine = draw.rays_of(part, self.generator), self.ranks.share
+        numbers = part.measured[mine].numel()
+        mine = mine if numbers else slice(0, 1)
         each = len(rays) // max(len(part), 1)
         s, interval = sample_rays(rays, draw.samples, self.generator, self.settings.sampling, self.density, each)
         if self.ranks.size > 1:
@@ -134,7 +139,7 @@ class Objective:
             own = (chosen[:, None] * each + torch.arange(each, device=chosen.device)).flatten()
             rays, s, interval = rays[own], s[own], interval[own]
         own_tau = None if tau is None else tau[mine].repeat_interleave(each)
-        return Piece(part[mine], rays, own_tau, s, interval)
+        return Piece(part[mine], rays, own_tau, s, interval, numbers)
 
     def terms(self, pieces: list[Piece]) -> dict[str, Tensor]:
         """Return the terms of the loss, each the mean over all measured numbers of the pieces."""
@@ -236,7 +241,7 @@ class Objective:
 
 
 def shares(pieces: list[Piece]) -> Iterator[tuple[Piece, float]]:
-    """Give each piece with its share of all measured numbers."""
-    total = sum(piece.part.measured.numel() for piece in pieces)
+    """Give each piece with its share of all measured numbers of this process."""
+    total = max(sum(piece.numbers for piece in pieces), 1)
     for piece in pieces:
-        yield piece, piece.part.measured.numel() / total
+        yield piece, piece.numbers / total

@@ -122,7 +122,7 @@ class Training:
             self.objective.refine(budget.progress)
             pieces, whole = self._batch()
             self.network.low = budget.progress < settings.full_precision_from
-            terms, mine = self.objective.terms(pieces), sum(piece.part.measured.numel() for piece in pieces)
+            terms, mine = self.objective.terms(pieces), sum(piece.numbers for piece in pieces)
             loss = sum(getattr(settings.weights, name) * term for name, term in terms.items())
             assert isinstance(loss, Tensor)
             rate = self._learning_rate()
