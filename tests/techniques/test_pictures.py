@@ -108,6 +108,20 @@ def test_the_reference_between_pixels_is_the_cubic_spline():
     assert references.known(torch.ones(3, dtype=torch.int16), beyond).tolist() == [False, False, False]
 
 
+@pytest.mark.parametrize(("height", "width"), [(1, 9), (2, 7), (6, 2), (1, 1)])
+def test_a_picture_of_few_rows_has_a_reference_too(height, width):
+    picture = torch.rand(1, height, width, generator=torch.Generator().manual_seed(0)) * 100
+    references = References(picture, [(height, width)])
+    row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    place = torch.stack([column, row], dim=-1).reshape(-1, 2).float()
+    view = torch.zeros(len(place), dtype=torch.int16)
+    torch.testing.assert_close(references.at(view, place), picture.flatten(), rtol=1e-4, atol=1e-3)
+    between = place[:, 1] * 0 + (height - 1) / 2, place[:, 0] * 0 + (width - 1) / 2
+    right = map_coordinates(picture[0].double().numpy(), [b.numpy() for b in between], order=3, mode="mirror")
+    torch.testing.assert_close(references.at(view, torch.stack(between[::-1], dim=-1)).double(), torch.tensor(right),
+                               rtol=1e-4, atol=1e-3)  # fmt: skip
+
+
 def test_pixels_without_a_reference_are_not_known():
     pictures = torch.rand(1, 20, 20) * 100
     pictures[0, 4:7, 4:7] = torch.nan

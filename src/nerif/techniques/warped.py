@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -45,9 +46,9 @@ class References:
             picture = pictures[i, :h, :w].double()
             self.good[i, :h, :w] = good = picture.isfinite()
             filled = torch.where(good, picture, picture[good].mean() if bool(good.any()) else 0.0)
-            own = torch.from_numpy(spline_filter(filled.numpy(), order=3, mode="mirror"))
-            padded = torch.nn.functional.pad(own[None, None], (PAD,) * 4, mode="reflect")[0, 0]
-            coefficients[i, : h + 2 * PAD, : w + 2 * PAD] = padded.float()
+            own = spline_filter(filled.numpy(), order=3, mode="mirror")
+            padded = np.pad(own, PAD, mode="reflect")  # PyTorch's takes no more rows than there are
+            coefficients[i, : h + 2 * PAD, : w + 2 * PAD] = torch.from_numpy(padded).float()
         self.coefficients = coefficients.flatten()
         self.sizes = torch.tensor(sizes)
         terms = (DEGREE + 1) * (DEGREE + 2) // 2
