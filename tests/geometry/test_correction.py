@@ -55,6 +55,32 @@ def test_rays_move_as_those_of_the_corrected_cameras(projection, lens, backgroun
     assert torch.equal(found.view, expected.view)
 
 
+@pytest.mark.parametrize("order", [("perspective", "telecentric"), ("telecentric", "perspective")])
+def test_a_rig_may_mix_cameras_with_and_without_a_beginning_of_their_rays(order):
+    telecentric = camera("telecentric", Lens(6.0), 0.0)
+    across, down, _ = telecentric.translation.tolist()
+    inside = replace(telecentric, translation=torch.tensor([across, down, 0.0], dtype=torch.float64))
+    kinds = {"perspective": camera("perspective", Lens(6.0), 0.5), "telecentric": inside}
+    cameras = [kinds[name] for name in order]
+    pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(1)).double() * 100
+    rays = Rays.concatenate([c.rays(pixels, True, i).clip(BOX) for i, c in enumerate(cameras)])
+    half = int(50 * order.index("telecentric"))
+    assert bool((rays.near[half : half + 50] < -5).any())  # its plane z_cam = 0 cuts the box
+    moved = Corrections(cameras, torch.zeros(2, len(GEOMETRY))).moved(rays, BOX)
+    through = rays.spread(1)
+    for found in (moved, through, rays[torch.arange(100)]):
+        assert torch.allclose(found.near, rays.near, atol=1e-9)
+        assert torch.allclose(found.far, rays.far, atol=1e-9)
+
+
+def test_records_that_differ_in_what_is_no_array_are_not_joined():
+    rays = camera("perspective", Lens(6.0), 0.0).rays(torch.zeros(2, 2, dtype=torch.float64))
+    with pytest.raises(AssertionError, match="box"):
+        Rays.concatenate([rays.clip(BOX), rays.clip(Box((-9.0,) * 3, (9.0,) * 3))])
+    with pytest.raises(AssertionError, match="lens"):
+        Rays.concatenate([replace(rays, lens=None), rays])
+
+
 def test_no_correction_changes_nothing():
     cameras = [camera("perspective", None, 0.0)]
     none = Corrections(cameras, torch.zeros(1, len(GEOMETRY)))

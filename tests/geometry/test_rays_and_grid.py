@@ -17,7 +17,7 @@ BOX = Box((-1.0, -2.0, -3.0), (2.0, 4.0, 6.0))
 def ray(origin: list[float], direction: list[float]) -> Rays:
     d = torch.tensor([direction], dtype=F64)
     one = torch.ones(1, dtype=F64)
-    nothing = torch.zeros(1, 2, dtype=F64), torch.zeros(1, dtype=torch.int16)
+    nothing = torch.zeros(1, 2, dtype=F64), torch.zeros(1, dtype=torch.int16), torch.zeros(1, dtype=F64)
     return Rays(torch.tensor([origin], dtype=F64), d / d.norm(), one, one, *nothing)
 
 

@@ -18,7 +18,8 @@ def rays(n: int = 400) -> Rays:
     origin = torch.cat([torch.full((n, 1), -100.0), 16 * torch.rand(n, 2, generator=g) - 8], dim=1)
     direction = torch.tensor([[1.0, 0.0, 0.0]]).expand(n, 3)
     none = torch.zeros(n)
-    return Rays(origin, direction, none, none, torch.zeros(n, 2), torch.zeros(n, dtype=torch.int16)).clip(BOX)
+    view = torch.zeros(n, dtype=torch.int16)
+    return Rays(origin, direction, none, none, torch.zeros(n, 2), view, none).clip(BOX)
 
 
 class Peak:

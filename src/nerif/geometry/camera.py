@@ -218,7 +218,8 @@ class Camera:
         number = torch.full(zero.shape, view, dtype=torch.int16)
         ends = self._background_points(origin, direction, sensitivity)
         lens = self._lens_discs(direction, ends)
-        return Rays(origin, direction, zero, zero, pixels, number, ends, self.projection.begin, lens)
+        begin = torch.full_like(zero, self.projection.begin)
+        return Rays(origin, direction, zero, zero, pixels, number, begin, ends, lens)
 
     def depth(self, plane: Plane) -> float:
         """Return where the optical axis meets a plane, mm from z_cam = 0."""

@@ -17,11 +17,18 @@ class Columns:
     """A record of arrays with one entry a ray, or of such records; None where there is nothing."""
 
     def each(self: C, change: Callable[..., Tensor], *others: C) -> C:
-        """Return the record of what `change` makes of every array and those of the others in its place."""
+        """Return the record of what `change` makes of every array and those of the others in its place.
+
+        What is no array, such as a box, is the same in all of them.
+        """
         made: dict[str, Any] = {}
         for f in fields(self):  # type: ignore[arg-type]
             first, *more = (getattr(part, f.name) for part in (self, *others))
             if isinstance(first, Columns):
                 first = first.each(change, *more)
-            made[f.name] = change(first, *more) if isinstance(first, Tensor) else first
+            elif isinstance(first, Tensor):
+                first = change(first, *more)
+            else:
+                assert all(other == first for other in more), f"{f.name}: expected the same in all records"
+            made[f.name] = first
         return type(self)(**made)

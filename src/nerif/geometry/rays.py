@@ -48,8 +48,8 @@ class Rays(Columns):
     near, far : (n,) path lengths between which the ray is inside the box, mm; far <= near where it misses
     pixel : (n, 2) the pixel (column, row) that sees it, px
     view : (n,) number of the view
+    begin : (n,) path length before which there is no ray, mm: 0, or -inf for a camera that sees along parallel lines
     background : what they see on a background, or None
-    begin : path length before which there is no ray, mm: 0, or -inf for a camera that sees along parallel lines
     lens : the lens that each passes in the middle, and the window it stands for; None where a pixel sees a thin ray
     """
 
@@ -59,8 +59,8 @@ class Rays(Columns):
     far: Float[Tensor, " n"]
     pixel: Float[Tensor, "n 2"]
     view: Int16[Tensor, " n"]
+    begin: Float[Tensor, " n"]
     background: BackgroundPoints | None = None
-    begin: float = 0.0
     lens: LensDiscs | None = None
 
     def __len__(self) -> int:
@@ -134,7 +134,7 @@ class Rays(Columns):
         # a ray along a face divides 0 by 0: nudge the direction, not the answer
         direction = torch.where(self.direction.abs() < 1e-12, torch.full_like(self.direction, 1e-12), self.direction)
         a, b = (lower - self.origin) / direction, (upper - self.origin) / direction
-        near = torch.minimum(a, b).amax(dim=-1).clamp_min(self.begin)
+        near = torch.minimum(a, b).amax(dim=-1).maximum(self.begin)
         far = torch.maximum(a, b).amin(dim=-1)
         lens = None if self.lens is None else replace(self.lens, box=box)
         return replace(self, near=near, far=torch.maximum(far, near), lens=lens)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -139,7 +138,8 @@ def picture_corners(camera: Camera, middle: Float[np.ndarray, 3]) -> PictureCorn
         rays = replace(camera, distortion=torch.zeros_like(camera.distortion)).rays(pixels, sensitivity=False)
     origin, direction = rays.origin.numpy(), rays.direction.numpy()
     abreast = ((middle - origin) * direction).sum(axis=1, keepdims=True)
-    first = np.minimum(0.0, abreast - 2 * np.linalg.norm(origin[2] - origin[0])) if math.isinf(rays.begin) else 0.0
+    before = np.minimum(0.0, abreast - 2 * np.linalg.norm(origin[2] - origin[0]))
+    first = np.maximum(before, rays.begin.numpy()[:, None])
     last = abreast if rays.background is None else rays.background.distance.numpy()[:, None]
     return PictureCorners(origin + first * direction, direction, origin + last * direction)
 
