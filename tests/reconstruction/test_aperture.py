@@ -13,16 +13,22 @@ from nerif.cli import main
 from nerif.consistency import check_consistency
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume
+from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.prediction import predict_view, reproject
 from nerif.reconstruction.aperture import lens_rays, seen_through
+from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.objective import Draw, Objective
 from nerif.reconstruction.operator import VoxelOperator, rays_through
+from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.training_data import FrameData
 from nerif.result import ResultDirectory
 from nerif.simulation import simulate, view_displacement
 from nerif.techniques.pictures import Pictures
@@ -181,6 +187,27 @@ def test_a_file_keeps_the_lenses(wide, tmp_path):
         Measurement.from_dataset(dataset)
     dataset["aperture_diameter"][:] = 0.0
     assert all(c.lens is None for c in Measurement.from_dataset(dataset).cameras)
+
+
+@pytest.mark.parametrize("model", ["lever_arm", "paraxial", "curved"])
+@pytest.mark.parametrize("lens", [Lens(12.5), Lens(window=4.0)], ids=["lens", "window"])
+def test_rays_of_a_pixel_that_miss_the_box_leave_every_term_and_its_slope_finite(wide, lens, model):
+    cameras = tuple(replace(c, lens=lens) for c in wide.cameras)
+    measurement = replace(wide, cameras=cameras, box=Box.cube(20.0))
+    shape = NetworkShape(depth=2, width=8, octaves=1, gradient_head=True)
+    weights = LossWeights(consistency=1, numerical=1, head=1, automatic=1)
+    settings = NeRIF(network=shape, weights=weights, model=model, device="cpu", lens_rays=4, norm="l2")
+    data = FrameData(settings, measurement, coarsest=1)
+    torch.manual_seed(0)
+    field, generator = data.untrained(), torch.Generator().manual_seed(0)
+    network = MixedPrecision(field.network, data.device, "float32", "off")
+    objective = Objective(settings, data, field, network, generator, Ranks())
+    pieces, _ = objective.batch(torch.arange(len(data)), Draw(4, 4))
+    assert not bool(pieces[0].rays.crosses.all())
+    for name, term in objective.terms(pieces).items():
+        slopes = torch.autograd.grad(term, list(field.network.parameters()), retain_graph=True, allow_unused=True)
+        assert bool(term.isfinite()), name
+        assert all(bool(g.isfinite().all()) for g in slopes if g is not None), name
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from nerif.fields.base import Field
+from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Box, Grid
@@ -69,6 +70,16 @@ def test_the_network_is_fitted_to_a_field_on_another_device():
         torch.Generator().manual_seed(0),
     )  # fmt: skip
     assert next(field.network.parameters()).grad.device.type == "meta"
+
+
+def test_the_network_is_fitted_to_a_field_that_is_zero():
+    field = neural()
+    network = MixedPrecision(field.network, torch.device("cpu"), "float32", "off")
+    start = VoxelField.through(torch.zeros(4, 5, 6), Grid(BOX, (4, 5, 6)))
+    points = torch.rand(40, 3) * 4 - 2
+    before = field.gradient(points).detach().norm()
+    fit_network(field, network, start, 100, 64, 1e-2, torch.Generator().manual_seed(0))
+    assert float(field.gradient(points).detach().norm() / before) < 0.3
 
 
 def test_sampling_and_projecting_ask_the_field_to_the_device(measurement):

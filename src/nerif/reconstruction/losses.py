@@ -151,11 +151,12 @@ def by_differences(
     value : the n head
     integral : Weights in the units of the network
     p : sample points in the coordinates of the network
-    reach : of the differences to either side, in the same coordinates
+    reach : of the differences to either side, in the same coordinates; 0 where a ray misses the box
     """
     assert integral.slope is not None
     length = integral.slope.norm(dim=-1)
-    along = integral.slope / length[..., None]
+    along = integral.slope / torch.where(length > 0, length, 1.0)[..., None]
+    reach = torch.where(reach > 0, reach, 1.0)  # any: a sample that stands for no length counts for nothing
     offset = reach[..., None, None] * along[:, None]  # n m c 3
     centre = p[:, :, None, :]
     points = torch.stack([centre + offset, centre - offset])  # 2 n m c 3

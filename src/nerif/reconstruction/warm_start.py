@@ -22,6 +22,7 @@ from nerif.reconstruction.losses import Evaluator
 __all__ = ["adopt", "fit_network"]
 
 WARM_UP = 20  # steps
+LEAST = 1e-12  # mean square in units of the network, below which the field is 0
 APART = 0.05  # of half the box: an axis that is found anew may be so far aside
 BETAS = (0.9, 0.999)  # Adam's decay rates
 
@@ -85,9 +86,8 @@ def fit_network(
         with torch.no_grad():
             value, gradient = start.value_and_gradient(points)
             value, gradient = value / field.scale, gradient * (field.half_edge / field.scale)
-            tiny = torch.finfo(value.dtype).tiny
-            value_scale = 1 / value.square().mean().clamp_min(tiny)
-            gradient_scale = 1 / gradient.square().sum(-1).mean().clamp_min(tiny)
+            value_scale = 1 / value.square().mean().clamp_min(LEAST)
+            gradient_scale = 1 / gradient.square().sum(-1).mean().clamp_min(LEAST)
         guess, slope, _ = network.value_and_gradient(field.normalise(points), False)
         loss = (guess.float() - value).square().mean() * value_scale
         loss = loss + (slope.float() - gradient).square().sum(-1).mean() * gradient_scale
