@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import pytest
 import torch
 
 from nerif.conventions import InputError
-from nerif.reconstruction.device import autocast_dtype, keep_freed_memory, peak_memory, resolve_device
+from nerif.fields.mlp import Network, NetworkShape
+from nerif.reconstruction.device import (
+    autocast_dtype,
+    float32_products,
+    keep_freed_memory,
+    peak_memory,
+    resolve_device,
+)
+from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.presets import PRESETS, preset
 
 
@@ -35,13 +45,33 @@ def test_gpu_that_is_not_there(monkeypatch):
     [("auto", True, True), ("bf16", True, True), ("tf32", True, False), ("float32", False, False)],
 )
 def test_precision_on_a_gpu(monkeypatch, precision, tf32, low):
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
-    before = torch.get_float32_matmul_precision()
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: not including_emulation)
+    mixed = MixedPrecision(Network(NetworkShape(depth=1, width=4, octaves=1)), torch.device("cuda"), precision, "off")
+    assert (mixed.dtype is torch.bfloat16) is low
+    assert mixed.products == ("high" if tf32 else "highest")
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_a_gpu_that_emulates_bf16_is_not_asked_for_it(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: including_emulation)
+    assert autocast_dtype("auto", torch.device("cuda")) is None
+
+
+def test_the_precision_of_products_is_what_it_was_afterwards():
+    with suppress(ArithmeticError), float32_products("high"):
+        assert torch.get_float32_matmul_precision() == "high"
+        with float32_products("highest"):
+            assert torch.get_float32_matmul_precision() == "highest"
+        assert torch.get_float32_matmul_precision() == "high"
+        raise ArithmeticError
+    assert torch.get_float32_matmul_precision() == "highest"
+    torch.backends.cuda.matmul.fp32_precision = "tf32"  # torch's newer switch, beside which the older cannot be read
     try:
-        assert (autocast_dtype(precision, torch.device("cuda")) is torch.bfloat16) is low
-        assert torch.get_float32_matmul_precision() == ("high" if tf32 else "highest")
+        with float32_products("highest"):
+            assert torch.backends.cuda.matmul.fp32_precision != "tf32"
+        assert torch.backends.cuda.matmul.fp32_precision == "tf32"
     finally:
-        torch.set_float32_matmul_precision(before)
+        torch.set_float32_matmul_precision("highest")
 
 
 def test_bf16_on_a_cpu_only_where_the_hardware_has_it(monkeypatch):

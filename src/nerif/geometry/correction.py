@@ -82,7 +82,8 @@ class Corrections:
             return along + (x - along) / of["zoom"][:, None]
 
         def turn(x: Tensor) -> Tensor:
-            return torch.einsum("nij,nj->ni", of["motion"], x)
+            # written out here and below, since a matrix product may be of reduced precision
+            return (of["motion"] * x[:, None]).sum(-1)
 
         narrowed = smaller(rays.direction)
         direction = turn(narrowed / narrowed.norm(dim=-1, keepdim=True))
@@ -92,9 +93,9 @@ class Corrections:
             distance = (of["offset"] - (origin * of["normal"]).sum(-1)) / (direction * of["normal"]).sum(-1)
             depth = ends.distance * (rays.direction * of["axis"]).sum(-1)
             nearer = torch.where(of["depth"], depth / (distance * (direction * axis).sum(-1)), 1.0)
-            along = torch.einsum("nij,nj->ni", ends.sensitivity, of["axis"])[..., None] * of["axis"][:, None]
+            along = (ends.sensitivity * of["axis"][:, None]).sum(-1, keepdim=True) * of["axis"][:, None]
             seen = along + (ends.sensitivity - along) * of["zoom"][:, None, None]
-            seen = torch.einsum("nki,nji->nkj", seen, of["motion"]) * nearer[:, None, None]
+            seen = (seen[:, :, None] * of["motion"][:, None]).sum(-1) * nearer[:, None, None]
             ends = BackgroundPoints(seen, distance)
         if lens is not None:
             sharp = of["focus"] / (direction * axis).sum(-1)

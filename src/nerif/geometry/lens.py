@@ -118,8 +118,10 @@ class LensDiscs(Columns):
         direction : t of the rays
         """
         p = self.window[:, None, None] * square.to(direction)
-        inverse = torch.linalg.solve(sensitivity @ sensitivity.mT, sensitivity)
-        across = -torch.einsum("nki,nij->nkj", p, inverse)
+        # written out, since a matrix product may be of reduced precision
+        square_of = (sensitivity[:, :, None] * sensitivity[:, None]).sum(-1)
+        inverse = torch.linalg.solve(square_of, sensitivity)
+        across = -(p[..., None] * inverse[:, None]).sum(-2)
         off = (across * self.normal[:, None]).sum(-1) / (direction * self.normal).sum(-1, keepdim=True)
         return across - off[..., None] * direction[:, None]
 

@@ -168,7 +168,8 @@ class Rays(Columns):
             normal = self.lens.normal[:, None]
             along = (direction * normal).sum(-1)
             to_plane = ends.distance[:, None, None] * reach * toward - shift
-            seen = torch.einsum("nij,nkj->nki", ends.sensitivity, direction)
+            # written out, since a matrix product may be of reduced precision
+            seen = (direction[:, :, None] * ends.sensitivity[:, None]).sum(-1)
             sensitivity = ends.sensitivity[:, None] - seen[..., None] * (normal / along[..., None])[:, :, None]
             distance = (to_plane * normal).sum(-1) / along
             ends = BackgroundPoints(sensitivity.flatten(0, 1), distance.flatten(0, 1))

@@ -6,13 +6,18 @@ import ctypes
 import os
 import platform
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import torch
 
 from nerif.conventions import InputError
 
-__all__ = ["autocast_dtype", "available_memory", "keep_freed_memory", "peak_memory", "resolve_device"]
+__all__ = [
+    "autocast_dtype", "available_memory", "float32_products", "keep_freed_memory", "peak_memory", "resolve_device",
+]  # fmt: skip
 
 
 def resolve_device(name: str) -> torch.device:
@@ -43,18 +48,31 @@ def resolve_device(name: str) -> torch.device:
 
 
 def autocast_dtype(precision: str, device: torch.device) -> torch.dtype | None:
-    """Return bfloat16 where the precision asks for it (or, with "auto", where the hardware has it), else None.
-
-    Sets whether CUDA's float32 products may be rounded to TF32.
-    """
+    """Return bfloat16 where the precision asks for it (or, with "auto", where the hardware has it), else None."""
     if device.type == "cuda":
-        torch.set_float32_matmul_precision("highest" if precision == "float32" else "high")
-        fast = torch.cuda.is_bf16_supported()
+        fast = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
         fast = bool(torch.cpu._is_avx512_bf16_supported())
     if precision == "bf16" or (precision == "auto" and fast):
         return torch.bfloat16
     return None
+
+
+@contextmanager
+def float32_products(precision: Literal["highest", "high"]) -> Iterator[None]:
+    """Set the precision of torch's products of float32 matrices within a block; "high" is TF32 on CUDA.
+
+    Directions of rays lose 9e-5 rad to TF32, so that only a network may run with it.
+    """
+    try:
+        before = torch.get_float32_matmul_precision()
+    except RuntimeError:  # the process has set CUDA's alone, by torch's newer switch
+        before = "high" if torch.backends.cuda.matmul.fp32_precision == "tf32" else "highest"
+    torch.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def available_memory(device: torch.device) -> int:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.fields.mlp import Network
-from nerif.reconstruction.device import autocast_dtype
+from nerif.reconstruction.device import autocast_dtype, float32_products
 
 __all__ = ["MixedPrecision"]
 
@@ -26,6 +28,8 @@ class MixedPrecision:
     def __init__(self, network: Network, device: torch.device, precision: str, compile: str) -> None:
         self.network, self.device, self.low = network, device, True
         self.dtype = autocast_dtype(precision, device)
+        tf32 = device.type == "cuda" and precision != "float32"
+        self.products: Literal["highest", "high"] = "high" if tf32 else "highest"
         self.both = network.value_and_gradient
         if compile == "on" or (compile == "auto" and device.type == "cuda"):
             self.both = torch.compile(network.value_and_gradient, dynamic=True)
@@ -49,8 +53,16 @@ class MixedPrecision:
         with self._precision():
             return self.both(p, heads)
 
-    def _precision(self) -> torch.autocast:
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self._is_low)
+    def backward(self, loss: Tensor) -> None:
+        """Differentiate a loss, with the products of matrices as the network has them."""
+        with float32_products(self.products):
+            loss.backward()
+
+    @contextmanager
+    def _precision(self) -> Iterator[None]:
+        low = torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self._is_low)
+        with float32_products(self.products), low:
+            yield
 
     @property
     def _is_low(self) -> bool:

@@ -25,7 +25,7 @@ from nerif.fields.mlp import UNBOUNDED
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import check_resumed
 from nerif.reconstruction.budget import Budget
-from nerif.reconstruction.device import peak_memory
+from nerif.reconstruction.device import float32_products, peak_memory
 from nerif.reconstruction.fingerprint import check_fingerprint
 from nerif.reconstruction.losses import DATA
 from nerif.reconstruction.objective import Objective, Piece
@@ -104,7 +104,7 @@ class Training:
 
     def run(self, on_step: OnStep | None = None) -> Reconstruction:
         """Train until something says stop, and return what there is."""
-        with self.cores:
+        with self.cores, float32_products("highest"):
             return self._run(on_step)
 
     def _run(self, on_step: OnStep | None) -> Reconstruction:
@@ -127,7 +127,7 @@ class Training:
             assert isinstance(loss, Tensor)
             rate = self._learning_rate()
             self.optimiser.zero_grad()
-            loss.backward()
+            self.network.backward(loss)
             self.ranks.average_gradients(self.field.network, mine, whole)
             self.optimiser.step({"adam": rate, "muon": rate * settings.matrix_rate})
             budget.step += 1
