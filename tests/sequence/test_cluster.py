@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib
+import os
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -57,6 +63,87 @@ def workers_of(process: subprocess.Popen) -> list[psutil.Process]:
     """The processes that reconstruct."""
     children = psutil.Process(process.pid).children(recursive=True)
     return [c for c in children if any("spawn_main" in word for word in c.cmdline())]
+
+
+@pytest.fixture(scope="module")
+def local() -> Iterator:
+    """A client of a local cluster of one worker."""
+    with open_cluster("local", 1) as (client, _):
+        client.wait_for_workers(1)
+        yield client
+
+
+def listening() -> set[tuple[str, int]]:
+    """Addresses that this process and its children listen on."""
+    own = psutil.Process()
+    found = [c for each in (own, *own.children(recursive=True)) for c in each.net_connections()]
+    return {(c.laddr.ip, c.laddr.port) for c in found if c.status == psutil.CONN_LISTEN}
+
+
+def addresses_of(client) -> dict[str, str]:
+    """Addresses of the processes of a cluster of one worker, by what they are."""
+    information = client.scheduler_info()
+    ((worker, about),) = information["workers"].items()
+    return {"scheduler": information["address"], "worker": worker, "nanny": about["nanny"]}
+
+
+def test_no_process_of_a_local_cluster_listens_beyond_the_loopback(local):
+    ports = {int(address.rsplit(":", 1)[1]) for address in addresses_of(local).values()}
+    found = listening()
+    assert ports <= {port for _, port in found}
+    assert {ip for ip, _ in found} == {"127.0.0.1"}
+
+
+@pytest.mark.parametrize("certificate", ["none", "another"])
+def test_nobody_without_the_certificate_runs_anything_in_a_local_cluster(local, certificate):
+    import dask
+    from distributed import Security, rpc
+    from distributed.protocol.pickle import dumps
+
+    security = None if certificate == "none" else Security.temporary()
+
+    async def run(address: str) -> int:
+        given = {} if security is None else {"connection_args": security.get_connection_args("client")}
+        async with rpc(address, **given) as process:
+            return await process.run(function=dumps(os.getpid), args=(), kwargs={}, wait=True)
+
+    for address in addresses_of(local).values():
+        assert address.startswith("tls://")
+        address = address if security else address.replace("tls://", "tcp://")
+        with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), pytest.raises(OSError):
+            asyncio.run(run(address))
+    assert list(local.run(os.getpid).values()) != [os.getpid()]  # with it, the worker answers
+
+
+def test_a_local_cluster_shows_nothing_by_http(local):
+    for _, port in listening():
+        for page in ("status", "metrics", "json/identity.json", "info/main/workers.html", "health"):
+            with pytest.raises((urllib.error.URLError, OSError)) as refused:
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=5)
+            assert getattr(refused.value, "code", 404) == 404
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
+def test_no_other_user_can_write_where_dask_looks_for_modules(local):
+    def searched() -> list[str]:
+        return [path for path in sys.path if "dask-scratch-space" in path]
+
+    ((*found,),) = local.run(searched).values()
+    found = {path.split("dask-scratch-space")[0] for path in (*found, *searched())}
+    assert found
+    assert {stat.S_IMODE(os.stat(path).st_mode) for path in found} == {0o700}
+
+
+def test_a_dashboard_that_cannot_be_is_refused(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "bokeh" else name)
+    with pytest.raises(InputError, match="dashboard: Bokeh is not installed"), open_cluster("local", 1, None, True):
+        pass
+
+
+def test_without_cryptography_no_cluster_is_opened(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "cryptography" else name)
+    with pytest.raises(InputError, match="cluster: cryptography is not installed"), open_cluster("local", 1):
+        pass
 
 
 @pytest.mark.slow
@@ -265,23 +352,32 @@ job_script_prologue: ["source ~/nerif/bin/activate"]
 """
 
 
-def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path):
+def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypatch):
     pytest.importorskip("dask_jobqueue", reason="pip install 'nerif[cluster]'")
     file = tmp_path / "slurm.yaml"
     file.write_text(SLURM)
     assert read_slurm(file)["cores"] == 1  # one chunk at a time in a job
     file.write_text(SLURM.replace("jobs: 4", "jobs: 0"))
-    with pytest.raises(InputError, match="jobs: expected"):
-        slurm_cluster(file)
-    from dask_jobqueue import SLURMCluster
-
-    settings = read_slurm(file)
-    settings.pop("jobs")
-    with SLURMCluster(**settings) as jobs:
+    with pytest.raises(InputError, match="jobs: expected"), slurm_cluster(file):
+        pass
+    file.write_text(SLURM)
+    monkeypatch.setattr("dask_jobqueue.SLURMCluster.scale", lambda self, jobs: None)  # sbatch is not to be run
+    with slurm_cluster(file, tmp_path) as jobs:
         script = jobs.job_script()
+        (folder,) = tmp_path.glob(".nerif-*")
+        modes = [stat.S_IMODE(path.stat().st_mode) for path in (folder, folder / "key.pem")]
+        assert jobs.scheduler_address.startswith("tls://")
     for line in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=8", "#SBATCH -t 02:00:00", "#SBATCH --gres=gpu:1"):
         assert line in script
     assert "--nthreads 1" in script
+    # by TLS, with a key that is in no script and that nobody else can read
+    certificate, key = folder / "certificate.pem", folder / "key.pem"
+    assert f"--protocol tls:// --tls-ca-file {certificate} --tls-cert {certificate} --tls-key {key}" in script
+    assert modes == [0o700, 0o600]
+    assert not folder.exists()
+    assert "--no-dashboard --dashboard-address 127.0.0.1:0" in script
+    assert 'export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES="[]"' in script
+    assert 'export DASK_TEMPORARY_DIRECTORY="$(mktemp -d)"' in script
     # stack samples fill a worker's memory; switched off before what the file itself wants
     prologue = ["export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False", "source ~/nerif/bin/activate"]
     assert [line for line in script.splitlines() if line in prologue] == prologue
@@ -294,14 +390,15 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path):
         ("- 1", "expected names and values"),
         ("cores: 1\nmemory: 1GB\njob_script_prologue: module load x", "expected a list of shell lines"),
         ("cores: 4", "expected 'memory' of a job"),
+        ("cores: 1\nmemory: 1GB\nscheduler_options: eth0", "scheduler_options: expected e.g. {'host': '10.0.0.1'}"),
         ("cores: 4\nmemory: 8GB\nqueu: x", "unknown key 'queu'; the nearest known one is 'queue'"),
     ],
 )
 def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
     file = tmp_path / "slurm.yaml"
     file.write_text(text)
-    with pytest.raises(InputError, match=words):
-        slurm_cluster(file)
+    with pytest.raises(InputError, match=words), slurm_cluster(file):
+        pass
 
 
 @pytest.mark.parametrize(

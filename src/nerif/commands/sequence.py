@@ -38,6 +38,8 @@ class Sequence(Settings):
     """Of a local cluster; 0 for one for each GPU, or for each two cores."""
     threads: int = 0
     """Of each worker on a CPU; 0 for its share of the cores."""
+    dashboard: bool = False
+    """Serve Dask's dashboard on 127.0.0.1, where every user of this machine can look at it."""
     retry: bool = False
     """Try again frames that failed in an earlier run."""
     force: bool = False
@@ -63,7 +65,8 @@ def run(settings: Sequence) -> SequenceStore:
         return reconstruct_sequence(
             settings.out, settings.measurement, settings.reconstructor, settings.frames,
             cluster=settings.cluster, workers=settings.workers, threads=settings.threads,
-            retry=settings.retry, force=settings.force, on_progress=update, say=MONITOR.say,
+            dashboard=settings.dashboard, retry=settings.retry, force=settings.force, on_progress=update,
+            say=MONITOR.say,
         )  # fmt: skip
 
 

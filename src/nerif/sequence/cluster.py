@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import logging
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +19,7 @@ from nerif.conventions import InputError
 from nerif.toml import check_known
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Security
 
 __all__ = ["check_workers", "open_cluster", "slurm_cluster"]
 
@@ -28,7 +30,16 @@ CONFIG = {
     "distributed.worker.profile.enabled": False,  # an hour of stack samples is a gigabyte
 }
 ANSWER_WITHIN = "5s"  # a scheduler that is there already
-NO_PROFILE = "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False"  # a job does not inherit CONFIG
+LOOPBACK = "127.0.0.1"
+SILENT = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+"""Dask opens an HTTP server whether or not there is a dashboard; by default it shows logs and file names to anybody."""
+IN_JOBS = [
+    "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False",
+    'export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES="[]"',
+    'export DASK_TEMPORARY_DIRECTORY="$(mktemp -d)"',  # see _private
+    "trap 'rm -rf \"$DASK_TEMPORARY_DIRECTORY\"' EXIT",
+]
+"""Shell lines of a job, which does not inherit the configuration of the command."""
 PREFIX = ("tcp://", "tls://", "ucx://", "ws://", "wss://")
 
 
@@ -39,18 +50,25 @@ def _cores() -> int:
 
 
 @contextmanager
-def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
+def open_cluster(
+    where: str, workers: int = 0, shared: Path | None = None, dashboard: bool = False
+) -> Iterator[tuple[Client, int]]:
     """Give a client of the cluster and the threads that each worker may use (0: as it finds them); close it at the end.
+
+    Whoever can send a message to a Dask process can run code in it. So the processes of a cluster made here talk by
+    TLS and accept only the certificate of this run; those on this machine listen on the loopback alone.
 
     Parameters
     ----------
     where : "local"; "tcp://host:port" of a scheduler; or a YAML file for SLURM (docs/sequences.md)
     workers : of a local cluster; 0 for one for each GPU, or for each two cores
+    shared : directory that all jobs of SLURM can read, for their certificate; by default the current one
+    dashboard : serve Dask's dashboard on the loopback, where every user of this machine can look at it
 
     Raises
     ------
     InputError
-        If there is no such file or scheduler, or the file is not understood.
+        If there is no such file or scheduler, the file is not understood, or a package is missing.
     """
     try:
         import dask
@@ -67,14 +85,35 @@ def open_cluster(where: str, workers: int = 0) -> Iterator[tuple[Client, int]]:
         with client:
             yield client, 0
         return
-    with dask.config.set(CONFIG):
+    if dashboard and importlib.util.find_spec("bokeh") is None:
+        raise InputError("dashboard: Bokeh is not installed; pip install 'nerif[sequence]'")
+    with _private() as scratch, dask.config.set({**CONFIG, **({} if dashboard else SILENT), **scratch}):
         if where == "local":
             count = workers or torch.cuda.device_count() or max(1, _cores() // 2)
-            cluster, threads = _local_cluster(count), max(1, _cores() // count)
+            cluster, threads = _local_cluster(count, dashboard), max(1, _cores() // count)
         else:
-            cluster, threads = slurm_cluster(Path(where)), 0
-        with cluster, Client(cluster) as client:
+            cluster, threads = slurm_cluster(Path(where), shared, dashboard), 0
+        with cluster as running, Client(running) as client:
             yield client, threads
+
+
+@contextmanager
+def _private() -> Iterator[dict[str, str]]:
+    """Give Dask a scratch directory of its own, which no other user can write to: it puts that directory on sys.path.
+
+    Its default is a directory of a fixed name in the temporary directory, which anybody may have made before.
+    """
+    with tempfile.TemporaryDirectory(prefix="nerif-", ignore_cleanup_errors=True) as scratch:
+        yield {"temporary-directory": scratch}
+
+
+def _certificate() -> Security:
+    """A certificate of this run, held in memory, which every process of the cluster asks of the others."""
+    from distributed import Security
+
+    if importlib.util.find_spec("cryptography") is None:
+        raise InputError("cluster: cryptography is not installed; pip install 'nerif[sequence]'")
+    return Security.temporary()
 
 
 def check_workers(client: Client) -> None:
@@ -99,17 +138,37 @@ def check_workers(client: Client) -> None:
             raise InputError(f"cluster: worker {worker}: expected nerif {__version__} as here, got {version}")
 
 
-def _local_cluster(workers: int) -> Any:
-    """A process for each worker, each with a GPU of its own where there are GPUs."""
+@contextmanager
+def _certificate_files(shared: Path) -> Iterator[Security]:
+    """Such a certificate as files, for jobs: dask-jobqueue's own ones stay until its garbage is collected."""
+    from distributed import Security
+
+    temporary = _certificate()
+    with tempfile.TemporaryDirectory(prefix=".nerif-", dir=shared, ignore_cleanup_errors=True) as folder:
+        certificate, key = Path(folder) / "certificate.pem", Path(folder) / "key.pem"
+        certificate.write_text(temporary.tls_ca_file)
+        key.touch(0o600)
+        key.write_text(temporary.tls_worker_key)
+        files = {f"tls_{role}_cert": str(certificate) for role in ("client", "scheduler", "worker")}
+        files |= {f"tls_{role}_key": str(key) for role in ("client", "scheduler", "worker")}
+        yield Security(require_encryption=True, tls_ca_file=str(certificate), **files)
+
+
+def _local_cluster(workers: int, dashboard: bool = False) -> Any:
+    """A process for each worker, each with a GPU of its own where there are GPUs; none listens beyond the loopback."""
     from distributed import Nanny, Scheduler, SpecCluster
 
-    gpus = _gpus()
+    gpus, security = _gpus(), _certificate()
+    # dashboard_address is that of the HTTP server, which Dask opens with or without a dashboard
+    common = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0"}
+    common |= {"protocol": "tls://", "security": security}
     specification = {}
     for i in range(workers):
         environment = {"CUDA_VISIBLE_DEVICES": gpus[i % len(gpus)]} if gpus else {}
         specification[i] = {
             "cls": Nanny,
             "options": {
+                **common,
                 "nthreads": 1,
                 "env": environment,
                 "memory_limit": 0,
@@ -117,9 +176,8 @@ def _local_cluster(workers: int) -> Any:
                 "silence_logs": logging.ERROR,
             },
         }
-    dashboard = {"dashboard": True, "dashboard_address": "localhost:0"} if _has_bokeh() else {"dashboard": False}
-    scheduler = {"cls": Scheduler, "options": {"host": "localhost", "port": 0, **dashboard}}
-    return SpecCluster(workers=specification, scheduler=scheduler, silence_logs="ERROR")
+    scheduler = {"cls": Scheduler, "options": {**common, "dashboard": dashboard}}
+    return SpecCluster(workers=specification, scheduler=scheduler, security=security, silence_logs="ERROR")
 
 
 def _gpus() -> list[str]:
@@ -129,23 +187,19 @@ def _gpus() -> list[str]:
     return (named or [str(i) for i in range(count)])[:count]
 
 
-def _has_bokeh() -> bool:
-    try:
-        import bokeh  # noqa: F401
-    except ImportError:
-        return False
-    return True
+@contextmanager
+def slurm_cluster(path: Path, shared: Path | None = None, dashboard: bool = False) -> Iterator[Any]:
+    """Give the SLURM cluster of a YAML file: `jobs`, and what dask_jobqueue.SLURMCluster takes.
 
-
-def slurm_cluster(path: Path) -> Any:
-    """Return the SLURM cluster of a YAML file: `jobs`, and what dask_jobqueue.SLURMCluster takes.
+    Scheduler and workers listen on the network, since jobs run on other machines, but talk by TLS. While they are
+    there, certificate and key are in a directory of `shared` that no other user can enter.
 
     Raises
     ------
     InputError
         If the file is missing or no YAML, a key is unknown, or dask-jobqueue is not installed.
     """
-    settings = read_slurm(path)
+    settings = {"shared_temp_directory": shared or Path.cwd(), **read_slurm(path)}
     jobs = settings.pop("jobs", 1)
     if not isinstance(jobs, int) or jobs < 1:
         raise InputError(f"{path}: jobs: expected a number of jobs of 1 or more, got {jobs!r}")
@@ -154,23 +208,42 @@ def slurm_cluster(path: Path) -> Any:
     except ImportError:
         raise InputError("cluster: dask-jobqueue is not installed; pip install 'nerif[cluster]'") from None
     check_known(settings, _slurm_names(), str(path), more="; see docs/sequences.md")
-    cluster = SLURMCluster(**settings)
-    cluster.scale(jobs=jobs)
-    return cluster
+    http = f"{LOOPBACK}:0"
+    options = _of_site(path, settings, "scheduler_options", {"host": "10.0.0.1"})
+    scheduler = {"dashboard": dashboard, "dashboard_address": http, **options}
+    words = _of_site(path, settings, "worker_extra_args", ["--lifetime", "55m"])
+    extra = [*words, "--no-dashboard", "--dashboard-address", http]
+    given = {**settings, "scheduler_options": scheduler, "worker_extra_args": extra}
+    with (
+        _certificate_files(Path(settings["shared_temp_directory"])) as security,
+        SLURMCluster(**given, security=security) as cluster,
+    ):
+        cluster.scale(jobs=jobs)
+        yield cluster
+
+
+def _of_site(path: Path, settings: dict[str, Any], name: str, example: Any) -> Any:
+    """A setting of the file or, without one, of Dask's own configuration of SLURM, of the type of the example."""
+    import dask
+
+    value = settings.get(name) or dask.config.get(f"jobqueue.slurm.{name.replace('_', '-')}", None) or type(example)()
+    if not isinstance(value, type(example)):
+        raise InputError(f"{path}: {name}: expected e.g. {example}, got {value!r}")
+    return value
 
 
 def _slurm_names() -> list[str]:
-    """What SLURMCluster understands: its own parameters and those of its jobs."""
+    """What SLURMCluster understands and is not fixed here: its own parameters and those of its jobs."""
     from dask_jobqueue.core import Job, JobQueueCluster
     from dask_jobqueue.slurm import SLURMJob
 
     parts = (inspect.signature(part.__init__).parameters.values() for part in (JobQueueCluster, Job, SLURMJob))
     named = [p.name for part in parts for p in part if p.kind is not p.VAR_KEYWORD]
-    return sorted(set(named) - {"self", "scheduler", "job_cls"})
+    return sorted(set(named) - {"self", "scheduler", "job_cls", "security", "protocol"})
 
 
 def read_slurm(path: Path) -> dict[str, Any]:
-    """Read the settings of a SLURM cluster, with the defaults that a worker of ours wants: one process, one thread."""
+    """Read the settings of a SLURM cluster, with our defaults: one process, one thread."""
     import yaml
 
     if not path.is_file():
@@ -192,5 +265,5 @@ def read_slurm(path: Path) -> dict[str, Any]:
             f'{path}: job_script_prologue: expected a list of shell lines, ["source ~/nerif/bin/activate"], '
             f"got {prologue!r}"
         )
-    prologue = [NO_PROFILE, *prologue]
+    prologue = [*IN_JOBS, *prologue]
     return {"processes": 1, "job_cpu": wanted["cores"], **wanted, "cores": 1, "job_script_prologue": prologue}

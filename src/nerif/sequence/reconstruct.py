@@ -33,6 +33,7 @@ def reconstruct_sequence(
     cluster: str = "local",
     workers: int = 0,
     threads: int = 0,
+    dashboard: bool = False,
     retry: bool = False,
     force: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
@@ -52,6 +53,7 @@ def reconstruct_sequence(
     cluster : "local", tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md)
     workers : of a local cluster; 0 for one for each GPU, or for each two cores
     threads : of each worker on a CPU; 0 for its share of the cores
+    dashboard : serve Dask's dashboard on 127.0.0.1, where every user of this machine can look at it
     retry : try again frames that failed in an earlier run
     force : begin anew, whatever `out` holds
     on_progress : told as frames are settled
@@ -95,8 +97,8 @@ def reconstruct_sequence(
     if missing:
         say(f"{out}: {missing} of {len(sequence)} frames to do, in chunks of {settings.chunk}")
         try:
-            with open_cluster(cluster, workers) as (client, share):
-                if client.dashboard_link:
+            with open_cluster(cluster, workers, out.parent.resolve(), dashboard) as (client, share):
+                if dashboard and client.dashboard_link:
                     say(f"dashboard: {client.dashboard_link}")
                 say("waiting for workers")
                 check_workers(client)
