@@ -9,7 +9,7 @@ with the most steps of those from nothing, so what they forget or pile up on the
 which frames from nothing reach the same error (on the line between the two nearest, in logarithms; a bound where all of
 them are worse or better), over the time taken. "Change" is the difference of one frame from the next in the truth,
 of its variation. Truth and reconstruction meet only in the errors.
-Needs nerif[sequence].
+Needs the extra `sequence`.
 """
 
 from __future__ import annotations

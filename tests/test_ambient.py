@@ -82,7 +82,7 @@ def test_a_truth_over_an_unknown_ambient_is_refused(truth, perfect, tmp_path, ca
 
 
 def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_path):
-    pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
+    pytest.importorskip("zarr", reason="pip install '.[sequence]'")
     from nerif.fields.mlp import Network, NetworkShape, NeuralField
     from nerif.measurement_sequence import MeasurementSequence
     from nerif.sequence.evaluation import evaluate_sequence

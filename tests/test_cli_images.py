@@ -297,7 +297,7 @@ def test_a_mirrored_camera_is_refused(copy, capsys):
 
 @pytest.mark.slow
 def test_many_flow_pictures_become_a_sequence(copy, capsys):
-    pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
+    pytest.importorskip("zarr", reason="pip install '.[sequence]'")
     from nerif.measurement_sequence import MeasurementSequence
 
     views = [folder for folder in sorted((copy / "pictures").iterdir()) if (folder / "flow").is_dir()]

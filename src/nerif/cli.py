@@ -70,7 +70,10 @@ def _run(words: list[str]) -> int:
         return _refuse(f"unknown verb '{verb}'; the nearest known one is '{near[0]}'; see nerif --help")
 
     from nerif.conventions import InputError
+    from nerif.installing import stranger
 
+    if warning := stranger():
+        print(f"nerif: {warning}", file=sys.stderr)
     try:
         command = importlib.import_module(ELSEWHERE.get(verb, f"nerif.commands.{verb}"))
         importlib.import_module("nerif.reconstruction.device").keep_freed_memory()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
+from nerif.installing import install
 from nerif.measurement import Measurement
 from nerif.measurement_file import CONVENTIONS, PLAIN, known_conventions, map_names, variables
 from nerif.netcdf import reading, values
@@ -40,7 +41,7 @@ def require_zarr() -> None:
     try:
         import zarr  # noqa: F401
     except ImportError:
-        raise InputError("sequences: zarr is not installed; pip install 'nerif[sequence]'") from None
+        raise InputError(f"sequences: zarr is not installed; {install('sequence')}") from None
 
 
 def add_frames(

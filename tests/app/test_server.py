@@ -119,7 +119,7 @@ def test_a_folder_that_is_none_is_said_in_one_line(tmp_path, capsys):
 def test_without_nicegui_the_remedy_is_said(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main(["app", str(tmp_path)]) == 2
-    assert "pip install 'nerif[app]'" in capsys.readouterr().err
+    assert "pip install 'nerif-bost[app]'" in capsys.readouterr().err
 
 
 def test_ctrl_c_ends_it_cleanly(tmp_path: Path):

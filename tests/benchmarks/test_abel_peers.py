@@ -61,7 +61,7 @@ def test_the_projection_is_the_integral_along_rays(seen):
 @pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.title)
 def test_every_peer_finds_the_jet(peer, seen):
     if peer.name != "quadrature":
-        pytest.importorskip("abel", reason="pip install 'nerif[benchmarks]'")
+        pytest.importorskip("abel", reason="pip install '.[benchmarks]'")
     displacement, view = seen
     grid = Grid.of_resolution(EVALUATED, 50)
     truth = JET.sample(grid).numpy()

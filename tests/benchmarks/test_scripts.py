@@ -32,7 +32,7 @@ SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in S
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_script(name, tmp_path):
     if name == "one_camera":
-        pytest.importorskip("abel", reason="pip install 'nerif[benchmarks]'")
+        pytest.importorskip("abel", reason="pip install '.[benchmarks]'")
     table = tmp_path / "results" / "table.md"
     words = [*SMALLEST[name].split(), "--write", str(table)] if name in SMALLEST else ["--help"]
     command = [sys.executable, str(FOLDER / f"{name}.py"), *words]

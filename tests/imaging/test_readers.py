@@ -334,7 +334,7 @@ def test_lavision_files_that_hold_something_else(tmp_path, stack12, lavision):
 def test_lavision_without_its_package(tmp_path, monkeypatch, suffix):
     monkeypatch.setitem(sys.modules, "lvpyio", None)
     (tmp_path / f"a.{suffix}").touch()
-    with pytest.raises(InputError, match=r"pip install 'nerif\[lavision\]'.*LaVision's own terms"):
+    with pytest.raises(InputError, match=r"pip install 'nerif-bost\[lavision\]'.*LaVision's own terms"):
         open_frames(tmp_path / f"a.{suffix}")
 
 

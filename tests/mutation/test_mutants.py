@@ -34,7 +34,7 @@ from nerif.simulation import simulate
 from nerif.volume import Volume
 from nerif.volume_file import read_volume, write_netcdf
 
-pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
+pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 
 VOXELS = Tikhonov(voxels=6, device="cpu", iterations=2, coarse_to_fine=False, regularisation=1e-3)
 NETWORK = NeRIF(

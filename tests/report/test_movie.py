@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("pyvista", reason="pip install 'nerif[movie]'")
-pytest.importorskip("imageio_ffmpeg", reason="pip install 'nerif[movie]'")
+pytest.importorskip("pyvista", reason="pip install '.[movie]'")
+pytest.importorskip("imageio_ffmpeg", reason="pip install '.[movie]'")
 
 from imageio_ffmpeg import get_ffmpeg_exe
 

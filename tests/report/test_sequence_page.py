@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
+pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 
 from nerif.cli import main
 from nerif.conventions import InputError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("zarr", reason="pip install 'nerif[sequence]'")
+pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 
 from sequence_films import simulated
 

@@ -24,7 +24,7 @@ import pytest
 
 from sequence_films import COLD, QUICK, blank, simulated
 
-pytest.importorskip("distributed", reason="pip install 'nerif[sequence]'")
+pytest.importorskip("distributed", reason="pip install '.[sequence]'")
 
 from nerif import __version__
 from nerif.cli import main
@@ -353,7 +353,7 @@ job_script_prologue: ["source ~/nerif/bin/activate"]
 
 
 def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypatch):
-    pytest.importorskip("dask_jobqueue", reason="pip install 'nerif[cluster]'")
+    pytest.importorskip("dask_jobqueue", reason="pip install '.[cluster]'")
     file = tmp_path / "slurm.yaml"
     file.write_text(SLURM)
     assert read_slurm(file)["cores"] == 1  # one chunk at a time in a job

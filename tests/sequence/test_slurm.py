@@ -11,7 +11,7 @@ import pytest
 
 from sequence_films import QUICK
 
-pytest.importorskip("dask_jobqueue", reason="pip install 'nerif[cluster]'")
+pytest.importorskip("dask_jobqueue", reason="pip install '.[cluster]'")
 
 from nerif.sequence.store import DONE, SequenceStore
 

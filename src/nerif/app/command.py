@@ -12,6 +12,7 @@ import tyro
 
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
+from nerif.installing import install
 
 __all__ = ["App", "main", "run"]
 
@@ -45,7 +46,7 @@ class App(Settings):
 def run(settings: App) -> None:
     """Serve until Ctrl-C."""
     if importlib.util.find_spec("nicegui") is None:
-        raise InputError("app: expected NiceGUI, which is not installed; pip install 'nerif[app]'")
+        raise InputError(f"app: expected NiceGUI, which is not installed; {install('app')}")
     from nerif.app.server import Address, serve
 
     serve(settings.folder, Address.of(settings.host, settings.port, settings.token), settings.browser)

@@ -14,6 +14,7 @@ from nerif.commands.output import MONITOR, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.geometry import Ring
+from nerif.installing import install
 from nerif.reconstruction.neural import NeRIF
 from nerif.result import ResultDirectory
 from nerif.simulation import Simulation
@@ -74,7 +75,7 @@ def run(settings: Demo) -> None:
     evaluate.run(evaluate.Evaluate(settings.out, truth=simulate.truth_path(measured)))
     page = write_report(settings.out, monitor=MONITOR)
     say(f"Open {page} in a browser: the field, the views, and whether it can be trusted.")
-    say(f"Or in the app, with everything that can be done next: nerif app {settings.out} (pip install 'nerif[app]')")
+    say(f"Or in the app, with everything that can be done next: nerif app {settings.out} ({install('app')})")
     say(f"Open {settings.out}/volume.vti in ParaView; figures for print: nerif figures {settings.out}")
 
 

@@ -13,6 +13,7 @@ from nerif.commands.methods import RECORDS, Reconstruct
 from nerif.commands.output import MONITOR
 from nerif.commands.settings import flag_value, read_settings, value_given
 from nerif.conventions import InputError
+from nerif.installing import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Step
 from nerif.reconstruction.presets import preset
 from nerif.result import RUN
@@ -40,7 +41,7 @@ def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise InputError("tensorboard: not installed; pip install 'nerif[tensorboard]'") from None
+        raise InputError(f"tensorboard: not installed; {install('tensorboard')}") from None
     with ExitStack() as stack:
         writer: list[SummaryWriter] = []
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from nerif.conventions import InputError
 from nerif.imaging.frames import Frames
+from nerif.installing import install
 
 __all__ = ["FileFrames"]
 
@@ -254,7 +255,7 @@ def _lvpyio() -> Any:
     except ImportError:
         raise InputError(
             "LaVision files (.im7, .vc7): expected the package lvpyio, which is not installed; "
-            "get it by pip install 'nerif[lavision]' (it is under LaVision's own terms)"
+            f"get it by {install('lavision')} (it is under LaVision's own terms)"
         ) from None
     return lvpyio
 

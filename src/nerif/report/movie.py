@@ -13,6 +13,7 @@ import numpy as np
 from nerif.atomic import atomic
 from nerif.conventions import InputError
 from nerif.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
+from nerif.installing import install
 from nerif.report.isosurface import default_level, filled
 from nerif.volume import Volume, field_of
 from nerif.volume_sequence import VolumeSequence
@@ -222,7 +223,7 @@ def _writer(path: Path, frames_per_second: float) -> Any:
             return imageio.get_writer(path, mode="I", duration=1000 / frames_per_second, loop=0)
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
-        raise InputError(f"movie: {error.name} is not installed; pip install 'nerif[movie]'") from None
+        raise InputError(f"movie: {error.name} is not installed; {install('movie')}") from None
     # yuv420p is what browsers and slides play
     return imageio.get_writer(
         path, fps=frames_per_second, codec="libx264", quality=8, pixelformat="yuv420p", macro_block_size=2

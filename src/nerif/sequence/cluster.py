@@ -16,6 +16,7 @@ import torch
 
 from nerif import __version__
 from nerif.conventions import InputError
+from nerif.installing import install
 from nerif.toml import check_known
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def open_cluster(
         import dask
         from distributed import Client
     except ImportError:
-        raise InputError("cluster: Dask is not installed; pip install 'nerif[sequence]'") from None
+        raise InputError(f"cluster: Dask is not installed; {install('sequence')}") from None
     if where.startswith(PREFIX):
         with dask.config.set({"distributed.comm.timeouts.connect": ANSWER_WITHIN}):
             try:
@@ -86,7 +87,7 @@ def open_cluster(
             yield client, 0
         return
     if dashboard and importlib.util.find_spec("bokeh") is None:
-        raise InputError("dashboard: Bokeh is not installed; pip install 'nerif[sequence]'")
+        raise InputError(f"dashboard: Bokeh is not installed; {install('sequence')}")
     with _private() as scratch, dask.config.set({**CONFIG, **({} if dashboard else SILENT), **scratch}):
         if where == "local":
             count = workers or torch.cuda.device_count() or max(1, _cores() // 2)
@@ -112,7 +113,7 @@ def _certificate() -> Security:
     from distributed import Security
 
     if importlib.util.find_spec("cryptography") is None:
-        raise InputError("cluster: cryptography is not installed; pip install 'nerif[sequence]'")
+        raise InputError(f"cluster: cryptography is not installed; {install('sequence')}")
     return Security.temporary()
 
 
@@ -130,8 +131,8 @@ def check_workers(client: Client) -> None:
         versions = client.run(eval, ask)
     except ImportError as error:
         raise InputError(
-            f"cluster: a worker cannot import nerif ({error}); install 'nerif[sequence]' where it runs, or name that "
-            "environment in job_script_prologue"
+            f"cluster: a worker cannot import nerif ({error}); {install('sequence')} where it runs, or name "
+            "that environment in job_script_prologue"
         ) from None
     for worker, version in versions.items():
         if version != __version__:
@@ -206,7 +207,7 @@ def slurm_cluster(path: Path, shared: Path | None = None, dashboard: bool = Fals
     try:
         from dask_jobqueue import SLURMCluster
     except ImportError:
-        raise InputError("cluster: dask-jobqueue is not installed; pip install 'nerif[cluster]'") from None
+        raise InputError(f"cluster: dask-jobqueue is not installed; {install('cluster')}") from None
     check_known(settings, _slurm_names(), str(path), more="; see docs/sequences.md")
     http = f"{LOOPBACK}:0"
     options = _of_site(path, settings, "scheduler_options", {"host": "10.0.0.1"})

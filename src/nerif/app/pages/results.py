@@ -23,6 +23,7 @@ from nerif.commands.export import Export
 from nerif.commands.figures import Figures
 from nerif.commands.movie import MovieCommand
 from nerif.exports import FORMATS
+from nerif.installing import install
 from nerif.report.movie import STYLES
 from nerif.report.pages import JOURNALS
 
@@ -147,7 +148,7 @@ class ResultsPage:
     def _export(self) -> None:
         with ui.element("div").classes("halves"):
             if self.row.film:
-                with card("A movie", "Every frame drawn off-screen; needs the extra nerif[movie]."):
+                with card("A movie", f"Every frame drawn off-screen; needs {install('movie')}."):
                     self._movie()
                 return
             with card("The field, for other programs", "On any grid: a network has no voxels of its own."):
