@@ -33,7 +33,7 @@ def test_an_error_leaves_what_was_there_and_no_part(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.toml"]
 
 
-def test_a_directory_replaces_a_directory_or_a_file_and_what_a_killed_run_left_is_gone(tmp_path):
+def test_a_directory_replaces_a_directory_but_a_file_does_not_and_what_a_killed_run_left_is_gone(tmp_path):
     path = tmp_path / "s.zarr"
     path.mkdir()
     (path / "old").write_text("1")
@@ -45,7 +45,7 @@ def test_a_directory_replaces_a_directory_or_a_file_and_what_a_killed_run_left_i
         part.mkdir()
         (part / "new").write_text("1")
     assert [p.name for p in path.iterdir()] == ["new"]
-    with atomic(path) as part:
-        part.write_text("a file now")
-    assert path.read_text() == "a file now"
+    with pytest.raises(OSError), atomic(path) as part:
+        part.write_text("a file")
+    assert [p.name for p in path.iterdir()] == ["new"]
     assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]

@@ -12,7 +12,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions", "installing", "json_file", "netcdf", "toml"),
+    ("atomic", "conventions", "installing", "json_file", "netcdf", "own_files", "toml"),
     ("geometry",),
     ("techniques",),
     ("drawing",),

@@ -12,6 +12,7 @@ from nerif import workflow
 from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.monitor import Monitor
+from nerif.own_files import WRITTEN
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.tikhonov import Tikhonov
@@ -33,7 +34,7 @@ def made(measurement, tmp_path_factory: pytest.TempPathFactory) -> tuple[ResultD
 def test_python_writes_the_whole_directory(made, measurement, capsys):
     out, result = made
     assert capsys.readouterr().out == ""
-    assert {p.name for p in out.path.iterdir()} == set(FILES) - {REPORT, CALIBRATION, *MERIDIAN}
+    assert {p.name for p in out.path.iterdir()} == {WRITTEN, *FILES} - {REPORT, CALIBRATION, *MERIDIAN}
     found = out.read()
     assert not found.missing
     assert [v["name"] for v in found.metrics["views"] if v["held_out"]] == ["144deg"]

@@ -16,14 +16,14 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path` that takes its name at the end, and is removed if anything goes wrong.
 
     The temporary name is hidden and keeps the ending, by which libraries choose a format. What is written may be a file
-    or a directory; either replaces what stands at `path`.
+    or a directory; a file replaces a file, and a directory whatever stands at `path`.
     """
     path = Path(path)
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     _remove(part)  # left by a process that was killed
     try:
         yield part
-        if path.is_dir() or (part.is_dir() and path.exists()):
+        if part.is_dir():
             _remove(path)
         os.replace(part, path)
     finally:

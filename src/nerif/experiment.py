@@ -21,6 +21,7 @@ from nerif.imaging.background import Background
 from nerif.imaging.bundle import Pose
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.targets import CalibrationTarget
+from nerif.own_files import WRITTEN, OwnFiles
 from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
 from nerif.toml import write_toml
 from nerif.volume import Volume
@@ -35,6 +36,9 @@ SIDES = {
     (0, -1): ("x+", "z+", "y-"),
 }
 """World axes along the axes of an upright target that faces the x or y direction of the world named by the key."""
+
+KINDS = ("target", "background", "reference", "flow")
+"""Folders of a view."""
 
 ORIGIN = torch.zeros(3, dtype=torch.float64)
 
@@ -85,12 +89,15 @@ class Experiment:
         Raises
         ------
         InputError
-            If truth_voxels, or a setting of target or background, can't be.
+            If truth_voxels, or a setting of target or background, can't be; or if a view has pictures already that this
+            program did not write: renamed ones would be taken for pictures of the experiment.
         """
         if truth_voxels < 1:
             raise InputError(f"truth_voxels: expected at least 1, got {truth_voxels}")
+        _check_pictures(folder, cameras)
         self._write_truth(folder / "truth", cameras, phantom, box, n_ambient, truth_voxels)
-        self._write_settings(folder / "calibrate.toml", cameras)
+        with OwnFiles(folder).writing("calibrate.toml") as path:
+            self._write_settings(path, cameras)
         for i, camera in enumerate(cameras):
             self._background_pictures(folder / camera.name, camera, i, phantom, box, n_ambient, on_picture)
         if self.poses:
@@ -100,10 +107,13 @@ class Experiment:
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float, voxels: int
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        write_cameras(folder / "calibration.toml", [CalibratedCamera.from_camera(c) for c in cameras])
+        files = OwnFiles(folder)
+        with files.writing("calibration.toml") as path:
+            write_cameras(path, [CalibratedCamera.from_camera(c) for c in cameras])
         grid = Grid.of_resolution(box, voxels)
         volume = Volume(phantom.sample(grid), grid, attributes={"n_ambient": n_ambient})
-        write_netcdf(folder / "volume.nc", [volume])
+        with files.writing("volume.nc") as path:
+            write_netcdf(path, [volume])
 
     def _write_settings(self, path: Path, cameras: Sequence[Camera]) -> None:
         """Settings of nerif calibrate by which the rig's own world comes out."""
@@ -179,7 +189,19 @@ class Experiment:
         counts = self.sensor.expose(light, seed)
         # a 16-bit file tells that only so many bits of it are used
         tags = [(281, "H", 1, 2**self.sensor.bits - 1, False)]
-        tifffile.imwrite(path, counts, extratags=tags)
+        with OwnFiles(path.parent).writing(path.name):
+            tifffile.imwrite(path, counts, extratags=tags)
+
+
+def _check_pictures(folder: Path, cameras: Sequence[Camera]) -> None:
+    for place in (folder / camera.name / kind for camera in cameras for kind in KINDS):
+        files = OwnFiles(place)
+        strange = [p.name for p in sorted(place.glob("*")) if p.name != WRITTEN and p.name not in files]
+        if strange:
+            raise InputError(
+                f"{place}: holds {strange[0]}, which nerif render did not write, and was left as it is; "
+                "give another --out"
+            )
 
 
 def _lens_as_calibrated(camera: Camera) -> dict[str, float]:

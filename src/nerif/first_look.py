@@ -132,7 +132,8 @@ class FirstLook:
         scores = evaluate_views(both)
         views, used = ([v for v in scores if v["held_out"] is held] for held in (True, False))
         taken = time.monotonic() - started
-        write_json(self._directory / SCORES, {"views": views, "fitted_views": used, "seconds": taken})
+        with self._directory.writing(SCORES) as path:
+            write_json(path, {"views": views, "fitted_views": used, "seconds": taken})
         for v in views:
             say(f"{name}, not seen so far, is predicted with CC {v['cc']:.4f}, rms error {rms_text(v)}")
         return result

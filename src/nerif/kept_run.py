@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -29,7 +28,7 @@ class KeptRun:
 
     Parameters
     ----------
-    directory : of its own
+    directory : of its own, in which only what this program wrote is replaced
     reconstructor : settings
     data : what is reconstructed
     start : field to begin from, or None
@@ -83,7 +82,7 @@ class KeptRun:
                 write_state(self.directory.path, result.state)
         elif not result.outcome.failed:
             self.directory.write_field(dataclasses.replace(result, state=None))
-            (self.directory / CHECKPOINT).unlink(missing_ok=True)
+            self.directory.files.remove([CHECKPOINT])
         return result
 
     def _has(self, name: str) -> bool:
@@ -95,14 +94,14 @@ class KeptRun:
         return Reconstruction(*self.directory.field(), [], kept, settings, quantity=self.directory.quantity())
 
     def _noted(self, resumed: bool) -> OnStep:
-        """Note at the first step what is asked for, in a directory without anything else."""
+        """Note at the first step what is asked for, in a directory without anything of an earlier run."""
         done: list[bool] = [resumed]
 
         def note(step: Step) -> None:
             if not done[0]:
-                shutil.rmtree(self.directory.path, ignore_errors=True)
-                self.directory.path.mkdir(parents=True)
-                with atomic(self.directory / ASKED) as part:
+                self.directory.files.remove()
+                self.directory.path.mkdir(parents=True, exist_ok=True)
+                with self.directory.writing(ASKED) as path, atomic(path) as part:
                     part.write_text(self._asked)
                 done[0] = True
 

@@ -27,6 +27,7 @@ from nerif.json_file import write_json
 from nerif.measurement import Measurement
 from nerif.monitor import Monitor
 from nerif.observation import Observation
+from nerif.own_files import OwnFiles
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
 from nerif.reconstruction.trials import best_covered
@@ -158,7 +159,8 @@ class Live:
             entries[name] = getattr(step, name)
         names = list(dict.fromkeys(name for point in self._curve for name in point))
         curve = {name: [point.get(name, float("nan")) for point in self._curve] for name in names}
-        write_json(self.directory / LIVE, {**entries, "curve": curve})
+        with OwnFiles(self.directory).writing(LIVE) as path:
+            write_json(path, {**entries, "curve": curve})
 
     @torch.no_grad()
     def _look(self, title: str, step: Step, held_out: bool) -> None:
@@ -174,7 +176,7 @@ class Live:
             measured, predicted = self._seen(field, observation, forward)
             arrays |= {"measured": measured, "predicted": predicted}
             about |= {"view": self.view, "components": observation.components, "unit": observation.technique.unit}
-        with atomic(self.directory / LIVE_LOOK) as part:
+        with OwnFiles(self.directory).writing(LIVE_LOOK) as path, atomic(path) as part:
             np.savez(part, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
     def _shown(self) -> tuple[Observation, ForwardModel] | None:

@@ -5,6 +5,7 @@ Each frame has chunks of its own, so frames are written and read one by one, by 
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     import xarray as xr
     import zarr
 
-__all__ = ["MeasurementSequence", "add_frames", "require_zarr"]
+__all__ = ["MeasurementSequence", "add_frames", "check_store", "require_zarr"]
 
 WRITTEN = "written"
 """Variable (time,) that is 1 where a frame is complete; stores of other programs may lack it."""
@@ -42,6 +43,36 @@ def require_zarr() -> None:
         import zarr  # noqa: F401
     except ImportError:
         raise InputError(f"sequences: zarr is not installed; {install('sequence')}") from None
+
+
+MEASURED = ("a measurement over time", WRITTEN)
+
+
+def check_store(path: Path, kind: tuple[str, str]) -> None:
+    """Refuse to replace anything but a store of the same kind, with nothing in it that is no part of the store.
+
+    Parameters
+    ----------
+    path : of what is to be replaced, which need not be there
+    kind : what the store holds; the name of an attribute, or of an array, that tells it from others
+    """
+    if not os.path.lexists(path):
+        return
+    what, mark = kind
+    other = InputError(f"{path}: exists already, is not {what}, and was left as it is; give another --out")
+    try:
+        about = json.loads((path / "zarr.json").read_text())
+        known = mark in about["attributes"] or (path / mark / "zarr.json").is_file()
+    except (OSError, ValueError, KeyError, TypeError):
+        raise other from None
+    if not known:
+        raise other
+    parts = {"zarr.json", *(found.parent.name for found in path.glob("*/zarr.json"))}
+    strange = sorted({found.name for found in path.iterdir()} - parts)
+    if strange:
+        raise InputError(
+            f"{path}: not overwritten, since {', '.join(strange)} in it is no part of the store; move it elsewhere"
+        )
 
 
 def add_frames(
@@ -171,7 +202,7 @@ class MeasurementSequence:
         Raises
         ------
         InputError
-            If the store exists, unless forced, or the times do not increase.
+            If the store exists, unless forced, or the times do not increase; if anything else is there, always.
         """
         import numpy as np
         import zarr
@@ -181,6 +212,7 @@ class MeasurementSequence:
             raise InputError(f"times: expected increasing instants in s, got {_short(times)}")
         if path.exists() and not force:
             raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
+        check_store(path, MEASURED)
         dataset = like.to_dataset()
         # the static variables by xarray, those of each frame as empty arrays of one chunk a frame
         maps = [name for name in map_names() if name in dataset]

@@ -6,8 +6,8 @@ import csv
 import json
 import math
 import os
-import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +23,7 @@ from nerif.geometry.symmetry import Symmetry
 from nerif.json_file import write_json
 from nerif.measurement import Measurement
 from nerif.meridian import Meridian
+from nerif.own_files import WARN, OwnFiles, remove_empty
 from nerif.reconstruction import files as kept
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
@@ -116,10 +117,12 @@ class ResultDirectory:
     Parameters
     ----------
     path : of the directory, which need not be there yet
+    say : is given a line about each file of somebody else that is renamed or left; a warning by default
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], say: Callable[[str], None] = WARN) -> None:
         self.path = Path(path)
+        self.files = OwnFiles(self.path, say)
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -154,16 +157,31 @@ class ResultDirectory:
         self.write_settings(settings)
 
     def clear(self) -> None:
-        """Remove the files of a reconstruction, and nothing else."""
-        for name in (*FILES, *MERIDIAN, LIVE, LIVE_LOOK):
-            (self.path / name).unlink(missing_ok=True)
-        for name in (ENSEMBLE, FIRST_LOOK, FIGURES):
-            shutil.rmtree(self.path / name, ignore_errors=True)
+        """Remove the files that this program wrote, and nothing else.
+
+        What somebody else wrote under a name that a run needs is renamed; a calibration only once one is written.
+        """
+        of_a_run = (*FILES, *MERIDIAN, LIVE, LIVE_LOOK)
+        self.files.remove(of_a_run)
+        self.files.set_aside([name for name in of_a_run if name != CALIBRATION])
+        if self.has(CALIBRATION):
+            self.files.say(f"{self.path / CALIBRATION}: left as it is; this run did not write it")
+        ensemble = self.path / ENSEMBLE
+        for folder in (*sorted(ensemble.glob("[0-9]*")), self.path / FIRST_LOOK, self.path / FIGURES):
+            OwnFiles(folder, self.files.say).remove()
+        remove_empty(ensemble)
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """Give the path to write a file of the result to; every one is written by this."""
+        with self.files.writing(name) as path:
+            yield path
 
     def write_settings(self, settings: Mapping[str, Any], about: Mapping[str, Any] | None = None) -> None:
         """Write run.toml: settings under the names of the flags, and what came out in the table [about]."""
         table = {**settings, "about": {"nerif": __version__, **(about or {})}}
-        write_toml(self.path / RUN, _without_none(table), RUN_HEAD)
+        with self.writing(RUN) as path:
+            write_toml(path, _without_none(table), RUN_HEAD)
 
     def write_field(self, result: Reconstruction) -> None:
         """Write the field and, where there is one, the checkpoint to go on from."""
@@ -174,14 +192,15 @@ class ResultDirectory:
     def write_history(self, history: Sequence[Mapping[str, float]]) -> None:
         """Write history.csv, a line a record, blank where a record lacks a column."""
         columns = list(dict.fromkeys(key for record in history for key in record))
-        with atomic(self.path / HISTORY) as part, part.open("w", newline="") as file:
+        with self.writing(HISTORY) as path, atomic(path) as part, part.open("w", newline="") as file:
             writer = csv.DictWriter(file, columns, restval="")
             writer.writeheader()
             writer.writerows(history)
 
     def write_metrics(self, entries: Mapping[str, Any]) -> None:
         """Write metrics.json afresh: scores of an earlier field do not stay."""
-        write_json(self.path / METRICS, entries)
+        with self.writing(METRICS) as path:
+            write_json(path, entries)
 
     def add_metrics(self, entries: Mapping[str, Any]) -> None:
         """Add entries to metrics.json."""
@@ -195,16 +214,19 @@ class ResultDirectory:
     def write_volumes(self, volumes: list[Volume]) -> None:
         """Write volume.nc and volume.vti."""
         for name in (VOLUME, VOLUME_VTI):
-            export(self.path / name, volumes)
+            with self.writing(name) as path:
+                export(path, volumes)
 
     def write_meridian(self, meridian: Meridian) -> None:
         """Write meridian.nc and meridian.csv."""
         for name, write in zip(MERIDIAN, (meridian.write, meridian.write_csv), strict=True):
-            write(self.path / name)
+            with self.writing(name) as path:
+                write(path)
 
     def write_reprojection(self, reprojection: Reprojection) -> None:
         """Write measured and predicted views."""
-        reprojection.write(self.path / REPROJECTION)
+        with self.writing(REPROJECTION) as path:
+            reprojection.write(path)
 
     # -- reading; each raises InputError where the file is missing or damaged --------------------------------------
 
@@ -253,12 +275,12 @@ class ResultDirectory:
 
     def member(self, number: int) -> ResultDirectory:
         """Return the directory of one member of an ensemble."""
-        return ResultDirectory(self.path / ENSEMBLE / f"{number:02d}")
+        return ResultDirectory(self.path / ENSEMBLE / f"{number:02d}", self.files.say)
 
     @property
     def first_look(self) -> ResultDirectory:
         """The directory of what was found while a view was kept out."""
-        return ResultDirectory(self.path / FIRST_LOOK)
+        return ResultDirectory(self.path / FIRST_LOOK, self.files.say)
 
     def read(self) -> Result:
         """Read what there is, whole, half-finished or broken: what is missing is told in the Result, never fatal.

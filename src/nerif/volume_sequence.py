@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from nerif.atomic import atomic
 from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Box, Grid
-from nerif.measurement_sequence import add_frames, require_zarr
+from nerif.measurement_sequence import add_frames, check_store, require_zarr
 from nerif.netcdf import reading
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, technique
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     import numpy as np
     import zarr
 
-__all__ = ["ViewScores", "VolumeSequence", "score_names"]
+__all__ = ["FIELDS", "ViewScores", "VolumeSequence", "score_names"]
+
+FIELDS = ("fields over time", "box_lower_mm")
+"""What such a store is, and an attribute that tells it from others."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +106,17 @@ class VolumeSequence:
         grid : of the volumes, mm
         quantities : such as index_excess, density
         attributes : whatever else is to be kept, JSON
+
+        Raises
+        ------
+        InputError
+            If anything but a store of fields is there, which is replaced.
         """
         import numpy as np
         import xarray as xr
         import zarr
 
+        check_store(Path(path), FIELDS)
         axes = {a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper()}) for a in "zyx"}
         fixed = xr.Dataset(
             coords={"time": ("time", np.array(times, dtype=np.float64), {"units": "s", "axis": "T"}), **axes},

@@ -122,7 +122,7 @@ def reconstruct_into(
     InputError
         If anything asked cannot be; a result that is there stays as it is.
     """
-    out, run, path = ResultDirectory(directory), run or Run(), None
+    out, run, path = ResultDirectory(directory, monitor.say), run or Run(), None
     if not isinstance(measurement, Measurement):
         path = Path(measurement)
         measurement = Measurement.read(path)
@@ -212,10 +212,15 @@ def write_report(
     directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET
 ) -> Path:
     """Write the page of a result directory, say what could not be shown, and return where it is."""
-    out = ResultDirectory(directory)
+    out = ResultDirectory(directory, monitor.say)
     path = path or out / REPORT
     result = out.read()
-    html.write(html.render(result), path)
+    page = html.render(result)
+    if path == out / REPORT:
+        with out.writing(REPORT):
+            html.write(page, path)
+    else:  # a file of its own, wherever it is asked for
+        html.write(page, path)
     for gap in result.missing:
         monitor.say(f"missing: {gap.sentence}")
     _say_size(path, monitor)
@@ -277,7 +282,8 @@ def _write(
             rig = with_posterior(result.rig, training, result.field, result.settings, bar)
         measurement = with_corrections(measurement, rig)
         metrics["rig"] = rig
-        write_cameras(out / CALIBRATION, [CalibratedCamera.from_camera(c) for c in measurement.cameras])
+        with out.writing(CALIBRATION) as written:
+            write_cameras(written, [CalibratedCamera.from_camera(c) for c in measurement.cameras])
         for line in moved_lines(rig):
             monitor.say(line)
         if run.hold_out:

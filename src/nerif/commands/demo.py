@@ -47,19 +47,21 @@ def run(settings: Demo) -> None:
         raise InputError(f"pixels: expected at least 8, got {settings.pixels}")
     if not settings.time_limit > 0:
         raise InputError(f"time_limit: expected seconds above 0, got {settings.time_limit}")
-    ResultDirectory(settings.out).check_free(settings.force)
+    out = ResultDirectory(settings.out, say)
+    out.check_free(settings.force)
     settings.out.mkdir(parents=True, exist_ok=True)
     measured = settings.out / "measurement.nc"
     between = 95.625  # degrees, halfway between the fifth and the sixth of nine views
     ring = Ring(extra_angles=(between,), image_size=(settings.pixels,) * 2, pixel_pitch=0.02 * 200 / settings.pixels)
-    simulate.run(
-        simulate.Simulate(
-            out=measured,
-            force=True,
-            simulation=Simulation(noise=settings.noise, seed=settings.seed, truth_voxels=80),
-            ring=ring,
+    with out.writing(measured.name), out.writing(simulate.truth_path(measured).name):
+        simulate.run(
+            simulate.Simulate(
+                out=measured,
+                force=True,
+                simulation=Simulation(noise=settings.noise, seed=settings.seed, truth_voxels=80),
+                ring=ring,
+            )
         )
-    )
     held_out = f"{between:g}deg"
     reconstruct.run(
         ReconstructNeRIF(

@@ -19,6 +19,7 @@ from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
+from nerif.own_files import OwnFiles
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
 from nerif.volume import INDEX
 
@@ -132,7 +133,7 @@ def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
-    with atomic(path) as part:
+    with OwnFiles(path.parent).writing(path.name), atomic(path) as part:
         try:
             save_file(tensors, part, metadata={"nerif": json.dumps(about)})
         except SafetensorError as error:  # a full disc is no OSError to it

@@ -27,6 +27,7 @@ from nerif.drawing import (
     style,
 )
 from nerif.observation import Observation
+from nerif.own_files import OwnFiles
 from nerif.report.figures import draw_history, draw_line, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
@@ -55,13 +56,16 @@ Seen = tuple[Observation, np.ndarray, np.ndarray, np.ndarray | None]
 
 
 def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi: int = 300) -> list[Path]:
-    """Write NAME.pdf and NAME.png of every figure that the result has data for, and return the paths."""
-    paths = []
+    """Write NAME.pdf and NAME.png of every figure that the result has data for, and return the paths.
+
+    A figure that was changed by hand, or that somebody else put there, is renamed (OwnFiles).
+    """
+    paths, files = [], OwnFiles(directory)
     with style():
         for name, figure in figures_of(result, *JOURNALS[journal]):
             for ending in ("pdf", "png"):
                 paths.append(directory / f"{name}.{ending}")
-                with atomic(paths[-1]) as part:
+                with files.writing(paths[-1].name) as path, atomic(path) as part:
                     figure.savefig(part, dpi=dpi, metadata={"Title": f"{name}, {result.directory.name}"})
     return paths
 

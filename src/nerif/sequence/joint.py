@@ -6,7 +6,6 @@ min  mean over rays of all frames |d(x, t) - d|^2 / sigma^2  +  mean |N|^2 over 
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from nerif.fields.space_time import SpaceTimeField
 from nerif.measurement_sequence import MeasurementSequence
+from nerif.own_files import OwnFiles
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step, compose
 from nerif.reconstruction.files import CHECKPOINT, checkpoints, read_state
 from nerif.reconstruction.training import Training
@@ -82,7 +82,7 @@ def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event 
             fail(i, error, 1)
             continue
         event({"frame": i, "what": "done", "seconds": found.seconds})
-    shutil.rmtree(kept, ignore_errors=True)
+    OwnFiles(kept).remove()
     with suppress(OSError):  # of other chunks there are some
         store.checkpoints.rmdir()
 
@@ -111,7 +111,7 @@ def _trained(
             return data, result
         except FAILURES as error:
             reason = str(error) or type(error).__name__
-            shutil.rmtree(kept, ignore_errors=True)
+            OwnFiles(kept).remove()
     raise FrameError(reason)
 
 
@@ -122,5 +122,5 @@ def _resumable(kept: Path, data: ChunkData) -> State | None:
     state = read_state(kept)
     if state.scalars.get("fingerprint") == data.fingerprint:
         return state
-    shutil.rmtree(kept)
+    OwnFiles(kept).remove()
     return None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +24,12 @@ from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
-from nerif.measurement_sequence import MeasurementSequence, add_frames
+from nerif.measurement_sequence import MeasurementSequence, add_frames, check_store
 from nerif.netcdf import reading
+from nerif.own_files import OwnFiles, remove_empty
 from nerif.reconstruction.bounds import in_units
 from nerif.volume import Volume
-from nerif.volume_sequence import VolumeSequence, score_names
+from nerif.volume_sequence import FIELDS, VolumeSequence, score_names
 
 __all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore", "chunk_tau"]
 
@@ -87,16 +87,24 @@ class SequenceStore(VolumeSequence):
         network: NetworkShape,
         attributes: dict[str, Any],
     ) -> SequenceStore:
-        """Make a store in which every frame is missing; what is there is replaced, checkpoints included.
+        """Make a store in which every frame is missing; one that is there is replaced, checkpoints included.
 
         Parameters
         ----------
         sequence : whose instants and views it has
         grid, quantities : of the volumes
         attributes : settings and whatever else is to be kept, JSON
+
+        Raises
+        ------
+        InputError
+            If anything but a store of fields is there.
         """
         like, frames = sequence.fullest(), len(sequence)
-        shutil.rmtree(_checkpoints(path), ignore_errors=True)
+        check_store(path, FIELDS)
+        for kept in _checkpoints(path).glob("*"):
+            OwnFiles(kept).remove()
+        remove_empty(_checkpoints(path))
         names = [kind.name for kind in like.techniques]
         about = {"kind": KIND, "network": vars(network), "views": list(like.names), "techniques": names, **attributes}
         with atomic(path) as part:
