@@ -12,7 +12,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions", "installing", "json_file", "netcdf", "own_files", "toml"),
+    ("atomic", "conventions", "finding", "installing", "json_file", "netcdf", "own_files", "toml"),
     ("geometry",),
     ("techniques",),
     ("drawing",),
@@ -28,7 +28,7 @@ LAYERS = (
     ("result", "glance", "monitor"),
     (
         "prediction", "halves", "evaluation", "consistency", "corrected", "rig_check", "mistakes", "quick_views",
-        "symptoms", "gains", "verdict",
+        "symptoms", "unrelated", "gains", "verdict",
     ),
     ("kept_run", "members", "first_look", "live"),
     ("report", "sequence"),

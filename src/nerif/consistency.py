@@ -8,15 +8,18 @@ fits equally well either way cannot be found: a flipped sign of everything, a mi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
+from nerif.conventions import InputError
+from nerif.finding import Finding
 from nerif.geometry import Grid
+from nerif.geometry.plausibility import rig_findings
 from nerif.measurement import Measurement
-from nerif.mistakes import Correction, everywhere, exchanges, of_one_view
+from nerif.mistakes import Correction, everywhere, exchanges, of_one_view, orders
 from nerif.observation import Observation, integrals_of
 from nerif.quick_views import (
     binned,
@@ -30,6 +33,7 @@ from nerif.quick_views import (
 )
 from nerif.reconstruction.aperture import seen_through
 from nerif.symptoms import looks, open_faces
+from nerif.unrelated import NOISY, repeatable, unrelated, unrelated_finding
 from nerif.volume import INDEX
 
 __all__ = ["Consistency", "ViewAgreement", "check_consistency"]
@@ -74,13 +78,13 @@ class Consistency:
     Parameters
     ----------
     views : agreement of every view; empty if there are too few views to compare
-    findings : mistakes, in words
+    findings : mistakes, the worst first: no view predicted by the others, then the rig, then single views
     remarks : what a user should know besides
     corrections : what undoes the mistakes that can be undone, of each technique by its name (`corrected`)
     """
 
     views: tuple[ViewAgreement, ...]
-    findings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     remarks: tuple[str, ...]
     corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
 
@@ -107,24 +111,39 @@ def check_consistency(
     observations = integrals_of(measurement)
     several = len(observations) > 1
     views: list[ViewAgreement] = []
-    findings: list[str] = []
+    rig = rig_findings(measurement.cameras, measurement.box)
+    past = {name for finding in rig if finding.code == "beside" for name in finding.views}
+    findings: list[Finding] = []
     remarks: list[str] = []
     corrections: dict[str, tuple[Correction, ...]] = {}
     for observation in observations:
-        own = _check(observation, measurement, voxels, on_step)
+        try:
+            own = _check(observation, measurement, voxels, on_step, past, [name for f in rig for name in f.views])
+        except InputError as error:
+            if not rig:
+                raise
+            remarks.append(f"views were not compared: {error}")
+            continue
         of = f"{observation.technique.name}: " if several else ""
         views += own.views
         corrections |= own.corrections
-        findings += [of + finding for finding in own.findings]
+        findings += [replace(finding, sentence=of + finding.sentence) for finding in own.findings]
         remarks += [of + remark for remark in own.remarks]
-    return Consistency(tuple(views), tuple(findings), tuple(remarks), corrections)
+    hopeless = [finding for finding in findings if finding.code == "unrelated"]
+    others = [finding for finding in findings if finding.code != "unrelated"]
+    return Consistency(tuple(views), (*hopeless, *rig, *others), tuple(remarks), corrections)
 
 
 def _check(
-    observation: Observation, measurement: Measurement, voxels: int, on_step: Callable[[int, int], None]
-) -> Consistency:
-    """Compare the views of one technique."""
+    observation: Observation, measurement: Measurement, voxels: int, on_step: Callable[[int, int], None],
+    past: Collection[str], suspicious: Collection[str],
+) -> Consistency:  # fmt: skip
+    """Compare the views of one technique but those that look past the box; cameras of some may be wrong."""
     kind, measurement = observation.technique, observation.alone(measurement)
+    seeing = [name for name in measurement.names if name not in past]
+    if not seeing:
+        return Consistency((), (), ("no view looks at the box: nothing can be compared",))
+    measurement = measurement.select(seeing)
     small = without_spikes(binned(measurement, LONGEST))
     pixels = measurement.usable.flatten(1).sum(dim=1).tolist()
     valid = [n / (c.image_size[0] * c.image_size[1]) for n, c in zip(pixels, measurement.cameras, strict=True)]
@@ -133,6 +152,7 @@ def _check(
     if len(names) < 3:
         return Consistency((), (), (*remarks, "fewer than three views: they cannot be compared with one another"))
     found: list[Correction] = []
+    uncorrected = small
     for _ in range(max(1, len(names) // 2)):
         correction = _most_likely_mistake(small, voxels, on_step)
         if correction is None:
@@ -143,19 +163,32 @@ def _check(
     if not objective > 0:
         nothing = f"every {kind.measured} of rays through the box is 0: there is nothing to compare"
         return Consistency((), (), (*remarks, nothing))
-    views, findings = [], [f"{_who(c, names)}: {c.words}" for c in found]
-    compared = [compare(predicted_by_others(small, [i], voxels)[i], small, i) for i in range(len(names))]
+    views: list[ViewAgreement] = []
+    compared = _compared(small, voxels)
+    if unrelated([agreement for agreement, _ in compared], small):
+        compared = _compared(uncorrected, voxels) if found else compared
+        numbers = [i for i, name in enumerate(names) if name in suspicious]
+        agreements = [agreement for agreement, _ in compared]
+        finding = unrelated_finding(uncorrected, agreements, voxels, numbers, on_step)
+        words = "not predicted by the others"
+        for name, share, (agreement, gain) in zip(names, valid, compared, strict=True):
+            views.append(ViewAgreement(name, share, agreement, gain, words, kind.measured))
+        return Consistency(tuple(views), (finding,), tuple(remarks))
+    if repeatable(small) < NOISY:
+        remarks.append("noise hides most of what was measured, and with it whether the views agree")
+    findings = [_finding(c, names) for c in found]
     middle = float(torch.tensor([a for a, _ in compared]).median())
     oddest = max(range(len(names)), key=lambda i: abs(math.log(max(compared[i][1], 1e-6))))  # it pulls at the others
     for i, (agreement, gain) in enumerate(compared):
         own = [c for c in found if i in c.views and len(c.views) < len(names)]
-        verdict = "; ".join(c.words for c in own)
+        verdict, code = "; ".join(c.words for c in own), ""
         if not own and agreement < UNLIKE * middle and middle > 0.3 and len(names) > 4:
-            verdict = "does not fit the other views: wrong calibration, other flow, or other time?"
+            verdict, code = "does not fit the other views: wrong calibration, other flow, or other time?", "unlike"
         elif not own and i == oddest and not 1 / GAIN < gain < GAIN and agreement > 0.5:
             verdict = f"{kind.measured} {gain:.2g} times what the other views predict: {kind.misscaled}?"
-        if verdict and not own:
-            findings.append(f"view {names[i]}: {verdict}")
+            code = "misscaled"
+        if code:
+            findings.append(Finding(code, f"view {names[i]}: {verdict}", (names[i],)))
         views.append(ViewAgreement(names[i], valid[i], agreement, gain, verdict, kind.measured))
     if not any(v.verdict for v in views) or found:  # a view that does not fit has rays through every face
         findings += open_faces(everything, small)
@@ -171,7 +204,7 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
     """The one mistake whose undoing helps the joint fit most, if it helps clearly."""
     views = range(len(small.names))
     observation, d = small.observations[0], values_of(small)
-    alike, done = everywhere(len(views), observation), 0
+    alike, done = [*everywhere(observation, small.cameras), *orders(small.cameras)], 0
 
     def step(total: int) -> None:
         nonlocal done
@@ -183,7 +216,7 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
         predicted = predicted_by_others(small, [i], voxels)[i]
         now = disagreement(predicted, small, i, d[i])
         agreements.append(compare(predicted, small, i)[0])
-        ways = of_one_view(i, observation)
+        ways = of_one_view(i, observation, small.cameras)
         left = [disagreement(predicted, small, i, c.undo(d, small.cameras)[i]) for c in ways]
         likely += [c for c, x in zip(ways, left, strict=True) if x < SHORTLIST * now]
         predictions.append(predicted)
@@ -202,7 +235,7 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
             return None
         if len(correction.views) == len(views) and gain > BETTER_EVERYWHERE:
             continue
-        if correction.change is None:
+        if correction.change is None and len(correction.views) == 2:
             clear = len(views) >= FEW or gain < BETTER_OF_FEW
             expected = predicted_by_others(small, correction.views, voxels)
             if not clear or _crossed(expected, small, correction) > EXCHANGE:
@@ -231,9 +264,11 @@ def _crossed(predicted: dict[int, Tensor], small: Measurement, pair: Correction)
     return crossed / max(straight, 1e-30)
 
 
-def _who(correction: Correction, names: Sequence[str]) -> str:
-    if len(correction.views) == len(names):
-        return "all views"
-    return ("views " if len(correction.views) > 1 else "view ") + " and ".join(names[i] for i in correction.views)
+def _compared(small: Measurement, voxels: int) -> list[tuple[float, float]]:
+    """Agreement and gain of every view with what the others predict of it."""
+    return [compare(predicted_by_others(small, [i], voxels)[i], small, i) for i in range(len(small.names))]
 
 
+def _finding(correction: Correction, names: Sequence[str]) -> Finding:
+    views = tuple(names[i] for i in correction.views)
+    return Finding(correction.code, f"{Finding.subject(views, len(names))}: {correction.words}", views)

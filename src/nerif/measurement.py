@@ -16,6 +16,7 @@ from nerif import measurement_file
 from nerif.atomic import atomic
 from nerif.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces
 from nerif.geometry import Box, Camera, Rays
+from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_lattice
 from nerif.measurement_summary import as_html, summary
 from nerif.netcdf import opened
 from nerif.observation import Observation, arguments_of, cameras_of, check_maps, check_observations
@@ -102,34 +103,22 @@ class Measurement:
 
     def _check_geometry(self) -> None:
         """Refuse a background in front of or inside the box, and a box that no ray crosses."""
-        corners = torch.tensor(
-            [[c[i >> a & 1][a] for a in range(3)] for i in range(8) for c in [(self.box.lower, self.box.upper)]],
-            dtype=torch.float64,
-        )
         crossing = False
         for camera in self.cameras:
             camera.check_distortion()
-            height, width = camera.image_size
-            u = torch.linspace(0, width - 1, min(width, 33), dtype=torch.float64)
-            v = torch.linspace(0, height - 1, min(height, 33), dtype=torch.float64)
-            rays = camera.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False).clip(self.box)
+            rays = rays_on_lattice(camera, self.box)
             crossing |= bool(rays.crosses.any())
-            if camera.background is None:
-                continue
-            normal = camera.background.normal.to(torch.float64)
-            plane = corners @ normal - camera.background.offset
-            sight = camera.sight((camera.background.offset * normal).to(camera.rotation))
-            behind = -plane * float(sight.to(normal) @ normal)
-            seen = rays[rays.crosses]
-            if len(seen) and (float(behind.min()) <= 0 or not bool(seen.unobstructed.all())):
+            if background_cuts(camera, self.box, rays):
                 raise InputError(
                     f"background of view '{camera.name}': expected a plane behind the box as the camera sees it, got "
-                    "one that cuts or stands before the box; check background_normal, background_offset (mm) and box"
+                    "one that cuts or stands before the box; check background_normal, background_offset (mm) and box; "
+                    + likely_cause(self.cameras, self.box)
                 )
         if not crossing:
             raise InputError(
                 f"box: no ray of any view crosses it ({self.box.lower} to {self.box.upper} mm); "
-                "check the box, and that rotation and translation map world to camera"
+                "check the box, and that rotation and translation map world to camera; "
+                + likely_cause(self.cameras, self.box)
             )
 
     @property

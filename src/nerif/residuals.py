@@ -31,7 +31,8 @@ NAMED = {BLOCK: 0.2, FINE: 0.12}  # of what is alike, that a pattern has to take
 
 CAUSES = {
     "offset": "the whole picture is displaced (a shaken camera): --refine shift, or nerif displacement --shake-border",
-    "calibration": "the view is looked at from elsewhere than the calibration says: --refine cameras",
+    "calibration": "the view is not looked at from where the calibration says: nerif check names one that is upside "
+    "down, mirrored or exchanged; where it names none, --refine cameras",
     "scale": "all of it is too large or too small: distances, pixel pitch, sensitivity, or a method that flattens",
     "blur": "what was measured is smoother or sharper than the field's: windows of optical flow, the lens (--aperture)",
 }

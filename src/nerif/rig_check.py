@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nerif.finding import Finding
+from nerif.geometry.plausibility import rig_findings
 from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
 from nerif.reconstruction.aperture import seen_through
@@ -27,12 +29,12 @@ class RigCheck:
     ----------
     table : for each view the refined numbers, their standard deviations before and after, and what is left of it
     remarks : what a user should know
-    findings : views that are not where their calibration says, in words
+    findings : cameras that cannot be where they are, and views that are not where their calibration says
     """
 
     table: list[dict[str, Any]]
     remarks: tuple[str, ...]
-    findings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def check_rig(
@@ -65,12 +67,14 @@ def check_rig(
     with monitor.counting("how well the rig is known") as bar:
         table = with_posterior(result.rig, seen_through(data, aperture), result.field, result.settings, bar)
     lines = moved_lines(table)
-    far = sum(row["moved"] > MOVED for row in table)
-    remarks = lines[: len(lines) - far]
+    moved = [row["name"] for row in table if row["moved"] > MOVED]
+    remarks, told_apart = lines[: len(lines) - len(moved)], lines[len(lines) - len(moved) :]
     worst = max(table, key=lambda row: row.get("rms_after", 0.0))
     if worst.get("rms_after", 0.0) > ROUGH:
         remarks.append(
             f"the field still leaves {worst['rms_after']:.1f} sigma in view {worst['name']} after {seconds:g} s: views "
             "may be off without showing; take a larger time limit, or look for what else is wrong"
         )
-    return RigCheck(table, tuple(remarks), tuple(lines[len(lines) - far :]))
+    impossible = rig_findings(measurement.cameras, measurement.box)
+    off = [Finding("moved", line, (name,)) for name, line in zip(moved, told_apart, strict=True)]
+    return RigCheck(table, tuple(remarks), (*impossible, *off))

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerif.conventions import FACES
 from nerif.fields.base import Field
+from nerif.finding import Finding
 from nerif.measurement import Measurement
 from nerif.prediction import predict_view
 from nerif.quick_views import path_integral, values_of
@@ -25,7 +26,7 @@ OPEN = (0.4, 2.0)  # flow goes on beyond a face: what is not explained of rays t
 FEWEST = 20  # rays of which something can be said
 
 
-def open_faces(field: Field, small: Measurement) -> list[str]:
+def open_faces(field: Field, small: Measurement) -> list[Finding]:
     """Return a finding for each face beyond which the flow seems to go on: rays through it fit worse than others.
 
     The others are those through faces known to be ambient alone. Where no face is, they are those not through this one
@@ -46,9 +47,10 @@ def open_faces(field: Field, small: Measurement) -> list[str]:
         size = float((own[:, 0].mean() / (usual if known else squares[left])[:, 1].mean()).sqrt())
         if size > OPEN[0] and share > OPEN[1] * share_usual:
             left &= ~through[face]
-            found[face] = (
+            found[face] = Finding(
+                "open_face",
                 f"face {face}: {share:.0%} of the {what} of rays through it is not explained, {share_usual:.0%} of "
-                f"the others; the flow seems to go on beyond it: give --open-faces {face}, or a larger box"
+                f"the others; the flow seems to go on beyond it: give --open-faces {face}, or a larger box",
             )
     return [found[face] for face in suspects if face in found]
 

@@ -138,7 +138,7 @@ class CheckPage:
         """The verdicts, and the correction that is offered."""
         ui.html(views_table(found), sanitize=False)
         notes = "".join(f"<li>{escape(text)}</li>" for text in found.remarks)
-        findings = "".join(f"<li>{escape(text)}</li>" for text in found.findings)
+        findings = "".join(f"<li>{escape(str(finding))}</li>" for finding in found.findings)
         if findings:
             ui.html(f"<h3>Found</h3><ul class=notes>{findings}</ul>", sanitize=False)
         elif found.views:
