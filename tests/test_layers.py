@@ -12,7 +12,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions", "finding", "installing", "json_file", "netcdf", "own_files", "toml"),
+    ("atomic", "conventions", "finding", "installing", "interruption", "json_file", "netcdf", "own_files", "pauses", "toml"),
     ("geometry",),
     ("techniques",),
     ("drawing",),

@@ -32,6 +32,7 @@ from nerif.quick_views import (
     without_spikes,
 )
 from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.threads import on_free_cores
 from nerif.symptoms import looks, open_faces
 from nerif.unrelated import NOISY, repeatable, unrelated, unrelated_finding
 from nerif.volume import INDEX
@@ -89,6 +90,7 @@ class Consistency:
     corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
 
 
+@on_free_cores
 def check_consistency(
     measurement: Measurement, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
     aperture: str = "auto",

@@ -17,10 +17,12 @@ from nerif.fields.mlp import NeuralField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.measurement import Measurement, measurement_of
+from nerif.pauses import pause
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, Projector, project
 from nerif.physics.ray_tracing import CurvedRays
 from nerif.reconstruction.operator import rays_through
 from nerif.reconstruction.symmetric_operator import seen_of
+from nerif.reconstruction.threads import on_free_cores
 from nerif.reprojection import Accuracy, Reprojection
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
@@ -79,6 +81,7 @@ def _through_voxels(
     step = VOXEL_STEP["linear" if flat.degree == 1 else "cubic"]
     each, seen = rays_through(rays, min(field.grid.spacing)), []
     for index in torch.arange(len(rays)).split(max(1, AT_ONCE // each)):
+        pause()
         part = rays[index]
         if bool(part.crosses.any()):
             seen.append(seen_of(field, part, model, step, device).cpu())
@@ -87,6 +90,7 @@ def _through_voxels(
     return torch.cat(seen)
 
 
+@on_free_cores
 def predict(
     field: Field,
     cameras: Sequence[Camera],
@@ -136,6 +140,7 @@ def predict(
     return measurement.observed({technique.name: predicted})
 
 
+@on_free_cores
 def reproject(
     field: Field,
     measurement: Measurement,

@@ -15,6 +15,7 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.refined_rig import MOVED, moved_lines
 from nerif.reconstruction.rig_posterior import with_posterior
 from nerif.reconstruction.sources import of_source
+from nerif.reconstruction.threads import on_free_cores
 
 __all__ = ["RigCheck", "check_rig"]
 
@@ -37,6 +38,7 @@ class RigCheck:
     findings: tuple[Finding, ...]
 
 
+@on_free_cores
 def check_rig(
     measurement: Measurement, refine: Sequence[str], seconds: float = 30.0, pose_sigma_mm: float | None = None,
     pose_sigma_deg: float | None = None, monitor: Monitor = QUIET, aperture: str = "auto",

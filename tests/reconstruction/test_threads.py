@@ -9,8 +9,16 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from nerif.consistency import check_consistency
+from nerif.fields.grid import VoxelField
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Grid, Ring
+from nerif.pauses import at_pauses, pause
+from nerif.prediction import predict, reproject
 from nerif.reconstruction import threads
 from nerif.reconstruction.threads import Cores, Used, free_threads
+from nerif.rig_check import check_rig
+from nerif.simulation import view_displacement
 
 NUMBA_STARTS = """
 import torch
@@ -130,3 +138,57 @@ def test_what_the_machine_does_can_be_read():
 def test_numba_leaves_torch_the_threads_it_has():
     said = subprocess.run([sys.executable, "-c", NUMBA_STARTS], capture_output=True, text=True, check=True, timeout=60)
     assert said.stdout.split() == ["1"]
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_short_pieces_of_work_go_on_with_what_is_known(machine):
+    """Each would end before its first look: a core that is taken stays so from one to the next."""
+    used = []
+    with Cores(torch.device("cpu")):
+        for _ in range(6):
+            with Cores(torch.device("cpu")):
+                machine.spend(0.3, 0.0, 1.0)
+                pause()
+                used.append(torch.get_num_threads())
+    assert used == [2, 1, 1, 1, 1, 1]
+    assert torch.get_num_threads() == 2
+    machine.spend(9.0, 0.0, 1.0)
+    pause()  # nobody looks any more
+    assert torch.get_num_threads() == 2
+
+
+def _grid_of(field) -> None:
+    field.sample(Grid(Box.cube(2.0), (2, 3, 4)))
+
+
+def _seen_of(field) -> None:
+    predict(field, Ring(views=1, image_size=(5, 6), pixel_pitch=0.5).cameras(), Box.cube(40.0), 1.00027, samples=8)
+
+
+def _traced(field) -> None:
+    (camera,) = Ring(views=1, image_size=(5, 6), pixel_pitch=0.5).cameras()
+    view_displacement(field, camera, Box.cube(40.0), 1.00027, 4)
+
+
+def _through_voxels(field) -> None:
+    grid = Grid(Box.cube(40.0), (4, 5, 6))
+    cameras = Ring(views=1, image_size=(5, 6), pixel_pitch=0.5).cameras()
+    predict(VoxelField.through(torch.zeros(grid.shape), grid), cameras, grid.box, 1.00027)
+
+
+@pytest.mark.parametrize("work", [_grid_of, _seen_of, _traced, _through_voxels])
+def test_long_work_pauses(work):
+    count = []
+    with at_pauses(lambda: count.append(1)):
+        work(make_phantom("gaussians", Box.cube(40.0), 0))
+    assert count
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("function", [reproject, predict, check_consistency, check_rig])
+def test_stages_look_for_free_cores(function, monkeypatch):
+    entered = []
+    monkeypatch.setattr(Cores, "__enter__", lambda cores: entered.append(cores))
+    with pytest.raises(TypeError):
+        function()
+    assert entered

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from nerif.conventions import Points, Values, Vectors
 from nerif.geometry import Grid
+from nerif.pauses import pause
 
 __all__ = ["Field", "in_chunks"]
 
@@ -41,6 +43,8 @@ class Field(ABC):
         return torch.cat(values).reshape(grid.shape)
 
 
-def in_chunks(points: Tensor, size: int = 1 << 13) -> tuple[Tensor, ...]:
-    """Split along the first axis, so that what is computed of each chunk stays in cache."""
-    return torch.split(points, size)
+def in_chunks(points: Tensor, size: int = 1 << 13) -> Iterator[Tensor]:
+    """Split along the first axis, so that what is computed of each chunk stays in cache; pause before each."""
+    for part in torch.split(points, size):
+        pause()
+        yield part

@@ -14,6 +14,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Rays
+from nerif.pauses import pause
 from nerif.techniques.base import ForwardModel, midpoints
 
 __all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]
@@ -107,5 +108,6 @@ def project(
     result = torch.zeros(len(rays), projector.channels, dtype=rays.origin.dtype)
     index, field = rays.crosses.nonzero()[:, 0], field.to(device)
     for part in torch.split(index, chunk):
+        pause()
         result[part] = projector(field, rays[part].to(device)).to(result)
     return result

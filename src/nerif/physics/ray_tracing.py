@@ -22,6 +22,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Rays
+from nerif.pauses import pause
 from nerif.physics.path_integral import LENS_RAYS, Projector
 
 __all__ = ["CurvedRays", "background_points", "trace"]
@@ -46,6 +47,7 @@ def trace(
     position = (rays.origin + rays.near[:, None] * rays.direction).to(double)
     heading = rays.direction.to(double)
     for i in range(steps):
+        pause()
         n, a = d(position)
         if i == 0:
             heading = n * heading

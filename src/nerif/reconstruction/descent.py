@@ -24,6 +24,7 @@ from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
+from nerif.pauses import pause
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds
@@ -247,7 +248,7 @@ class Descent:
             if not math.isfinite(objective):
                 message = "the objective turned non-finite, the field before that was kept"
                 raise _Stop("diverged", f"{message}; look for extreme values or sigma in the measurement")
-            self.cores.look()
+            pause()
             self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
             before, past = past[0], [*past[1:], objective]
             self._tell(problem, judge, iterate, weight)

@@ -7,17 +7,28 @@ than one (benchmarks/results/busy-cpu.md).
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import sys
+import threading
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import torch
 
-__all__ = ["Cores", "free_threads", "share_threads"]
+from nerif.pauses import at_pauses
+
+__all__ = ["Cores", "free_threads", "on_free_cores", "share_threads"]
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+_here = threading.local()  # torch has a number of threads for each thread that asks it too
 
 FIRST, EVERY = 0.5, 2.0  # seconds until the first look at what the cores do, and between looks
 LEAST, SHARED = 0.25, 0.8  # of a core others may use before it is left to them: the least, and what all threads share
@@ -66,6 +77,9 @@ class Cores:
     On a machine with nothing else to do the number stays, and with it the order in which numbers are added. Threads
     are left at once, and taken when there has been room for a while: a longer one, each time it was in vain.
 
+    It looks at every pause of the thread (pauses.py). Within another one, on a CPU, it is that one that looks, and goes
+    on with what it knows: pieces of work that are short by themselves are not each begun with all threads.
+
     Parameters
     ----------
     device : where the work is done; on a GPU nothing is looked at
@@ -77,19 +91,25 @@ class Cores:
         self._watching = device.type == "cpu" and self.most > 1
         self._next, self._then = 0.0, Used(0.0, 0.0, 0.0, 0.0)
         self._calm, self._patience, self._taken = 0, CALM, False
+        self._entered = ExitStack()
 
     def __enter__(self) -> Cores:
-        _set(self.most)
-        self._begin(FIRST)
+        if getattr(_here, "cores", None) is None:
+            _here.cores = self
+            self._entered.callback(_set, self.before)
+            self._entered.callback(setattr, _here, "cores", None)
+            self._entered.enter_context(at_pauses(self.look))
+            _set(self.most)
+            self._begin(FIRST)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        _set(self.before)
+        self._entered.close()
 
     def look(self) -> None:
-        """Take the threads that there are cores for; to be called often."""
+        """Take the threads that there are cores for."""
         if not self._watching or time.perf_counter() < self._next:
             return
         then = self._then
@@ -115,6 +135,17 @@ class Cores:
             self._watching = used is not None
             self._then = self._then if used is None else used
             self._next = time.perf_counter() + seconds
+
+
+def on_free_cores(function: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Let all of a function compute with the threads that there are cores for (Cores)."""
+
+    @functools.wraps(function)
+    def within(*given: Given.args, **named: Given.kwargs) -> Result:
+        with Cores(torch.device("cpu")):
+            return function(*given, **named)
+
+    return within
 
 
 def _set(threads: int) -> None:
