@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import time
 
+import pytest
+import torch
+
 from nerif.fields.mlp import NetworkShape
+from nerif.reconstruction import budget as module
 from nerif.reconstruction import training
+from nerif.reconstruction.budget import Budget
 from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.parallel import Ranks
 
 
 def test_the_time_limit_is_of_training_alone(measurement, monkeypatch):
@@ -23,3 +29,22 @@ def test_the_time_limit_is_of_training_alone(measurement, monkeypatch):
         network=NetworkShape(depth=1, width=8), points_per_batch=64, time_limit=1.0, max_steps=1, device="cpu"
     )
     assert settings(measurement).history
+
+
+def test_the_pace_begins_again_where_other_rays_are_counted(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
+    budget = Budget(NeRIF(max_steps=10, device="cpu"), 1000, Ranks.from_environment(), torch.device("cpu"))
+    budget.count(600)
+    clock[0] = 2.0
+    assert budget.rays_per_second == pytest.approx(300.0)
+    kept = budget.used()
+    budget.recount(100)  # 0.6 epochs are 60 of these
+    assert budget.rays_done == 60
+    budget.count(50)
+    clock[0] = 3.0
+    assert budget.rays_per_second == pytest.approx(50.0)
+    budget.restore({**kept, "rays_done": 0})  # taken back
+    budget.count(20)
+    clock[0] = 5.0
+    assert budget.rays_per_second == pytest.approx(10.0)

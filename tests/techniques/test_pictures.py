@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 from nerif.cli import main
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume
+from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Grid, Ring
 from nerif.measurement import Measurement
@@ -254,6 +255,20 @@ def test_pictures_go_on_from_displacements(balls, taken):
     assert [o.technique.name for o in of_source(both, "auto", preferred="displacements").observations] == ["deflection"]
     together = replace(NETWORK, source="both", max_steps=60)(both)
     assert not together.outcome.failed
+
+
+def test_a_run_tells_where_pictures_take_over_and_its_pace_goes_on(balls, taken):
+    """There are fewer pixels of pictures than displacements, so that fewer rays are counted from then on."""
+    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
+    flow = taken.maps["flow"].clone()
+    flow[:, ::2] = torch.nan
+    both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05), maps={**taken.maps, "flow": flow})
+    settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
+    Training(settings, FrameData(settings, both)).run(steps.append)
+    assert [(s.step, s.note) for s in steps if s.note] == [
+        (5, "the loss is of pictures from here on, of displacements before: it jumps")
+    ]
+    assert all(s.rays_per_second > 0 for s in steps)
 
 
 def test_shifts_of_pictures_are_refined_of_the_displacements_that_are_there(balls, taken):

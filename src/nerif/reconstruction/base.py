@@ -76,6 +76,7 @@ class Step:
     rays_per_second : 1/s
     capture : gives the State to resume from
     field : gives the Field as it is now, to be looked at before the method goes on
+    note : a line for the user on what changed before this step; nothing where nothing did
     """
 
     step: int
@@ -86,6 +87,7 @@ class Step:
     rays_per_second: float
     capture: Callable[[], State]
     field: Callable[[], Field]
+    note: str = ""
 
 
 OnStep = Callable[[Step], bool | None]

@@ -32,6 +32,7 @@ class Budget:
         self.step, self.rays_done = 0, 0
         self.cycles = None if settings.limited else Cycles(settings.first_cycle, settings.longest)
         self._before, self._began, self._agreed = 0.0, time.perf_counter(), 0.0
+        self.begin_pace()
 
     def agree(self) -> None:
         """Let all processes go by the clock of the first."""
@@ -69,6 +70,20 @@ class Budget:
         """What of the run is done at least: 0 at the start, 1 at the latest end."""
         return self.progress if self.cycles is None else self.seconds / self.cycles.longest
 
+    def count(self, rays: int) -> None:
+        """Count rays of a step."""
+        self.rays_done += rays
+        self._paced += rays
+
+    def begin_pace(self) -> None:
+        """Take the pace from now on: other rays, or other work on them, have another one."""
+        self._paced, self._paced_from = 0, time.perf_counter()
+
+    @property
+    def rays_per_second(self) -> float:
+        """The pace since the data last changed or the run was taken back, 1/s."""
+        return self._paced / max(time.perf_counter() - self._paced_from, 1e-9)
+
     def left(self, rays: int) -> float:
         """Return how many rays the run has time or steps for yet, at the pace so far; inf where neither is limited.
 
@@ -98,6 +113,7 @@ class Budget:
     def recount(self, rays: int) -> None:
         """Count passes over another number of rays from now on."""
         self.rays_done, self.rays = round(self.epoch * rays), rays
+        self.begin_pace()
 
     def where(self) -> dict[str, float]:
         """Return step, epoch and seconds, as the history has them."""
@@ -112,5 +128,6 @@ class Budget:
         """Go on from what a checkpoint kept."""
         self.step, self.rays_done = int(used["step"]), int(used["rays_done"])
         self._before, self._began = float(used["seconds"]), time.perf_counter()
+        self.begin_pace()
         if self.cycles is not None:  # a run that had a limit begins a cycle where it is
             self.cycles.restore(used.get("cycles", {"step": self.step, "seconds": self._before}))

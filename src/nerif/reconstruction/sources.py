@@ -40,10 +40,12 @@ class Stage:
     ----------
     begin : share of the run at which it begins
     measurement : gives what is to be met
+    words : what that is
     """
 
     begin: float
     measurement: Callable[[], Measurement]
+    words: str
 
 
 def check_source(source: str, measurement: Measurement | None = None) -> None:
@@ -71,9 +73,7 @@ def chosen_source(measurement: Measurement, source: str, preferred: str) -> str:
     return preferred if source == "auto" and pictures is not None and found is not None else source
 
 
-def of_source(
-    measurement: Measurement, source: str, blur: float = SOFT, preferred: str = "pictures"
-) -> Measurement:
+def of_source(measurement: Measurement, source: str, blur: float = SOFT, preferred: str = "pictures") -> Measurement:
     """Return the measurement with what a reconstruction is to go by: pictures, displacements, or both.
 
     What is measured by other techniques is left as it is. Pictures keep what displacements tell, as a guess.
@@ -116,12 +116,17 @@ def stages(measurement: Measurement, source: str) -> list[Stage]:
         return final
 
     if pictures is None or source == "displacements":
-        return [Stage(0.0, last)]
-    ends = [Stage(begin, last) for begin in (SHARP_FROM, *SETTLED)]
+        names = " and ".join(o.technique.measured for o in final.observations)
+        return [Stage(0.0, last, names)]
+    ends = [Stage(begin, last, "pictures") for begin in (SHARP_FROM, *SETTLED)]
     if found is not None:
-        return [Stage(0.0, partial(of_source, measurement, "displacements")), *ends]
-    blurred = [partial(of_source, measurement, source, px) for px in BLURS]
-    return [*(Stage(SHARP_FROM * i / len(BLURS), part) for i, part in enumerate(blurred)), *ends]
+        return [Stage(0.0, partial(of_source, measurement, "displacements"), "displacements"), *ends]
+    begins = [SHARP_FROM * i / len(BLURS) for i in range(len(BLURS))]
+    blurred = [
+        Stage(begin, partial(of_source, measurement, source, px), f"pictures blurred by {px:g} px")
+        for begin, px in zip(begins, BLURS, strict=True)
+    ]
+    return [*blurred, *ends]
 
 
 def _pair(measurement: Measurement) -> tuple[Observation | None, Observation | None]:

@@ -12,7 +12,6 @@ run back to its last good state with a third of the learning rate.
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import asdict
 from typing import Any
 
@@ -22,6 +21,7 @@ from torch import Tensor
 from nerif.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.mlp import UNBOUNDED
+from nerif.pauses import pause
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import check_resumed
 from nerif.reconstruction.budget import Budget
@@ -86,6 +86,7 @@ class Training:
         # its clock begins here: imports are no training
         self.budget = Budget(settings, len(data), self.ranks, self.device)
         self.history: list[dict[str, float]] = []
+        self.notes: list[str] = []  # for the next step that is told
         self.edge, self.settled = data.coarsest, data.coarsest == 1
         self.watch = Watch(data.noise)
         self.retries, self.rate = 0, 1.0
@@ -111,14 +112,14 @@ class Training:
         settings, budget = self.settings, self.budget
         budget.agree()
         outcome = budget.exhausted() or self._fit(on_step)
-        clock, rays_then = time.perf_counter(), budget.rays_done
+        budget.begin_pace()
         while outcome is None:
             self._agree()
             if not self.settled and budget.progress >= PIONEERS:
                 self._settle()
-                clock, rays_then = time.perf_counter(), budget.rays_done
+            before = self.data.met
             if self.data.advance(budget.progress):
-                self._begin_part()
+                self._begin_part(before)
             self.objective.refine(budget.progress)
             pieces, whole = self._batch()
             self.network.low = budget.progress < settings.full_precision_from
@@ -145,7 +146,7 @@ class Training:
             if self.watch.collapsed(outcome is not None):
                 outcome = self._take_back("the field was lost") or budget.exhausted()
                 continue
-            speed = (budget.rays_done - rays_then) / max(time.perf_counter() - clock, 1e-9)
+            speed = budget.rays_per_second
             if budget.step % LOG_EVERY == 0 or budget.step == 1 or outcome is not None:
                 self._log({**values, "rays_per_second": speed})
             if budget.step % KEEP_EVERY == 0 and self.watch.healthy and self._finite():
@@ -156,7 +157,7 @@ class Training:
 
     def _agree(self) -> None:
         """Take the cores there are; let all processes go by the clock of the first (on GPUs now and then: it waits)."""
-        self.cores.look()
+        pause()
         if self.device.type == "cpu" or self.budget.step % LOG_EVERY == 0:
             self.budget.agree()
 
@@ -200,7 +201,7 @@ class Training:
         draw = objective.draw(budget.progress)
         rays = objective.pixels(draw)
         index = shuffled(budget.rays_done, rays, len(self.data), self.settings.seed)
-        budget.rays_done += rays
+        budget.count(rays)
         self.drawn += rays
         if self.settings.sampling == "adaptive" and budget.step and budget.step % DENSITY_EVERY == 0:
             objective.look()
@@ -213,6 +214,8 @@ class Training:
             edge, rays = edge // 2, 4 * rays
         self.settled = True
         if edge < self.edge:
+            pixels = "single pixels" if edge == 1 else f"bins of {edge} px"
+            self._note(f"the loss is of {pixels} from here on, of bins of {self.edge} px before: it may jump")
             self._refine(edge)
 
     def _refine(self, edge: int) -> None:
@@ -222,8 +225,15 @@ class Training:
         self.objective.settle()
         self._log({"bin_edge": float(edge)})
 
-    def _begin_part(self) -> None:
-        """Meet what the data give from now on, what is open beside the field fitted to the field so far."""
+    def _begin_part(self, before: str) -> None:
+        """Meet what the data give from now on, what is open beside the field fitted to the field so far.
+
+        Parameters
+        ----------
+        before : what was met until now
+        """
+        if self.data.met != before:
+            self._note(f"the loss is of {self.data.met} from here on, of {before} before: it jumps")
         self._recount()
         self.watch = Watch(self.data.noise)
         self.watch.step = self.budget.step
@@ -319,11 +329,17 @@ class Training:
     def _log(self, values: dict[str, float]) -> None:
         self.history.append({**self.budget.where(), **values})
 
+    def _note(self, text: str) -> None:
+        self.notes.append(text)
+
     def _tell(self, values: dict[str, float], speed: float, over: bool = False) -> Step:
         budget = self.budget
         progress = 1.0 if over else min(budget.share, 1.0)
-        capture = self._capture
-        return Step(budget.step, budget.epoch, budget.seconds, progress, values, speed, capture, lambda: self.field)
+        capture, note = self._capture, "; ".join(self.notes)
+        self.notes.clear()
+        return Step(
+            budget.step, budget.epoch, budget.seconds, progress, values, speed, capture, lambda: self.field, note
+        )  # fmt: skip
 
     def _capture(self) -> State:
         groups = {"network": self._weights(), "optimiser": self.optimiser.tensors(), "data": self.data.kept()}

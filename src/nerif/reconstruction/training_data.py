@@ -78,6 +78,9 @@ class TrainingData(ABC):
     stage: int = 0
     """Part of the run that the data are given for."""
 
+    met: str = "what was measured"
+    """What the loss is of in this part."""
+
     axis: Axis | None = None
     """Of a symmetric flow."""
     refinement: Refinement | None = None
@@ -194,7 +197,7 @@ class FrameData(TrainingData):
 
     def refine(self, edge: int) -> None:
         settings, self.edge = self.settings, edge
-        seen = self.stages[self.stage].measurement()
+        seen, self.met = self.stages[self.stage].measurement(), self.stages[self.stage].words
         self.target = Target.of(seen, settings.open_faces, edge, settings.model).to(self.device)
         self.names = seen.names
         self.noise = self.target.noise or 0.0
