@@ -12,7 +12,8 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
-    ("atomic", "conventions", "finding", "installing", "interruption", "json_file", "netcdf", "own_files", "pauses", "toml"),
+    ("atomic", "conventions", "finding", "installing", "interruption", "json_file", "netcdf", "own_files",
+     "pauses", "toml"),
     ("geometry",),
     ("techniques",),
     ("drawing",),

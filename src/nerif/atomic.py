@@ -8,7 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["atomic"]
+__all__ = ["atomic", "written"]
+
+written: list[Path] = []
+"""What this process has written, in that order."""
 
 
 @contextmanager
@@ -26,6 +29,7 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
         if part.is_dir():
             _remove(path)
         os.replace(part, path)
+        written.append(path)
     finally:
         _remove(part)
 

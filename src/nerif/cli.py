@@ -32,6 +32,9 @@ VERBS = {
 }
 
 
+MENTIONED = 4
+"""Files that are named of those an interrupted command has written."""
+
 ELSEWHERE = {"app": "nerif.app.command"}
 """Modules of verbs that are no file of nerif.commands."""
 
@@ -77,11 +80,12 @@ def _run(words: list[str]) -> int:
     try:
         command = importlib.import_module(ELSEWHERE.get(verb, f"nerif.commands.{verb}"))
         importlib.import_module("nerif.reconstruction.device").keep_freed_memory()
-        command.main(words[1:])
+        on_free_cores = importlib.import_module("nerif.reconstruction.threads").on_free_cores
+        on_free_cores(command.main)(words[1:])
     except InputError as error:
         return _refuse(str(error))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"nerif: interrupted; {stop if str(stop) else _left_behind()}", file=sys.stderr)
         return 130
     except SystemExit as stop:
         return int(stop.code or 0)
@@ -90,6 +94,17 @@ def _run(words: list[str]) -> int:
     except OSError as error:
         return _refuse(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0
+
+
+def _left_behind() -> str:
+    """What a command that was broken off has written, and how to go on, where nothing else is known."""
+    from nerif.atomic import written
+
+    if not written:
+        return "nothing was written; the same command begins anew"
+    last = ", ".join(dict.fromkeys(map(str, written[-MENTIONED:])))
+    more = f" and {len(written) - MENTIONED} more" if len(written) > MENTIONED else ""
+    return f"written and whole: {last}{more}; the same command with --force does all of it anew"
 
 
 def _refuse(message: str) -> int:

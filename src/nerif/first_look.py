@@ -126,10 +126,9 @@ class FirstLook:
             say(f"without {name}: {result.outcome.reason}; all views begin from nothing")
             return None
         fitted = next(n for n in best_covered(self.data.cameras) if n != name)
-        both = reproject(
-            result.field, self.data.select([name, fitted]), [name], result.device, model=result.model
-        )
-        scores = evaluate_views(both)
+        pair = self.data.select([name, fitted])
+        with self.monitor.counting(f"predicting {name}"):
+            scores = evaluate_views(reproject(result.field, pair, [name], result.device, model=result.model))
         views, used = ([v for v in scores if v["held_out"] is held] for held in (True, False))
         taken = time.monotonic() - started
         with self._directory.writing(SCORES) as path:

@@ -66,7 +66,8 @@ class Members:
         say, started, word = self.monitor.say, time.monotonic(), self.kind.word
         noise = cache(lambda: self._noise(main))  # which not every kind asks for
         found = Found(main, self.reconstructor, self.training, lambda: noise()[0], lambda f: self._seen(f, main))
-        quantities = all_quantities(main, gas, voxels)
+        with self.monitor.counting("sampling the field"):
+            quantities = all_quantities(main, gas, voxels)
         taken = self.kind.taken(found, quantities[0], gas.for_field(quantities[0]))
         left_out, diverged = [], []
         for number in range(1, self.kind.members + 1):
@@ -112,7 +113,8 @@ class Members:
 
     def _seen(self, field: Field, main: Reconstruction) -> Maps:
         """What the views of the reconstruction would see of a field."""
-        return reproject(field, self.training, (), main.device, model=main.model).maps
+        with self.monitor.counting("measuring the field again") as bar:
+            return reproject(field, self.training, (), main.device, bar, main.model).maps
 
     def _noise(self, main: Reconstruction) -> tuple[Maps, str]:
         """Standard deviation of every pixel's noise by technique: the file's, else the rms residual of each view."""

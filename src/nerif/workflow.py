@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
@@ -15,6 +17,7 @@ from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
 from nerif.gains import fit_gains, with_gains
 from nerif.halves import departure_sentence, departures, halved
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
+from nerif.interruption import if_interrupted
 from nerif.live import Live
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
@@ -24,7 +27,7 @@ from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
 from nerif.reconstruction.ensemble import Ensemble
-from nerif.reconstruction.files import CHECKPOINT, checkpoints
+from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.neural import NeRIF
@@ -36,6 +39,7 @@ from nerif.reconstruction.rig_posterior import with_posterior
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
+from nerif.reconstruction.threads import Cores
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.trials import Trials
@@ -122,7 +126,30 @@ def reconstruct_into(
     InputError
         If anything asked cannot be; a result that is there stays as it is.
     """
-    out, run, path = ResultDirectory(directory, monitor.say), run or Run(), None
+    out, begun = ResultDirectory(directory, monitor.say), [resume]
+    with Cores(torch.device("cpu")), if_interrupted(lambda: _left_behind(out, begun[0])):
+        return _reconstruct_into(
+            out, measurement, reconstructor, run or Run(), voxels, resume, force, keep, on_step, monitor, live, begun
+        )
+
+
+def _left_behind(out: ResultDirectory, begun: bool) -> str:
+    """What an interrupted run has saved, and how to go on; an older result is not its own before it has begun."""
+    resume = f"nerif reconstruct --resume --out {out.path}"
+    if begun and out.has(FIELD):
+        return f"{out.path} holds the field, not yet all that is written of it; {resume} completes it"
+    if begun and (out.has(CHECKPOINT) or out.first_look.has(CHECKPOINT) or out.first_look.has(FIELD)):
+        return f"{out.path} holds the last checkpoint; {resume} goes on from there"
+    return "nothing was saved yet; the same command starts again"
+
+
+def _reconstruct_into(
+    out: ResultDirectory, measurement: Measurement | str | os.PathLike[str], reconstructor: Reconstructor, run: Run,
+    voxels: int | None, resume: bool, force: bool, keep: Mapping[str, Any] | None, on_step: OnStep | None,
+    monitor: Monitor, live: bool, begun: list[bool],
+) -> Reconstruction:  # fmt: skip
+    """Do it; `begun` becomes [True] when the directory is the run's own."""
+    path = None
     if not isinstance(measurement, Measurement):
         path = Path(measurement)
         measurement = Measurement.read(path)
@@ -166,7 +193,7 @@ def reconstruct_into(
     settings = _settings(run, path, reconstructor, voxels, keep or {})
     if "density" not in quantities_of(measurement.quantity):
         del settings["gas"]
-    run, begin = replace(run, hold_out=unseen), _begin(out, settings, resume)
+    run, begin = replace(run, hold_out=unseen), _begin(out, settings, resume, begun)
     data = measurement if look is None else look.data
     looked = Live(out.path, data, reconstructor, *unseen[:1]) if live else None
     if looked is not None and look is not None:
@@ -214,8 +241,9 @@ def write_report(
     """Write the page of a result directory, say what could not be shown, and return where it is."""
     out = ResultDirectory(directory, monitor.say)
     path = path or out / REPORT
-    result = out.read()
-    page = html.render(result)
+    with monitor.counting("writing the report"):
+        result = out.read()
+        page = html.render(result)
     if path == out / REPORT:
         with out.writing(REPORT):
             html.write(page, path)
@@ -257,8 +285,9 @@ def _write(
     out.write_field(result)
     out.write_history(result.history)
     monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
-    volumes = all_quantities(result, run.gas, voxels)
-    out.write_volumes(volumes)
+    with monitor.counting("sampling the field"):
+        volumes = all_quantities(result, run.gas, voxels)
+        out.write_volumes(volumes)
     for line in masked_lines(volumes):
         monitor.say(line)
     if "temperature" in quantities_of(measurement.quantity) and all(v.quantity != "temperature" for v in volumes):
@@ -288,14 +317,16 @@ def _write(
             monitor.say(line)
         if run.hold_out:
             unseen = calibrated.select(run.hold_out)
-            held = refit(result.field, unseen, result.settings, result.device)
-            mended = reproject(result.field, with_corrections(unseen, held), run.hold_out, result.device)
+            with monitor.counting("refining the views held out"):
+                held = refit(result.field, unseen, result.settings, result.device)
+                mended = reproject(result.field, with_corrections(unseen, held), run.hold_out, result.device)
             metrics |= {"rig_held_out": held, "views_refitted": evaluate_views(mended) if held else []}
     with monitor.counting("re-projecting") as bar:
         reprojection = reproject(result.field, measurement, run.hold_out, result.device, bar, result.model)
-    views = evaluate_views(reprojection)
-    out.write_metrics({"views": views, "reprojection": [a.entries for a in reprojection.accuracies], **metrics})
-    out.write_reprojection(reprojection)
+    with monitor.counting("scoring the views"):
+        views = evaluate_views(reprojection)
+        out.write_metrics({"views": views, "reprojection": [a.entries for a in reprojection.accuracies], **metrics})
+        out.write_reprojection(reprojection)
     for line in score_lines(views):
         monitor.say(line)
     for line in score_lines(metrics.get("views_refitted", [])):
@@ -391,7 +422,9 @@ def _settings(
     return {"measurement": found, "method": _method(reconstructor), "voxels": voxels, **asked}
 
 
-def _begin(out: ResultDirectory, settings: Mapping[str, Any], resume: bool) -> Callable[[Step | None], None]:
+def _begin(
+    out: ResultDirectory, settings: Mapping[str, Any], resume: bool, begun: list[bool]
+) -> Callable[[Step | None], None]:
     """Make the directory ready once the first step is done: input that is refused before leaves an old result alone."""
     done: list[bool] = []
 
@@ -399,5 +432,6 @@ def _begin(out: ResultDirectory, settings: Mapping[str, Any], resume: bool) -> C
         if not done:
             out.begin(settings, resume)
             done.append(True)
+            begun[0] = True
 
     return prepare

@@ -19,6 +19,7 @@ from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, measure_instant
 from nerif.imaging.over_time import frame_numbers, instants_of, measure_recording
 from nerif.imaging.views import find_views
+from nerif.interruption import if_interrupted
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.techniques.deflection import Deflection
@@ -117,7 +118,9 @@ def run_over_time(settings: Displacement, recording: Recording) -> MeasurementSe
     numbers = frame_numbers(settings.frames, recording.views)
     times = instants_of(numbers, recording.views[0], settings.frame_rate)
     kept = {name: value for name, value in asdict(settings).items() if name not in ("out", "force", "config", "frames")}
-    with counting_bar("references, then frames", len(recording.views) + len(numbers)) as bar:
+    begun = f"frames that are done are kept in {settings.out}; the same command goes on with the others"
+    count = len(recording.views) + len(numbers)
+    with if_interrupted(lambda: begun), counting_bar("references, then frames", count) as bar:
         return measure_recording(recording, numbers, times, settings.out, kept, settings.force, say, bar)
 
 

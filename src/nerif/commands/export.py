@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, say
+from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.exports import FORMATS, export
@@ -58,10 +58,11 @@ def run(settings: Export) -> None:
         raise InputError(f"lower, upper: expected a part of the box {whole_box}, got {box.lower} to {box.upper}")
     grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
     asked = settings.quantities or tuple(q for q in quantities_of(quantity) if q != "temperature")
-    reconstructed = Volume.of(field.sample(grid), grid, quantity, n_ambient)
-    gas = settings.gas.of(result.settings())
-    volumes = [derive(reconstructed, q, gas) for q in asked]
-    export(settings.out, volumes)
+    with counting_bar("sampling the field"):
+        reconstructed = Volume.of(field.sample(grid), grid, quantity, n_ambient)
+        gas = settings.gas.of(result.settings())
+        volumes = [derive(reconstructed, q, gas) for q in asked]
+        export(settings.out, volumes)
     say(f"{settings.out}: {', '.join(asked)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
     for line in masked_lines(volumes):
         say(line)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import say
+from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.conventions import InputError
 from nerif.report.pages import JOURNALS, save_figures
@@ -42,7 +42,8 @@ def run(settings: Figures) -> None:
     if out.is_file():
         raise InputError(f"{out}: expected a folder for --out, got a file")
     out.mkdir(parents=True, exist_ok=True)
-    paths = save_figures(result, out, settings.journal, settings.dpi)
+    with counting_bar("drawing figures"):
+        paths = save_figures(result, out, settings.journal, settings.dpi)
     for gap in result.missing:
         say(f"left out: {gap.sentence}")
     if not paths:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from nerif.reconstruction.base import OnStep, Step, compose
 __all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say", "silence"]
 
 SAME_SIGNAL = 0.5  # seconds
+SOON, EVERY = 2.0, 15.0  # seconds until work is told where there is no terminal, and between the lines
 
 
 def say(text: str) -> None:
@@ -77,19 +79,50 @@ def interruptible() -> Iterator[list[bool]]:
 
 @contextmanager
 def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """Show a bar that goes away when done: a callable that is told how many are done, and out of how many."""
+    """Show a bar that goes away when done: a callable that is told how many are done, and out of how many.
+
+    Without a terminal it is a line after SOON, and one EVERY so many seconds, also while nothing is told.
+    """
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 
     console = Console(stderr=True)
+    if not console.is_terminal:
+        with _lines(title, total) as update:
+            yield update
+        return
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())  # title, bar, percent, time left; m/n
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=total)
 
         def update(done: int, of: int | None = None) -> None:
             bar.update(task, completed=done, total=total if of is None else of)
 
         yield update
+
+
+@contextmanager
+def _lines(title: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """Tell how far work is in lines, from a thread of their own: a callable as counting_bar gives it."""
+    so_far, done = [""], threading.Event()
+
+    def update(count: int, of: int | None = None) -> None:
+        whole = total if of is None else of
+        so_far[0] = f" {count}" + (f"/{whole}" if whole else "")
+
+    def tell() -> None:
+        begun, wait = time.monotonic(), SOON
+        while not done.wait(wait):
+            print(f"{title}{so_far[0]}, {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
+            wait = EVERY
+
+    teller = threading.Thread(target=tell, daemon=True)
+    teller.start()
+    try:
+        yield update
+    finally:
+        done.set()
+        teller.join()
 
 
 @contextmanager
@@ -141,7 +174,12 @@ def progress_bar(title: str) -> Iterator[OnStep]:
 def _training(title: str) -> Iterator[OnStep]:
     """A bar of the training that Ctrl-C stops after the step it is in."""
     with interruptible() as asked, progress_bar(title) as bar:
-        yield compose(bar, lambda _: asked[0])
+        yield compose(bar, _say_note, lambda _: asked[0])
+
+
+def _say_note(step: Step) -> None:
+    if step.note:
+        say_on(step.note)
 
 
 MONITOR = Monitor(say_on, _training, counting_bar)

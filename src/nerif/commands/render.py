@@ -15,6 +15,7 @@ from nerif.conventions import AMBIENT_INDEX
 from nerif.experiment import Experiment
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
+from nerif.interruption import if_interrupted
 from nerif.result import ResultDirectory
 
 __all__ = ["Render", "main", "run"]
@@ -57,7 +58,8 @@ def run(settings: Render) -> None:
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
-    with counting_bar("rendering", pictures.pictures(len(cameras))) as bar:
+    begun = f"{settings.out} lacks pictures; the same command with --force begins anew"
+    with if_interrupted(lambda: begun), counting_bar("rendering", pictures.pictures(len(cameras))) as bar:
         pictures.write(
             settings.out, cameras, phantom, box, settings.n_ambient, settings.truth_voxels,
             lambda: bar(next(count)),

@@ -12,6 +12,7 @@ from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.conventions import InputError, with_unit
 from nerif.geometry import Ring
+from nerif.interruption import if_interrupted
 from nerif.simulation import Simulation
 from nerif.volume_file import write_netcdf
 
@@ -86,7 +87,8 @@ def run_over_time(settings: Simulate) -> None:
     for path in (settings.out, truth):
         if path.exists() and not settings.force:
             raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
-    with counting_bar("simulating frames") as bar:
+    begun = f"{settings.out} and {truth} lack frames; the same command with --force begins anew"
+    with if_interrupted(lambda: begun), counting_bar("simulating frames") as bar:
         _, store = settings.simulation.over_time(times, cameras, settings.out, truth, settings.force, bar)
     say(f"{settings.out}: {len(times)} frames of {len(cameras)} views")
     say(f"{truth}: the truth on {' x '.join(map(str, store.grid.shape))} voxels (z, y, x)")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from nerif.conventions import InputError
 from nerif.geometry import Grid
+from nerif.interruption import Interrupted
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.aperture import seen_through
@@ -105,7 +106,8 @@ def reconstruct_sequence(
                 run_sequence(client, replace(plan, threads=threads or share), on_progress)
         except KeyboardInterrupt:
             say(outcome_table(store))
-            raise
+            kept = f"frames that are done are kept in {out}; the same command goes on with the others"
+            raise Interrupted(kept) from None
     say(outcome_table(store))
     return store
 
