@@ -54,6 +54,17 @@ def test_with_the_cookie_it_is(server, path):
     assert "default-src 'self'" in headers["content-security-policy"]
 
 
+@pytest.mark.parametrize(
+    "foreign", ['prefs={"a":1}', "x[y]=1", "name=\xfc\xdf", "a", "=;;", "nerif-{port}=old", "{own}"]
+)
+@pytest.mark.parametrize("order", ["{foreign}; {own}", "{own};{foreign}"])
+def test_cookies_of_other_programs_lock_nobody_out(server, foreign, order):
+    own = server.cookie()
+    foreign = foreign.replace("{own}", own).replace("{port}", str(server.port))
+    assert server.get("/design", {"Cookie": order.format(foreign=foreign, own=own)})[0] == 200
+    assert server.get("/design", {"Cookie": foreign.replace(own, "")})[0] == 403
+
+
 @pytest.mark.parametrize("path", ["/design", STATIC, SOCKET])
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1.evil.example:1"])
 def test_a_foreign_name_that_leads_here_is_refused(server, path, host):

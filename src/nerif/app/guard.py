@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 from collections.abc import Awaitable, Callable, Collection, MutableMapping
-from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
@@ -65,12 +64,13 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        lines = [(name.decode("latin-1").lower(), value.decode("latin-1")) for name, value in scope["headers"]]
+        headers, cookies = dict(lines), ";".join(value for name, value in lines if name == "cookie")
         if headers.get("host", "").lower() not in self.allowed:
             await _refuse(scope, receive, send, 421, "This address is not the one of this server.")
         elif "origin" in headers and not self._own(headers["origin"]):
             await _refuse(scope, receive, send, 403, "Another page asked for this.")
-        elif self._known(headers.get("cookie", "")):
+        elif self._known(cookies):
             await self._pass(scope, receive, send)
         elif scope["type"] == "http" and self._given(scope):
             await self._exchange(scope, send)
@@ -82,11 +82,10 @@ class Guard:
         return scheme in ("http", "https") and host in self.allowed
 
     def _known(self, cookies: str) -> bool:
-        try:
-            morsel = SimpleCookie(cookies).get(self.name)
-        except CookieError:
-            return False
-        return morsel is not None and hmac.compare_digest(morsel.value.encode(), self.cookie.encode())
+        """Whether the session's cookie is among those sent: other programs on this machine set theirs, in any form."""
+        pairs = (cookie.partition("=") for cookie in cookies.split(";"))
+        values = [value.strip() for name, _, value in pairs if name.strip() == self.name]
+        return any(hmac.compare_digest(value.encode(), self.cookie.encode()) for value in values)
 
     def _given(self, scope: Scope) -> bool:
         query = dict(parse_qsl(scope["query_string"].decode("latin-1")))
