@@ -9,7 +9,10 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
 
+import psutil
 import pytest
 
 from app.serving import Served, answering, free_port, outside, served
@@ -111,6 +114,27 @@ def test_others_are_let_in_with_a_token_only():
     with pytest.raises(InputError, match="token: expected 16"):
         App(token="short")
     assert "[::1]" in Address("::1", 1, "x" * 16).names
+
+
+def test_a_server_for_all_interfaces_answers_to_the_address_of_each(monkeypatch):
+    """Debian writes the machine's name beside 127.0.1.1 into /etc/hosts."""
+    there = {
+        "eth0": [(socket.AF_INET, "192.0.2.7"), (socket.AF_INET6, "fe80::1%eth0"), (-1, "02:00:5e:10:00:00")],
+        "lo": [(socket.AF_INET, "127.0.0.1")],
+    }  # fmt: skip
+    found = {name: [SimpleNamespace(family=f, address=a) for f, a in rows] for name, rows in there.items()}
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: found)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [(socket.AF_INET, 1, 6, "", ("127.0.1.1", 0))])
+    names = Address("0.0.0.0", 1, "x" * 16).names
+    assert {"192.0.2.7", "[fe80::1]", socket.gethostname()} <= set(names)
+    assert not any("02:00" in name or "%" in name for name in names)
+    assert "192.0.2.7" not in Address("127.0.0.1", 1, "x" * 16).names
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "0.0.0.0", "192.0.2.7"])
+def test_the_address_to_open_is_one_that_is_answered(host):
+    address = Address(host, 8620, "x" * 16)
+    assert urlsplit(address.link).netloc.removesuffix(":8620") in address.names
 
 
 def test_a_port_that_is_taken_gives_the_next(capsys):

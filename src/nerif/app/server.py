@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
 
+import psutil
 from nicegui import app, background_tasks, ui
 from nicegui.server import Server
 from starlette.responses import RedirectResponse
@@ -30,6 +31,7 @@ __all__ = ["Address", "serve", "told_of"]
 
 TRIED = 20  # ports
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
+EVERYWHERE = ("0.0.0.0", "::")
 QUEUE_EVERY = 0.5  # seconds
 
 
@@ -72,18 +74,18 @@ class Address:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What browsers may call this server."""
-        if _is_local(self.host):
-            return LOCAL
-        own = {self.host, socket.gethostname(), socket.getfqdn()}
-        if self.host in ("0.0.0.0", "::"):
-            own |= {str(found[4][0]) for found in socket.getaddrinfo(socket.gethostname(), None)}
+        """What browsers may call this server: where it listens on all interfaces, by the address of any of them."""
+        own = {self.host}
+        if not _is_local(self.host):
+            own |= {socket.gethostname(), socket.getfqdn()}
+        if self.host in EVERYWHERE:
+            own |= _interfaces()
         return (*LOCAL, *sorted(f"[{name}]" if ":" in name else name for name in own))
 
     @property
     def link(self) -> str:
         """The address to open."""
-        host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(self.host, self.host)
+        host = socket.gethostname() if self.host in EVERYWHERE else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/?{urlencode({'token': self.token})}"
 
 
@@ -159,6 +161,12 @@ def _is_local(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:  # a name
         return False
+
+
+def _interfaces() -> set[str]:
+    """The addresses of this machine's network interfaces; its own name may lead to 127.0.1.1 alone."""
+    found = [address for interface in psutil.net_if_addrs().values() for address in interface]
+    return {a.address.partition("%")[0] for a in found if a.family in (socket.AF_INET, socket.AF_INET6)}
 
 
 def _free_port(host: str, port: int) -> int:
