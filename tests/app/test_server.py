@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +19,12 @@ import pytest
 from app.serving import Served, answering, free_port, outside, served
 from nerif.app.command import App
 from nerif.app.guard import cookie_of
+from nerif.app.private import page_leading_to
 from nerif.app.server import Address, told_of
 from nerif.cli import main
+from nerif.commands.settings import read_settings
 from nerif.conventions import InputError
+from report.browsing import needs_browser, wait_for
 
 STATIC = "/_nicegui/3.18.0/static/nicegui.css"
 SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
@@ -42,7 +46,7 @@ def test_without_the_token_nothing_is_answered(server, path):
 
 def test_the_token_is_exchanged_for_a_cookie_that_no_script_reads(server):
     status, headers, _ = server.get(f"/design?token={server.token}&x=1")
-    assert (status, headers["location"]) == (303, "/design?x=1")
+    assert (status, headers["refresh"]) == (200, "0; url=/design?x=1")
     kept = headers["set-cookie"]
     assert "HttpOnly" in kept
     assert "SameSite=Strict" in kept
@@ -157,15 +161,53 @@ def test_without_nicegui_the_remedy_is_said(tmp_path, capsys, monkeypatch):
     assert "pip install 'nerif-bost[app]'" in capsys.readouterr().err
 
 
-def test_ctrl_c_ends_it_cleanly(tmp_path: Path):
-    words = [sys.executable, "-m", "nerif", "app", str(tmp_path), "--no-browser", "--port", str(free_port())]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=outside()) as process:
+def test_a_browser_is_led_in_without_the_token_on_its_command_line_and_ctrl_c_ends_all(tmp_path: Path):
+    browser, started = tmp_path / "browser", tmp_path / "started"
+    browser.write_text(f'#!/bin/sh\necho "$@" > {started}.part && mv {started}.part {started}\n')
+    browser.chmod(0o755)
+    words = [sys.executable, "-m", "nerif", "app", str(tmp_path), "--port", str(free_port())]
+    environment = {**outside(), "BROWSER": f"{browser} %s", "XDG_STATE_HOME": str(tmp_path / "state")}
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    ) as process:
         assert process.stdout is not None
-        answering(process.pid, process.stdout)
+        served = answering(process.pid, process.stdout)
+        until = time.monotonic() + 20
+        while not started.is_file():
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        address = started.read_text().strip()
+        assert served.token not in address
+        page = Path(address.removeprefix("file://"))
+        assert served.link in page.read_text()
+        assert page.stat().st_mode & 0o077 == 0
         process.send_signal(signal.SIGINT)
         rest, _ = process.communicate(timeout=20)
         assert process.returncode == 0
         assert "Traceback" not in rest
+        assert not page.exists()
+
+
+def test_a_page_that_cannot_be_kept_from_others_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    with pytest.raises(InputError, match=r"expected a directory .* set XDG_STATE_HOME"), page_leading_to("http://x:1/"):
+        pass
+
+
+def test_a_token_may_stand_in_a_file_instead_of_the_command_line(tmp_path):
+    (tmp_path / "app.toml").write_text('host = "0.0.0.0"\ntoken = "0123456789abcdef"\n')
+    settings = read_settings(App(), [str(tmp_path), "--config", str(tmp_path / "app.toml")], "app")
+    assert (settings.folder, settings.token) == (tmp_path, "0123456789abcdef")
+
+
+@needs_browser
+def test_a_browser_is_let_in_by_way_of_the_page(browser, server):
+    """It comes from another site: a cookie with SameSite=Strict is not sent to where a redirect leads then."""
+    with page_leading_to(server.link) as page:
+        browser.get(page)
+        wait_for(browser, "return location.pathname === '/design' && window.socket?.connected")
+    assert server.token not in browser.current_url
 
 
 @pytest.mark.parametrize(("error", "shown"), [("No response returned.", False), ("out of tune", True)])

@@ -32,7 +32,8 @@ class App(Settings):
     """Address to listen on. Any other than this machine's own needs --token: whoever reaches it and knows the token can
     run nerif here and read and write the folder, and what goes to and fro is not encrypted."""
     token: str | None = None
-    """Token in the address, of 16 letters or more; else a random one each time."""
+    """Token in the address, of 16 letters or more; else a random one each time. Other users of the machine can read the
+    command line: give it in a --config file that they cannot read."""
     browser: bool = True
     """Open the browser."""
 

@@ -102,16 +102,21 @@ class Guard:
         await self.app(scope, receive, with_headers)
 
     async def _exchange(self, scope: Scope, send: Send) -> None:
-        """Give the cookie, and lead to the same page without the token in its address."""
+        """Give the cookie, and lead to the same page without the token in its address.
+
+        By a page of this server: where another one led here, a browser does not send a cookie that is SameSite=Strict
+        to the target of an HTTP redirect.
+        """
         rest = [(k, v) for k, v in parse_qsl(scope["query_string"].decode("latin-1")) if k != "token"]
         where = "/" + scope["path"].lstrip("/\\") + ("?" + urlencode(rest) if rest else "")
         headers = [
-            (b"location", where.encode("ascii", "ignore").replace(b"\r", b"").replace(b"\n", b"")),
+            (b"refresh", b"0; url=" + where.encode("ascii", "ignore").replace(b"\r", b"").replace(b"\n", b"")),
+            (b"content-type", b"text/plain; charset=utf-8"),
             (b"set-cookie", f"{self.name}={self.cookie}; HttpOnly; SameSite=Strict; Path=/".encode()),
             (b"cache-control", b"no-store"),
             *HEADERS,
         ]
-        await send({"type": "http.response.start", "status": 303, "headers": headers})
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
 
 

@@ -9,6 +9,7 @@ import secrets
 import socket
 import webbrowser
 from collections.abc import Awaitable, Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
@@ -21,6 +22,7 @@ from starlette.responses import RedirectResponse
 from nerif.app.frame import frame
 from nerif.app.guard import Guard
 from nerif.app.pages import PAGES, Page
+from nerif.app.private import page_leading_to
 from nerif.app.project import Project
 from nerif.app.result_answers import ROUTES
 from nerif.app.workspace import READ_ONLY, Workspace
@@ -95,7 +97,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     Raises
     ------
     InputError
-        If the folder is none.
+        If the folder is none, or the user's own directory (private.py) cannot be written to.
     """
     work = Workspace(Project(folder))
     if not work.project.writable:
@@ -113,19 +115,22 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
             await asyncio.sleep(0.01)
         say(f"{work.project.folder}: {address.link}")
         say("Ctrl-C ends the server; what runs goes on.")
-        if browser:
-            webbrowser.open(address.link)
+        if first:
+            webbrowser.open(first)
 
     app.on_startup(lambda: background_tasks.create(begun()))
     app.on_startup(lambda: work.beside(work.project.contents))  # the first look is the longest
     app.timer(QUEUE_EVERY, work.jobs.advance)
-    try:
-        ui.run(
-            host=address.host, port=address.port, title="nerif", show=False, reload=False, dark=None, language="en-US",
-            tailwind=False, show_welcome_message=False, reconnect_timeout=30.0, favicon=FAVICON, access_log=False,
-        )  # fmt: skip
-    except KeyboardInterrupt:
-        say("")
+    with ExitStack() as ending:
+        first = ending.enter_context(page_leading_to(address.link)) if browser else ""
+        try:
+            ui.run(
+                host=address.host, port=address.port, title="nerif", show=False, reload=False, dark=None,
+                language="en-US", tailwind=False, show_welcome_message=False, reconnect_timeout=30.0, favicon=FAVICON,
+                access_log=False,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            say("")
     say("The server has ended; nerif app goes on with the same runs.")
 
 

@@ -1,0 +1,71 @@
+"""Files for the user alone, outside of every project: whoever may only read the machine or a project cannot read them.
+
+They are in $XDG_STATE_HOME/nerif, by default ~/.local/state/nerif.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from html import escape
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from nerif.conventions import InputError
+
+__all__ = ["page_leading_to"]
+
+
+def _directory() -> Path:
+    """The directory, made if it is missing.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made or written to.
+    """
+    given = Path(os.environ.get("XDG_STATE_HOME", ""))
+    where = (given if given.is_absolute() else Path.home() / ".local" / "state") / "nerif"
+    try:
+        where.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(where, error) from None
+    return where
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a new file that its owner alone may read."""
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(content)
+    except OSError as error:
+        raise _unwritable(path.parent, error) from None
+
+
+def _unwritable(where: Path, error: OSError) -> InputError:
+    return InputError(
+        f"{where}: expected a directory for files that you alone can read, got '{error.strerror or error}'; "
+        "set XDG_STATE_HOME to a directory that you can write to"
+    )
+
+
+@contextmanager
+def page_leading_to(link: str) -> Iterator[str]:
+    """Give the address of a page that leads to `link`, and remove the page at the end.
+
+    A browser is started with the address in its command line, which every user of the machine can read; `link` holds
+    the token and stands in the page alone.
+    """
+    page = _directory() / f"open-{urlsplit(link).port}.html"
+    page.unlink(missing_ok=True)  # of a server that was killed
+    to = escape(link)
+    _write(
+        page,
+        f'<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer"><title>nerif</title>'
+        f'<meta http-equiv="refresh" content="0; url={to}"><a href="{to}">nerif</a>\n'.encode(),
+    )
+    try:
+        yield page.as_uri()
+    finally:
+        page.unlink(missing_ok=True)
