@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from nerif.app import runner
-from nerif.app.jobs import LAUNCHED, Job, Jobs, command_line
+from nerif.app.jobs import Job, Jobs, claim, command_line
 from nerif.app.jobs_drawer import film_progress
 from nerif.cli import main
 from nerif.conventions import InputError
@@ -65,8 +65,6 @@ def test_one_at_a_time_and_in_order(tmp_path):
 
 def sleeping(jobs: Jobs, process: subprocess.Popen[bytes], **more: object) -> str:
     """A run whose process is one that only sleeps."""
-    import psutil
-
     job = jobs.add(("reconstruct", "m.nc", "--out", "r", "--live"), "run", "r")
     where = jobs.directory / job.id
     began = psutil.Process(process.pid).create_time()
@@ -128,11 +126,10 @@ def test_what_is_asked_while_a_run_starts_is_heard(tmp_path):
     jobs = Jobs(tmp_path)
     job = jobs.add(["demo", "--out", "demo"], "a demo", "demo")
     where = jobs.directory / job.id
-    own = psutil.Process()
-    write_json(where / LAUNCHED, {"pid": own.pid, "began": own.create_time()})
+    assert claim(where, os.getpid())
     assert jobs.get(job.id).state == "running"
     jobs.stop(job.id)
-    runner.main(where)
+    runner.main(where, job.attempt)
     assert jobs.get(job.id).state == "stopped"
     assert not (tmp_path / "demo").exists()
 
@@ -142,6 +139,40 @@ def test_a_run_outlives_the_server(tmp_path):
     code += "print(jobs.add(('--version',), 'x').id); jobs.advance()"
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
     assert until(Jobs(tmp_path), done.stdout.strip(), "done").code == 0
+
+
+@pytest.mark.parametrize("last", ["subprocess.Popen", "json.dumps"])  # of a start: before and after the claim
+def test_a_server_killed_while_it_starts_a_run_leaves_it_to_the_next(tmp_path, last):
+    code = "import json, os, subprocess, sys; from nerif.app.jobs import Jobs; from pathlib import Path;"
+    code += "jobs = Jobs(Path(sys.argv[1])); print(jobs.add(('--version',), 'x').id, flush=True);"
+    code += f"{last} = lambda *_, **__: os._exit(9); jobs.advance()"
+    killed = subprocess.run([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert killed.returncode == 9
+    id = killed.stdout.strip()
+    assert until(Jobs(tmp_path), id, "done").code == 0
+    assert len(Jobs(tmp_path).log(id)) == 1  # it ran once
+
+
+def test_a_run_belongs_to_one_process_until_that_has_gone(tmp_path, process):
+    where = Jobs(tmp_path).directory / Jobs(tmp_path).add(HELP, "x").id
+    assert claim(where, process.pid)
+    assert not claim(where, os.getpid())
+    process.kill()
+    process.wait()
+    assert claim(where, os.getpid())
+    assert not claim(where, os.getpid())
+    assert Jobs(tmp_path).all()[0].state == "running"
+
+
+def test_a_process_that_cannot_start_a_run_says_why(tmp_path, monkeypatch):
+    broken = tmp_path / "python"
+    broken.write_text("#!/bin/sh\necho it is broken >&2\nexit 3\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(broken))
+    jobs = Jobs(tmp_path)
+    id = jobs.add(HELP, "x").id
+    assert until(jobs, id, "failed").code == 3
+    assert jobs.log(id) == ["it is broken"]
 
 
 def test_command_lines_are_quoted():

@@ -1,7 +1,9 @@
 """Runs of `nerif ...`, one after the other: a queue on disk, which a server that is started again finds as it was.
 
 Each run has a folder of its own in FOLDER/.nerif/jobs with job.json (what is asked), log.txt, and what its process
-writes down: started.json and ended.json (runner.py). State is nowhere else.
+writes down: started.json and ended.json (runner.py). State is nowhere else. The name of an empty file says whose the
+run is: `waiting`, and once a server has started a process for it, runner-PID-TIME of that process. Renaming it is the
+claim, which one server alone can make. Where that process has gone before the run began, the run waits again.
 
     queued ─▶ running ─▶ done | failed | stopped
                  │
@@ -22,6 +24,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,7 +37,7 @@ from nerif.result import RUN
 
 __all__ = ["Job", "Jobs", "command_line"]
 
-LAUNCHED = "launched"
+WAITING, OWNER = "waiting", "runner-"
 CLOCK = 1.5  # seconds by which two readings of when a process was started may differ
 RESUMABLE = ("reconstruct", "sequence")
 
@@ -151,27 +154,25 @@ class Jobs:
     def _read(self, name: str) -> Job | None:
         """A run and its state; None where its folder is damaged or just being removed."""
         where = self.directory / name
+        owned = _owned(_owner(where))  # before the files are read: it writes how the run ended just before it goes
         kept, started, ended = (_json(where / file) for file in (JOB, STARTED, ENDED))
         if set(kept) != set(KEPT):
             return None
         job = Job(**{**kept, "arguments": tuple(kept["arguments"]), "attempt": tuple(kept["attempt"])})
         if ended:
-            job = replace(job, code=int(ended["code"]), started=started["time"], ended=ended["time"])
+            job = replace(job, code=int(ended["code"]), started=started.get("time", 0.0), ended=ended["time"])
             over = {"pause": "paused", "stop": "stopped"}.get(job.asked, "done")
             if job.code and job.arguments[0] != "sequence":  # which ends by Ctrl-C in no other way
                 over = "stopped"
             return replace(job, state=over if job.asked or not job.code else "failed")
         if started:
             job = replace(job, started=started["time"], pid=int(started["pid"]))
-            if _alive(job.pid, started["began"]):
+            if owned or _alive(job.pid, started["began"]):
                 return replace(job, state="running")
             return replace(job, state="stopped" if job.asked else "failed", ended=(where / STARTED).stat().st_mtime)
         if job.asked:
             return replace(job, state="stopped")
-        launched = _json(where / LAUNCHED)
-        if launched and not _alive(int(launched["pid"]), launched["began"]):
-            return replace(job, state="failed")
-        return replace(job, state="running" if launched else "queued")
+        return replace(job, state="running" if owned else "queued")
 
     # -- what is asked -------------------------------------------------------------------------------------------
 
@@ -190,6 +191,7 @@ class Jobs:
         words = tuple(str(word) for word in arguments)
         job = Job(name, title, words, words, str(self.folder), str(out), place=time.time())
         self._of(job).mkdir(parents=True)
+        (self._of(job) / WAITING).touch()
         self._keep(job)
         return job
 
@@ -221,9 +223,9 @@ class Jobs:
             attempt = tuple(word for word in attempt if word != "--force")
         elif job.resumable and (self.folder / job.out / RUN).is_file():
             attempt = (job.arguments[0], "--resume", "--out", job.out, *(("--live",) if "--live" in attempt else ()))
-        for name in (STARTED, ENDED, LAUNCHED):
-            (self._of(job) / name).unlink(missing_ok=True)
         self._keep(replace(job, attempt=attempt, asked="", place=time.time()))
+        for name in (STARTED, ENDED):  # it waits once the last of them is gone
+            (self._of(job) / name).unlink(missing_ok=True)
 
     def first(self, id: str) -> None:
         """Let a waiting run be the next."""
@@ -294,20 +296,50 @@ class Jobs:
             self._launch(job)
 
     def _launch(self, job: Job) -> None:
-        import psutil
-
         where = self._of(job)
-        try:
-            claim = os.open(where / LAUNCHED, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
-        except FileExistsError:  # another server of the same folder was faster
-            return
-        runner = subprocess.Popen(
-            [sys.executable, "-m", "nerif.app.runner", str(where)], stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-        )  # fmt: skip
-        with os.fdopen(claim, "w") as file:
-            json.dump({"pid": runner.pid, "began": psutil.Process(runner.pid).create_time()}, file)
-        threading.Thread(target=runner.wait, daemon=True).start()  # only now may its number be given again
+        with (where / LOG).open("ab") as log:  # what the runner prints is why it could not start the run
+            runner = subprocess.Popen(
+                [sys.executable, "-m", "nerif.app.runner", str(where)], stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
+            )  # fmt: skip
+        assert runner.stdin is not None
+        claimed = claim(where, runner.pid)
+        with suppress(BrokenPipeError), runner.stdin as order:  # a runner that has ended already is waited for below
+            if claimed:
+                order.write(json.dumps(job.attempt).encode())
+
+        def wait() -> None:
+            code = runner.wait()  # only now may its number be given again
+            if claimed and code and not (where / STARTED).exists():
+                write_json(where / ENDED, {"code": code, "time": time.time()})
+
+        threading.Thread(target=wait, daemon=True).start()
+
+
+def _owner(where: Path) -> Path:
+    """The file that says whose a run is."""
+    return next(where.glob(f"{OWNER}*"), where / WAITING)
+
+
+def _owned(owner: Path) -> bool:
+    """Whether the process that a run belongs to is there."""
+    _, _, process = owner.name.partition(OWNER)
+    pid, _, began = process.partition("-")
+    return bool(began) and _alive(int(pid), float(began))
+
+
+def claim(where: Path, pid: int) -> bool:
+    """Let a run belong to a process; False where it belongs to another one already, or is gone."""
+    import psutil
+
+    owner = _owner(where)
+    if _owned(owner):
+        return False
+    try:
+        owner.rename(where / f"{OWNER}{pid}-{psutil.Process(pid).create_time():.2f}")
+    except FileNotFoundError:  # another server was faster
+        return False
+    return True
 
 
 def _json(path: Path) -> dict[str, Any]:

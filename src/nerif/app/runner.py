@@ -1,6 +1,7 @@
 """One run as a process of its own, which goes on when the server ends: `python -m nerif.app.runner DIRECTORY`.
 
-It starts the command line of job.json, writes down who runs (process and when it was started), and how it ended.
+Its standard input gives the arguments of nerif as JSON, once the run is its own; where that ends without any, because
+the server was killed, nothing is started. It writes down who runs (process and when it was started), and how it ended.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from nerif.json_file import write_json
@@ -20,13 +22,13 @@ __all__ = ["ENDED", "JOB", "LOG", "STARTED", "main"]
 JOB, STARTED, ENDED, LOG = "job.json", "started.json", "ended.json", "log.txt"
 
 
-def main(directory: Path) -> None:
-    """Run it and wait for its end."""
+def main(directory: Path, words: Sequence[str]) -> None:
+    """Run nerif with these arguments and wait for its end."""
     import psutil
 
     job = json.loads((directory / JOB).read_text())
     signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell ignores in the background is no wish here
-    arguments = [sys.executable, "-m", "nerif", *job["attempt"]]
+    arguments = [sys.executable, "-m", "nerif", *words]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (directory / LOG).open("ab") as log:
         process = subprocess.Popen(
@@ -41,4 +43,5 @@ def main(directory: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    if order := sys.stdin.read():
+        main(Path(sys.argv[1]), json.loads(order))
