@@ -2,6 +2,10 @@
 
 import sys
 
-from nerif.cli import main
+if __name__ == "__main__":
+    if not sys.flags.safe_path:
+        del sys.path[0]  # the current folder, which may not be the user's own: its numpy.py is not the one to import
 
-sys.exit(main())
+    from nerif.cli import main
+
+    sys.exit(main())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 from nerif import __version__
@@ -46,7 +47,10 @@ def main(arguments: list[str] | None = None) -> int:
     what it prints any more.
     """
     try:
-        code = _run(sys.argv[1:] if arguments is None else list(arguments))
+        if arguments is None:
+            _run_nothing_of_the_folder()
+            arguments = sys.argv[1:]
+        code = _run(list(arguments))
         sys.stdout.flush()
     except BrokenPipeError:  # nerif info FILE | head -2
         from nerif.commands.output import silence
@@ -54,6 +58,16 @@ def main(arguments: list[str] | None = None) -> int:
         silence()
         return 141
     return code
+
+
+def _run_nothing_of_the_folder() -> None:
+    """Keep code in the current folder, which may be somebody else's, from being run, here and in all child processes.
+
+    Python looks there for modules first where it is started with -c or -m, as workers are. Numba reads there in
+    .numba_config.yaml where its compiled code is, which are pickles.
+    """
+    os.environ["PYTHONSAFEPATH"] = "1"
+    os.environ.setdefault("NUMBA_CACHE_DIR", "")
 
 
 def _run(words: list[str]) -> int:

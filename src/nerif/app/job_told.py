@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Sequence
 
 from nicegui import ui
 
-from nerif.app.jobs import Job
+from nerif.app.jobs import REFUSED, Job
 from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.conventions import InputError
@@ -15,7 +15,7 @@ __all__ = ["LINES", "JobTold"]
 
 EVERY = 0.7  # seconds
 LINES = 3  # of the log
-SAID = {"done": "It is done.", "failed": "It failed; what it said:", "stopped": "It was stopped."}
+SAID = {"done": "It is done.", "failed": "It failed; what it said:", "stopped": "It was stopped.", "refused": REFUSED}
 
 
 class JobTold:

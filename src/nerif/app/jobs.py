@@ -5,6 +5,9 @@ writes down: started.json and ended.json (runner.py). State is nowhere else. The
 run is: `waiting`, and once a server has started a process for it, runner-PID-TIME of that process. Renaming it is the
 claim, which one server alone can make. Where that process has gone before the run began, the run waits again.
 
+A folder may come from somebody else, runs in it among them. job.json is signed with a secret of the user (private.py);
+what is not, or was changed, or was signed for another folder, is refused: it is shown, and never started.
+
     queued ─▶ running ─▶ done | failed | stopped
                  │
                  └─▶ paused ─▶ queued ...          stopped, and gone on with: nerif reconstruct by --resume, nerif
@@ -13,6 +16,7 @@ claim, which one server alone can make. Where that process has gone before the r
 
 from __future__ import annotations
 
+import hmac
 import json
 import os
 import secrets
@@ -23,23 +27,31 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from nerif.app.private import secret
 from nerif.app.runner import ENDED, JOB, LOG, STARTED
 from nerif.conventions import InputError
 from nerif.json_file import write_json
 from nerif.result import RUN
 
-__all__ = ["Job", "Jobs", "command_line"]
+__all__ = ["REFUSED", "Job", "Jobs", "command_line"]
 
 WAITING, OWNER = "waiting", "runner-"
 CLOCK = 1.5  # seconds by which two readings of when a process was started may differ
+MOST = 64  # runs at the same time
 RESUMABLE = ("reconstruct", "sequence")
+OVER = ("done", "failed", "stopped", "refused")
+REFUSED = (
+    "You did not put it into the queue of this folder, or it was changed, or the folder was moved. It is not started; "
+    "start the run again from its page."
+)
+"""What is said of a run without a valid signature."""
 
 
 def command_line(arguments: Sequence[str]) -> str:
@@ -57,11 +69,10 @@ class Job:
     title : what it is, for people
     arguments : of nerif, the verb first
     attempt : those of the present start: of a run that is gone on with, other ones
-    folder : where it runs
     out : what it writes, relative to the folder; empty if that is no result directory
     asked : "", "stop" or "pause"
     place : in the queue
-    state : queued, running, paused, done, failed or stopped
+    state : queued, running, paused, done, failed, stopped or refused
     pid : of its process while it runs
     code : exit code once it has ended
     started, ended : seconds since the epoch, 0 if not yet
@@ -71,7 +82,6 @@ class Job:
     title: str
     arguments: tuple[str, ...]
     attempt: tuple[str, ...]
-    folder: str
     out: str = ""
     asked: str = ""
     place: float = 0.0
@@ -94,10 +104,13 @@ class Job:
     @property
     def resumable(self) -> bool:
         """Whether it can be paused: stopped, and gone on with later."""
-        return self.arguments[0] in RESUMABLE and bool(self.out)
+        return self.arguments[0] in RESUMABLE and bool(self.out) and self.state != "refused"
 
 
-KEPT = ("id", "title", "arguments", "attempt", "folder", "out", "asked", "place")
+KEPT: dict[str, type | tuple[type, ...]] = {
+    "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "asked": str, "place": (int, float),
+}  # fmt: skip
+SIGNATURE = "signature"
 
 
 class Jobs:
@@ -106,17 +119,23 @@ class Jobs:
     Parameters
     ----------
     folder : of the project
+
+    Raises
+    ------
+    InputError
+        If there is no secret to sign with (private.py).
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.directory = folder, folder / ".nerif" / "jobs"
+        self._secret = secret()
 
     # -- what there is -------------------------------------------------------------------------------------------
 
     def all(self) -> list[Job]:
         """Return all runs: what waits and runs in the order of the queue, then what has ended, the last one first."""
         found = [job for job in map(self._read, self._names()) if job is not None]
-        open_, over = ("running", "queued", "paused"), [j for j in found if j.state in ("done", "failed", "stopped")]
+        open_, over = ("running", "queued", "paused"), [j for j in found if j.state in OVER]
         return sorted((j for j in found if j.state in open_), key=lambda j: (open_.index(j.state), j.place)) + sorted(
             over, key=lambda j: j.ended, reverse=True
         )
@@ -154,11 +173,15 @@ class Jobs:
     def _read(self, name: str) -> Job | None:
         """A run and its state; None where its folder is damaged or just being removed."""
         where = self.directory / name
-        owned = _owned(_owner(where))  # before the files are read: it writes how the run ended just before it goes
-        kept, started, ended = (_json(where / file) for file in (JOB, STARTED, ENDED))
-        if set(kept) != set(KEPT):
+        found = _json(where / JOB)
+        kept, signature = {k: v for k, v in found.items() if k in KEPT}, found.get(SIGNATURE)
+        if not _is_job(kept):
             return None
         job = Job(**{**kept, "arguments": tuple(kept["arguments"]), "attempt": tuple(kept["attempt"])})
+        if job.id != name or not hmac.compare_digest(str(signature).encode(), self._signature(kept).encode()):
+            return replace(job, id=name, state="refused", ended=(where / JOB).stat().st_mtime)
+        owned = _owned(_owner(where))  # before the others are read: how a run ended is written just before its end
+        started, ended = _json(where / STARTED), _json(where / ENDED)
         if ended:
             job = replace(job, code=int(ended["code"]), started=started.get("time", 0.0), ended=ended["time"])
             over = {"pause": "paused", "stop": "stopped"}.get(job.asked, "done")
@@ -189,7 +212,7 @@ class Jobs:
             raise InputError("arguments: expected a verb of nerif, got nothing")
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
         words = tuple(str(word) for word in arguments)
-        job = Job(name, title, words, words, str(self.folder), str(out), place=time.time())
+        job = Job(name, title, words, words, str(out), place=time.time())
         self._of(job).mkdir(parents=True)
         (self._of(job) / WAITING).touch()
         self._keep(job)
@@ -214,7 +237,13 @@ class Jobs:
         self._ask(id, "pause")
 
     def resume(self, id: str) -> None:
-        """Put a run that has been paused, stopped or broken off back into the queue: from its checkpoint, if it can."""
+        """Put a run that has been paused, stopped or broken off back into the queue: from its checkpoint, if it can.
+
+        Raises
+        ------
+        InputError
+            If it is refused.
+        """
         job = self.get(id)
         if job.state in ("queued", "running"):
             return
@@ -265,12 +294,13 @@ class Jobs:
     @property
     def at_once(self) -> int:
         """How many run at the same time."""
-        return int(_json(self.directory / "settings.json").get("at_once", 1))
+        count = _json(self.directory / "settings.json").get("at_once")
+        return count if isinstance(count, int) and 1 <= count <= MOST else 1
 
     @at_once.setter
     def at_once(self, count: int) -> None:
-        if not 1 <= count <= 64:
-            raise InputError(f"at_once: expected 1 to 64 runs at the same time, got {count}")
+        if not 1 <= count <= MOST:
+            raise InputError(f"at_once: expected 1 to {MOST} runs at the same time, got {count}")
         self.directory.mkdir(parents=True, exist_ok=True)
         write_json(self.directory / "settings.json", {"at_once": int(count)})
 
@@ -284,7 +314,15 @@ class Jobs:
             os.kill(now.pid, signal.SIGINT)
 
     def _keep(self, job: Job) -> None:
-        write_json(self._of(job) / JOB, {k: v for k, v in asdict(job).items() if k in KEPT})
+        if job.state == "refused":
+            raise InputError(f"job {job.id}: {REFUSED}")
+        kept = {name: value for name, value in asdict(job).items() if name in KEPT}
+        write_json(self._of(job) / JOB, {**kept, SIGNATURE: self._signature(kept)})
+
+    def _signature(self, kept: Mapping[str, Any]) -> str:
+        """What only this user can write of a run in this folder."""
+        words = json.dumps([str(self.folder), kept], sort_keys=True)
+        return hmac.new(self._secret, words.encode(), "sha256").hexdigest()
 
     # -- the queue -----------------------------------------------------------------------------------------------
 
@@ -299,7 +337,7 @@ class Jobs:
         where = self._of(job)
         with (where / LOG).open("ab") as log:  # what the runner prints is why it could not start the run
             runner = subprocess.Popen(
-                [sys.executable, "-m", "nerif.app.runner", str(where)], stdin=subprocess.PIPE,
+                [sys.executable, "-P", "-m", "nerif.app.runner", str(where)], stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
             )  # fmt: skip
         assert runner.stdin is not None
@@ -314,6 +352,13 @@ class Jobs:
                 write_json(where / ENDED, {"code": code, "time": time.time()})
 
         threading.Thread(target=wait, daemon=True).start()
+
+
+def _is_job(kept: Mapping[str, Any]) -> bool:
+    """Whether the entries of a job.json are there, and of the right kind."""
+    if set(kept) != set(KEPT) or not all(isinstance(kept[name], kind) for name, kind in KEPT.items()):
+        return False
+    return all(words and all(isinstance(w, str) for w in words) for words in (kept["arguments"], kept["attempt"]))
 
 
 def _owner(where: Path) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nicegui import ui
 
-from nerif.app.jobs import Job
+from nerif.app.jobs import REFUSED, Job
 from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.conventions import InputError
@@ -27,6 +27,7 @@ ACTIONS = {
     "done": ("remove",),
     "failed": ("resume", "remove"),
     "stopped": ("resume", "remove"),
+    "refused": ("remove",),
 }
 NAMES = {
     "pause": "Pause", "stop": "Stop", "resume": "Go on", "remove": "Forget", "first": "Next", "earlier": "Earlier",
@@ -109,6 +110,8 @@ class JobsDrawer:
                 f"<b>{escape(job.title)}</b><span class=state>{escape(said)} {escape(title)}</span>"
                 f"<code>{escape(job.line)}</code>", sanitize=False,
             )  # fmt: skip
+            if job.state == "refused":
+                ui.html(f"<p class=note>{escape(REFUSED)}</p>", sanitize=False)
             if job.state == "running" and share:
                 ui.linear_progress(share, show_value=False).props(f'aria-label="{escape(job.title)}"')
             with ui.row().classes("gap-1"):

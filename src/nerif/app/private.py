@@ -6,15 +6,18 @@ They are in $XDG_STATE_HOME/nerif, by default ~/.local/state/nerif.
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from html import escape
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from nerif.conventions import InputError
 
-__all__ = ["page_leading_to"]
+__all__ = ["page_leading_to", "secret"]
+
+LENGTH = 32  # of the secret, bytes
 
 
 def _directory() -> Path:
@@ -48,6 +51,33 @@ def _unwritable(where: Path, error: OSError) -> InputError:
         f"{where}: expected a directory for files that you alone can read, got '{error.strerror or error}'; "
         "set XDG_STATE_HOME to a directory that you can write to"
     )
+
+
+def secret() -> bytes:
+    """Return the secret that runs are signed with: made the first time, the same for every server of this user.
+
+    Raises
+    ------
+    InputError
+        If others may have read or written it, or the directory cannot be written to.
+    """
+    path = _directory() / "secret"
+    if not path.exists():
+        part = path.with_name(f".{secrets.token_hex(8)}")
+        _write(part, secrets.token_bytes(LENGTH))
+        with suppress(FileExistsError):  # of two servers that start at once, the first gives the secret
+            os.link(part, path)
+        part.unlink()
+    with path.open("rb") as file:
+        about, content = os.fstat(file.fileno()), file.read()
+    own = os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o077)
+    if not own or len(content) != LENGTH:
+        got = f"{len(content)} bytes with mode {about.st_mode & 0o777:03o} of user {about.st_uid}"
+        raise InputError(
+            f"{path}: expected {LENGTH} bytes that you alone can read (mode 600), got {got}; delete it, and start "
+            "runs that wait again from their pages"
+        )
+    return content
 
 
 @contextmanager

@@ -26,13 +26,12 @@ def main(directory: Path, words: Sequence[str]) -> None:
     """Run nerif with these arguments and wait for its end."""
     import psutil
 
-    job = json.loads((directory / JOB).read_text())
     signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell ignores in the background is no wish here
-    arguments = [sys.executable, "-m", "nerif", *words]
+    arguments = [sys.executable, "-P", "-m", "nerif", *words]  # -P: no module of the folder is imported
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (directory / LOG).open("ab") as log:
         process = subprocess.Popen(
-            arguments, cwd=job["folder"], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
+            arguments, cwd=directory.parents[2], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
         )
         began = psutil.Process(process.pid).create_time()
         write_json(directory / STARTED, {"pid": process.pid, "began": began, "time": time.time()})

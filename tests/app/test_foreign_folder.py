@@ -1,0 +1,140 @@
+"""A folder of somebody else: nothing in it is run, and no run that is found in it is started."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from app.serving import answering, end, free_port, outside
+from nerif.app.jobs import Jobs
+from nerif.app.private import secret
+from nerif.conventions import InputError
+
+MODULES = ("numpy", "psutil", "torch", "types", "lazy_loader", "multiprocessing", "selectors", "nicegui", "zarr")
+PLANTED = {
+    "id": "planted", "title": "<b>planted</b>", "arguments": ["--version"], "attempt": ["--version"], "folder": "/",
+    "out": "../../elsewhere", "asked": "", "place": -1.0, "signature": "0" * 64,
+}  # fmt: skip
+
+
+def plant(folder: Path, modules: Sequence[str] = MODULES) -> None:
+    """Modules that leave a mark when they are imported, and a run that waits."""
+    for name in modules:
+        (folder / f"{name}.py").write_text(f"open({str(folder / 'mark')!r}, 'a').write({name!r})\n")
+    (folder / ".numba_config.yaml").write_text("CACHE_DIR: compiled\n")  # which Numba unpickles
+    where = folder / ".nerif" / "jobs" / "planted"
+    where.mkdir(parents=True)
+    (where / "waiting").touch()
+    (where / "job.json").write_text(json.dumps(PLANTED))
+
+
+def ended(jobs: Jobs, id: str) -> str:
+    """Wait for the end of a run, and return its state; another process or this one advances the queue."""
+    until = time.monotonic() + 60
+    while (state := jobs.get(id).state) in ("queued", "running"):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return state
+
+
+def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path):
+    plant(tmp_path)
+    jobs = Jobs(tmp_path)
+    own = jobs.add(("info", "m.nc"), "own").id
+    words = [sys.executable, "-P", "-m", "nerif", "app", ".", "--no-browser", "--port", str(free_port())]
+    with subprocess.Popen(
+        words, cwd=tmp_path, env=outside(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as server:
+        assert server.stdout is not None
+        try:
+            answering(server.pid, server.stdout)
+            assert ended(jobs, own) == "failed"  # there is no m.nc
+        finally:
+            end(server.pid, server.stdout)
+    assert "m.nc" in jobs.log(own)[-1]
+    assert jobs.get("planted").state == "refused"
+    assert not (jobs.directory / "planted" / "log.txt").exists()
+    assert not (tmp_path / "mark").exists()
+
+
+def test_a_run_that_is_not_signed_is_shown_and_never_started(tmp_path):
+    plant(tmp_path, ())
+    jobs = Jobs(tmp_path)
+    jobs.advance()
+    assert [(job.id, job.state, job.resumable) for job in jobs.all()] == [("planted", "refused", False)]
+    for action in (jobs.resume, jobs.first):
+        with pytest.raises(InputError, match="It is not started; start the run again from its page"):
+            action("planted")
+    jobs.stop("planted")
+    assert jobs.all()[0].state == "refused"
+    jobs.remove("planted")
+    assert jobs.all() == []
+
+
+@pytest.mark.parametrize("change", ["arguments", "folder", "copy", "secret"])
+def test_a_signature_holds_for_one_run_in_one_folder_by_one_user(tmp_path, monkeypatch, change):
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    where = Jobs(first).directory / Jobs(first).add(("info", "m.nc"), "own").id
+    assert Jobs(first).all()[0].state == "queued"
+    if change == "arguments":
+        (where / "job.json").write_text((where / "job.json").read_text().replace("m.nc", "n.nc"))
+    elif change == "folder":
+        first.rename(second)
+    elif change == "copy":
+        shutil.copytree(where, where.with_name("again"))
+        shutil.rmtree(where)
+    else:
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state of another user"))
+    assert [job.state for job in Jobs(second if change == "folder" else first).all()] == ["refused"]
+
+
+def test_the_secret_is_the_users_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert secret() == secret()
+    path = tmp_path / "nerif" / "secret"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert [p.name for p in path.parent.iterdir()] == ["secret"]
+    path.chmod(0o644)
+    with pytest.raises(InputError, match=r"expected 32 bytes that you alone can read .* delete it"):
+        Jobs(tmp_path)
+
+
+def run(words: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run Python in a folder."""
+    return subprocess.run(
+        [sys.executable, *words], cwd=folder, capture_output=True, text=True, env=outside(), timeout=60
+    )
+
+
+def test_the_command_imports_nothing_of_a_folder_nor_do_its_workers(tmp_path):
+    """As the script `nerif` starts it: its own folder is first on sys.path, and workers start with python -c."""
+    command, folder = tmp_path / "bin" / "nerif", tmp_path / "project"
+    command.parent.mkdir()
+    folder.mkdir()
+    plant(folder)
+    command.write_text(
+        "from nerif.cli import main\n"
+        "if __name__ == '__main__':\n"
+        "    assert main() == 2\n"
+        "    import numba\n"
+        "    from nerif.imaging.workers import work\n"
+        "    print(dict(work(divmod, 7, [2, 3], 2)), repr(numba.config.CACHE_DIR))\n"
+    )
+    done = run([str(command), "info", "m.nc"], folder)
+    assert done.stdout == "{0: (3, 1), 1: (2, 1)} ''\n", done.stderr
+    assert not (folder / "mark").exists()
+
+
+def test_python_m_nerif_imports_no_package_of_a_folder(tmp_path):
+    plant(tmp_path, ("numpy", "psutil", "torch"))
+    done = run(["-m", "nerif", "info", "m.nc"], tmp_path)
+    assert (done.returncode, "m.nc" in done.stderr) == (2, True), done.stderr
+    assert not (tmp_path / "mark").exists()
