@@ -115,7 +115,7 @@ def _left_behind() -> str:
     from nerif.atomic import written
 
     if not written:
-        return "nothing was written; the same command begins anew"
+        return "nothing was written; the same command starts again"
     last = ", ".join(dict.fromkeys(map(str, written[-MENTIONED:])))
     more = f" and {len(written) - MENTIONED} more" if len(written) > MENTIONED else ""
     return f"written and whole: {last}{more}; the same command with --force does all of it anew"

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     import xarray as xr
     import zarr
 
-__all__ = ["MeasurementSequence", "add_frames", "check_store", "require_zarr"]
+__all__ = ["ZARR_FORMAT", "MeasurementSequence", "add_frames", "check_store", "require_zarr"]
 
+ZARR_FORMAT = 3
+"""Of every store. The second one has filters that unpickle what they read: a store of somebody else could run code."""
 WRITTEN = "written"
 """Variable (time,) that is 1 where a frame is complete; stores of other programs may lack it."""
 
@@ -222,7 +224,7 @@ class MeasurementSequence:
         time = ("time", np.asarray(times, dtype=np.float64), {"units": "s", "axis": "T"})
         fixed = fixed.assign_coords(names).assign_coords(time=time)
         with atomic(path) as part:
-            fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=3)
+            fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=ZARR_FORMAT)
             group = zarr.open_group(part, mode="r+")
             for name in maps:
                 v = dataset[name]
@@ -295,7 +297,9 @@ def _opened(path: Path) -> xr.Dataset:
     if not path.exists():
         raise InputError(f"{path}: no such store; expected a measurement sequence (Zarr, {CONVENTIONS})")
     with reading(f"{path}: not a readable Zarr store"):
-        return xr.open_dataset(path, engine="zarr", chunks=None, consolidated=False, decode_times=False)
+        return xr.open_dataset(
+            path, engine="zarr", chunks=None, consolidated=False, decode_times=False, zarr_format=ZARR_FORMAT
+        )
 
 
 def _short(times: Sequence[float]) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from nerif.atomic import atomic
 from nerif.conventions import InputError, ambient_index
 from nerif.geometry import Box, Grid
-from nerif.measurement_sequence import add_frames, check_store, require_zarr
+from nerif.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
 from nerif.netcdf import reading
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, technique
@@ -74,7 +74,7 @@ class VolumeSequence:
         if not self.path.is_dir():
             raise InputError(f"{path}: no such store; expected volumes over time (Zarr)")
         with reading(f"{path}: expected volumes over time, written by nerif"):
-            self.group: zarr.Group = zarr.open_group(self.path, mode="r+")
+            self.group: zarr.Group = zarr.open_group(self.path, mode="r+", zarr_format=ZARR_FORMAT)
             self.attributes: dict[str, Any] = dict(self.group.attrs)
         if missing := {"box_lower_mm", "box_upper_mm", "n_ambient"} - set(self.attributes):
             raise InputError(
@@ -131,7 +131,7 @@ class VolumeSequence:
             },
         )
         with atomic(path) as part:
-            fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=3)
+            fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=ZARR_FORMAT)
             group = zarr.open_group(part, mode="r+")
             for quantity in quantities:
                 unit, name = describe(quantity)

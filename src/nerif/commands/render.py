@@ -58,7 +58,7 @@ def run(settings: Render) -> None:
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
-    begun = f"{settings.out} lacks pictures; the same command with --force begins anew"
+    begun = f"{settings.out} lacks pictures; the same command with --force starts again"
     with if_interrupted(lambda: begun), counting_bar("rendering", pictures.pictures(len(cameras))) as bar:
         pictures.write(
             settings.out, cameras, phantom, box, settings.n_ambient, settings.truth_voxels,

@@ -87,7 +87,7 @@ def run_over_time(settings: Simulate) -> None:
     for path in (settings.out, truth):
         if path.exists() and not settings.force:
             raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
-    begun = f"{settings.out} and {truth} lack frames; the same command with --force begins anew"
+    begun = f"{settings.out} and {truth} lack frames; the same command with --force starts again"
     with if_interrupted(lambda: begun), counting_bar("simulating frames") as bar:
         _, store = settings.simulation.over_time(times, cameras, settings.out, truth, settings.force, bar)
     say(f"{settings.out}: {len(times)} frames of {len(cameras)} views")
