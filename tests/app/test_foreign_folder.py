@@ -15,6 +15,8 @@ import pytest
 from app.serving import answering, end, free_port, outside
 from nerif.app.jobs import Jobs
 from nerif.app.private import secret
+from nerif.app.project import Project
+from nerif.app.workspace import Workspace
 from nerif.conventions import InputError
 
 MODULES = ("numpy", "psutil", "torch", "types", "lazy_loader", "multiprocessing", "selectors", "nicegui", "zarr")
@@ -62,6 +64,28 @@ def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path
     assert jobs.get("planted").state == "refused"
     assert not (jobs.directory / "planted" / "log.txt").exists()
     assert not (tmp_path / "mark").exists()
+
+
+@pytest.mark.parametrize("link", [".nerif", ".nerif/jobs"])
+def test_a_folder_whose_links_lead_what_the_app_writes_elsewhere_is_refused(tmp_path, link):
+    folder, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
+    (folder / link).parent.mkdir(parents=True)
+    elsewhere.mkdir()
+    (folder / link).symlink_to(elsewhere)
+    with pytest.raises(InputError, match="outside of it"):
+        Workspace(Project(folder))
+    assert not any(elsewhere.iterdir())
+
+
+@pytest.mark.parametrize("text", ["[1]", '"x"', '{"design": 1}', "{"])
+def test_settings_and_drafts_that_are_none_break_nothing(tmp_path, text):
+    jobs = tmp_path / ".nerif" / "jobs"
+    jobs.mkdir(parents=True)
+    (tmp_path / ".nerif" / "drafts.json").write_text(text)
+    (jobs / "settings.json").write_text(text.replace("design", "at_once").replace("1", '"many"'))
+    work = Workspace(Project(tmp_path))
+    assert work.draft("design") == {}
+    assert work.jobs.at_once == 1
 
 
 def test_a_run_that_is_not_signed_is_shown_and_never_started(tmp_path):

@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.app.private import secret
+from nerif.app.project import OWN
 from nerif.app.runner import ENDED, JOB, LOG, STARTED
 from nerif.conventions import InputError
 from nerif.json_file import write_json
@@ -127,7 +128,7 @@ class Jobs:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.directory = folder, folder / ".nerif" / "jobs"
+        self.folder, self.directory = folder, folder / OWN / "jobs"
         self._secret = secret()
 
     # -- what there is -------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from nerif.app.jobs import Jobs
 from nerif.app.picture_files import PictureFiles
-from nerif.app.project import Project
+from nerif.app.project import OWN, Project
 from nerif.json_file import write_json
 
 __all__ = ["READ_ONLY", "Workspace"]
@@ -30,23 +30,32 @@ class Workspace:
     Parameters
     ----------
     project : Project
+
+    Raises
+    ------
+    InputError
+        If what the app writes into the folder would be outside of it, by a link.
     """
 
     def __init__(self, project: Project) -> None:
+        for name in (OWN, f"{OWN}/jobs"):
+            project.path(name)
         self.project, self.jobs, self.files = project, Jobs(project.folder), PictureFiles(project)
         self._drafts: dict[str, dict[str, Any]] = {}
 
     @property
     def _file(self) -> Path:
-        return self.project.folder / ".nerif" / "drafts.json"
+        return self.project.folder / OWN / "drafts.json"
 
     def draft(self, page: str) -> dict[str, Any]:
         """Return what was typed on a page and is not the default: kept over a reload, and over another start."""
         if not self._drafts and self._file.is_file():
             try:
-                self._drafts = dict(json.loads(self._file.read_text()))
+                found = json.loads(self._file.read_text())
             except ValueError:  # damaged: nothing but what was typed is lost
-                self._drafts = {}
+                found = {}
+            kept = found if isinstance(found, dict) else {}
+            self._drafts = {name: values for name, values in kept.items() if isinstance(values, dict)}
         return self._drafts.setdefault(page, {})
 
     def keep(self, page: str, values: dict[str, Any]) -> None:
