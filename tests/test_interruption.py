@@ -41,7 +41,7 @@ def test_every_command_ends_in_one_line(verb, monkeypatch, capsys):
     written.clear()
     assert main([verb]) == 130
     said = capsys.readouterr()
-    assert said.err == "nerif: interrupted; nothing was written; the same command begins anew\n"
+    assert said.err == "nerif: interrupted; nothing was written; the same command starts again\n"
     assert said.out == ""
 
 
@@ -154,5 +154,5 @@ def test_a_signal_ends_a_command_without_a_traceback(tmp_path):
 
 def test_a_film_that_is_simulated_says_how_to_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(simulate.Simulation, "over_time", broken_off)
-    with pytest.raises(Interrupted, match="lack frames; the same command with --force begins anew"):
+    with pytest.raises(Interrupted, match="lack frames; the same command with --force starts again"):
         simulate.run(simulate.Simulate(out=tmp_path / "m.zarr", times="0:1e-3:3"))

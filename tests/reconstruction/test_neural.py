@@ -274,6 +274,19 @@ def test_each_limit_is_named(measurement):
     assert replace(SMALL, stop_ratio=0.9, max_steps=400)(measurement).outcome.reason == "converged"
 
 
+def test_the_rule_of_the_loss_ends_a_run_that_goes_on_from_a_field(measurement, undisturbed):
+    """The share is of the loss near which a network begins, not of the little that an earlier run has left."""
+    result = replace(SMALL, stop_ratio=0.9)(measurement, start=undisturbed.field)
+    assert result.outcome.reason == "converged"
+    assert result.history[-1]["step"] < 5
+
+
+def test_a_small_learning_rate_is_given_the_steps_it_needs(measurement):
+    """Preset paper stays at the empty field for about 450 steps of 2048 points, and finds it then."""
+    slow = training.Training(replace(SMALL, learning_rate=1e-3), FrameData(SMALL, measurement))
+    assert slow.watch.patience == 15 * training.Training(SMALL, FrameData(SMALL, measurement)).watch.patience
+
+
 def test_ambient_is_ambient_on_the_faces(measurement, trained):
     unit = torch.rand(500, 2)
     faces = torch.cat([measurement.box.face_points(f, unit) for f in measurement.ambient_faces])

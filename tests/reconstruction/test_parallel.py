@@ -96,7 +96,7 @@ def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_and_counts_fo
         sum(terms.values()).backward()
         weighed = {name for name, p in field.network.named_parameters() if p.grad is not None}
         share = sum(piece.numbers for piece in pieces) / whole
-        assert share or float(objective.of_nothing(pieces)) == 0
+        assert share or float(objective.of_nothing([p.part for p in pieces], [p.numbers for p in pieces])) == 0
         return {name: share * float(term.detach()) for name, term in terms.items()}, weighed, share
 
     alone, weighed, _ = of(Ranks())

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from nerif.reconstruction.watch import LEAST, PATIENCE, Watch
+from nerif.reconstruction.watch import LEAST, PATIENCE, RATE, Watch
 
 
-def followed(values: list[float], noise: float = 0.0) -> Watch:
-    watch = Watch(noise)
+def followed(values: list[float], noise: float = 0.0, rate: float = RATE) -> Watch:
+    watch = Watch(noise, rate)
     for step, q in enumerate(values, start=1):
         watch.follow(2 * q, 2.0, step)
     return watch
@@ -17,6 +17,12 @@ def test_an_empty_field_is_noticed_after_a_while_or_at_the_end():
     assert followed([1.0] * LEAST).collapsed(over=True)
     assert not followed([1.0] * (PATIENCE - 1)).collapsed(over=False)
     assert followed([1.0] * PATIENCE).collapsed(over=False)
+
+
+def test_a_smaller_learning_rate_has_more_steps_to_leave_the_empty_field():
+    assert not followed([1.0] * (4 * PATIENCE - 1), rate=RATE / 4).collapsed(over=False)
+    assert followed([1.0] * 4 * PATIENCE, rate=RATE / 4).collapsed(over=False)
+    assert followed([1.0] * PATIENCE, rate=4 * RATE).collapsed(over=False)
 
 
 def test_a_field_that_is_lost_again_is_noticed_soon():

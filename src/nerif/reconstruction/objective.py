@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +15,7 @@ from nerif.fields.space_time import AtTimes, with_time
 from nerif.geometry import Rays
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, project
 from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
+from nerif.reconstruction.order import shuffled
 from nerif.reconstruction.parallel import Ranks
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.refinement import MOMENTUM
@@ -26,6 +27,7 @@ from nerif.reconstruction.training_data import TrainingData
 __all__ = ["Objective", "Piece"]
 
 GAUGE_POINTS = 256  # a step
+EMPTY_RAYS = 1 << 14  # that the loss of the ambient field is taken over
 JUDGED_SAMPLES, JUDGED_AT_ONCE = 64, 128  # of a thin ray that is held back, of a pixel with a lens four times as many
 SETTLING = 24  # samples of a ray that brightness is fitted by
 REFINED_SAMPLES, REFINED_RAYS, REFINED_AT_ONCE = 16, 4, 512
@@ -145,7 +147,7 @@ class Objective:
         """Return the terms of the loss, each the mean over all measured numbers of the pieces."""
         settings = self.settings
         terms: dict[str, Tensor] = {}
-        for piece, share in shares(pieces):
+        for piece, share in zip(pieces, shares([piece.numbers for piece in pieces]), strict=True):
             found = loss_terms(
                 self.field, self._at(piece.tau), piece.part, piece.rays, piece.s, piece.interval, settings.weights,
                 settings.norm,
@@ -157,11 +159,26 @@ class Objective:
             terms["gauge"] = ambient.square().mean()
         return terms
 
-    def of_nothing(self, pieces: list[Piece]) -> Tensor:
-        """Return what the loss of the pieces would be in the ambient field."""
-        empty = sum(share * reduce(piece.part.of_nothing, self.settings.norm) for piece, share in shares(pieces))
+    def of_nothing(self, parts: Sequence[Part], numbers: Sequence[int]) -> Tensor:
+        """Return what each of the terms that compare with the measured would be in the ambient field.
+
+        Parameters
+        ----------
+        parts : rays, of one technique each
+        numbers : measured numbers of each, by which they are weighed
+        """
+        terms = (reduce(part.of_nothing, self.settings.norm) for part in parts)
+        empty = sum(share * term for share, term in zip(shares(numbers), terms, strict=True))
         assert isinstance(empty, Tensor)
         return empty
+
+    def empty_loss(self) -> float:
+        """Return the loss of the ambient field, near which a network begins, over as many rays as EMPTY_RAYS."""
+        data, weights = self.data, self.settings.weights
+        index = shuffled(0, min(EMPTY_RAYS, len(data)), len(data), self.settings.seed)
+        parts = [part for part, _ in data.batch(index)]
+        term = self.of_nothing(parts, [part.measured.numel() for part in parts])
+        return float(term) * sum(getattr(weights, name) for name in DATA)
 
     def look(self) -> None:
         """Look at where the field varies."""
@@ -240,8 +257,7 @@ class Objective:
         return self.network if tau is None else AtTimes(self.network, tau)
 
 
-def shares(pieces: list[Piece]) -> Iterator[tuple[Piece, float]]:
-    """Give each piece with its share of all measured numbers of this process."""
-    total = max(sum(piece.numbers for piece in pieces), 1)
-    for piece in pieces:
-        yield piece, piece.numbers / total
+def shares(numbers: Sequence[int]) -> list[float]:
+    """Return the share that each has of all; of none, 0."""
+    total = max(sum(numbers), 1)
+    return [number / total for number in numbers]

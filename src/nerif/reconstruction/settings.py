@@ -91,7 +91,8 @@ class TrainingSettings(SharedSettings):
     first_cycle: int = 400
     """Steps after which a run without a limit first asks whether more would; then after each twice as many."""
     stop_ratio: float = 0.0
-    """Stop when the loss is below this share of the initial loss; 0 never (paper: 0.005)."""
+    """Stop when the loss is below this share of that of the ambient field, near which a network begins; 0 never (paper:
+    0.005)."""
     fit_steps: int = 400
     """Steps in which the network is fitted to the field it starts from (--start-from)."""
     rate_after_fit: float = 0.3

@@ -88,12 +88,12 @@ class Training:
         self.history: list[dict[str, float]] = []
         self.notes: list[str] = []  # for the next step that is told
         self.edge, self.settled = data.coarsest, data.coarsest == 1
-        self.watch = Watch(data.noise)
+        self.watch = Watch(data.noise, settings.learning_rate)
         self.retries, self.rate = 0, 1.0
         self.drawn = 0  # rays, counted through bins of any size
         self.best: dict[str, Tensor] = {}  # weights at the end of the best cycle
         self.beside: dict[str, Tensor] = {}  # what was fitted beside them
-        self.initial_loss, self.running = float("nan"), float("nan")
+        self.initial_loss, self.running = self._initial_loss(), float("nan")
         if resume is not None:
             check_fingerprint(resume.scalars.get("fingerprint"), data.fingerprint)
             self._restore(resume)
@@ -135,7 +135,8 @@ class Training:
             outcome = self._judge() or self._outcome()
             if self.device.type == "cuda" and budget.step % LOG_EVERY and outcome is None:
                 continue  # looking at a number waits for the GPU, so look now and then
-            found = (*terms.values(), loss, self.objective.of_nothing(pieces))
+            empty = self.objective.of_nothing([p.part for p in pieces], [p.numbers for p in pieces])
+            found = (*terms.values(), loss, empty)
             figures = torch.stack([term.detach().float() for term in found])
             means = self.ranks.average(figures, mine, whole).tolist()
             values = dict(zip((*terms, "loss"), means, strict=False))
@@ -235,7 +236,7 @@ class Training:
         if self.data.met != before:
             self._note(f"the loss is of {self.data.met} from here on, of {before} before: it jumps")
         self._recount()
-        self.watch = Watch(self.data.noise)
+        self.watch = Watch(self.data.noise, self.settings.learning_rate)
         self.watch.step = self.budget.step
         self.objective.settle()
         self._log({"part": float(self.data.stage)})
@@ -243,6 +244,7 @@ class Training:
     def _recount(self) -> None:
         self.budget.recount(len(self.data))
         self.watch.noise = self.data.noise
+        self.initial_loss = self._initial_loss()
 
     def _learning_rate(self) -> float:
         """Adam's, of the next step."""
@@ -259,7 +261,7 @@ class Training:
         """Why the run is over, if it is."""
         outcome, share = self.budget.exhausted(), self.settings.stop_ratio
         if outcome is None and share and self.running <= share * self.initial_loss:
-            return Outcome("converged", f"loss fell to {share:g} of its initial value")
+            return Outcome("converged", f"loss fell to {share:g} of that of the ambient field")
         return outcome
 
     def _judge(self) -> Outcome | None:
@@ -286,16 +288,24 @@ class Training:
         return {name: value.detach().clone() for name, value in self.field.network.state_dict().items()}
 
     def _follow(self, values: dict[str, float], empty: float) -> None:
-        """A running mean of the loss; squares are rooted so that ratios mean the same for both norms."""
+        """A running mean of the loss, and of what the watch needs."""
         weights, squared = self.settings.weights, self.settings.norm == "squared"
         data = {name: getattr(weights, name) for name in DATA if name in values}
         residual = sum(weight * values[name] for name, weight in data.items()) / sum(data.values())
         power = 1 if squared else 2
         self.watch.follow(residual**power, empty**power, self.budget.step)
-        loss = math.sqrt(values["loss"]) if squared else values["loss"]
-        if math.isnan(self.initial_loss):
-            self.initial_loss = self.running = loss
+        loss = self._rooted(values["loss"])
+        if math.isnan(self.running):
+            self.running = loss
         self.running += 0.1 * (loss - self.running)
+
+    def _initial_loss(self) -> float:
+        """The loss that the stopping rule takes a share of; NaN where there is no rule."""
+        return self._rooted(self.objective.empty_loss()) if self.settings.stop_ratio else math.nan
+
+    def _rooted(self, loss: float) -> float:
+        """The root of a squared loss, so that ratios mean the same for both norms."""
+        return math.sqrt(loss) if self.settings.norm == "squared" else loss
 
     def _finite(self) -> bool:
         """Whether the weights are: a finite loss can have a gradient that is not."""
@@ -348,7 +358,7 @@ class Training:
         tensors["generator"] = self.generator.get_state().clone()
         if self.objective.density.values is not None:
             tensors["density"] = self.objective.density.values.clone()
-        names = ("retries", "rate", "initial_loss", "running", "settled", "drawn")
+        names = ("retries", "rate", "running", "settled", "drawn")
         scalars: dict[str, Any] = {name: getattr(self, name) for name in names}
         scalars |= {"scale": self.field.scale, "offset": self.field.offset}
         kept = {"budget": self.budget.used(), "history": list(self.history), "fingerprint": self.data.fingerprint}

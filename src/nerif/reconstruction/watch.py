@@ -16,6 +16,7 @@ EMPTY = 0.9  # of what can be explained is left: nothing is found
 HALF, LOSS = 0.5, 0.1
 MUCH = 1.5  # sigma, of which noise alone leaves 1
 PATIENCE, LEAST = 200, 50  # steps in which the loss must have fallen; steps after which an end says something
+RATE = 1.5e-2  # learning rate that PATIENCE is for: at a smaller one the weights need more steps to go as far
 MEMORY = 0.95  # of the running mean, a step
 
 
@@ -25,10 +26,11 @@ class Watch:
     Parameters
     ----------
     noise : the q that is left by the noise alone; 0 where it is not known
+    rate : learning rate of the run
     """
 
-    def __init__(self, noise: float) -> None:
-        self.noise = noise
+    def __init__(self, noise: float, rate: float = RATE) -> None:
+        self.noise, self.patience = noise, round(PATIENCE * max(1.0, RATE / rate))
         self.residual, self.empty = 0.0, 0.0  # running means
         self.lowest, self.step, self.since = 1.0, 0, 0
 
@@ -65,7 +67,7 @@ class Watch:
         """
         if self.found:
             return self.since >= LEAST and self.left > HALF
-        return self.since >= (LEAST if over else PATIENCE) and self.left > EMPTY
+        return self.since >= (LEAST if over else self.patience) and self.left > EMPTY
 
     @property
     def found(self) -> bool:
