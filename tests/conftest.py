@@ -5,10 +5,12 @@ from __future__ import annotations
 # ruff: noqa: E402
 import functools
 import inspect
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 # tests run side by side, each in a thread; threads that wait must not take the cores of other tests
@@ -47,6 +49,7 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
 from nerif.measurement import Measurement
+from nerif.reconstruction import budget
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.simulation import simulate
@@ -153,6 +156,17 @@ def cameras() -> tuple[Camera, ...]:
 def measurement(ball: Field, cameras: tuple[Camera, ...], box: Box) -> Measurement:
     """What those views see of the balls, with 2 % noise."""
     return simulate(ball, cameras, box, n_ambient=1.00027, noise=0.02, seed=5, steps=60)
+
+
+@pytest.fixture
+def slow_clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Let every look at the clock of a training come so many seconds after the one before."""
+
+    def set_to(seconds: float) -> None:
+        ticks = itertools.count()
+        monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: seconds * next(ticks)))
+
+    return set_to
 
 
 @pytest.fixture(scope="session")

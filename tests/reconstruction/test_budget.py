@@ -1,8 +1,10 @@
-"""What counts as time of training."""
+"""What counts as time of training, and what it is told by."""
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -48,3 +50,16 @@ def test_the_pace_begins_again_where_other_rays_are_counted(monkeypatch):
     budget.count(20)
     clock[0] = 5.0
     assert budget.rays_per_second == pytest.approx(10.0)
+
+
+def test_slow_steps_have_a_history(measurement, slow_clock):
+    """A record every twenty steps and, where these take long, every few seconds."""
+    settings = NeRIF(network=NetworkShape(depth=1, width=8, octaves=1), points_per_batch=256, device="cpu")
+    slow_clock(0.5)
+    slow = replace(settings, max_steps=19)(measurement)
+    recorded = [record["seconds"] for record in slow.history]
+    assert len(recorded) > 5
+    assert max(b - a for a, b in pairwise(recorded)) < 15.0
+    slow_clock(1e-4)
+    quick = replace(settings, max_steps=41)(measurement)
+    assert [record["step"] for record in quick.history] == [1, 20, 40, 41]

@@ -21,6 +21,8 @@ from nerif.workflow import reconstruct_into
 
 __all__ = ["main", "run"]
 
+SCALARS_EVERY = 5.0  # seconds, where twenty steps take longer
+
 
 def run(settings: Reconstruct) -> Reconstruction:
     """Reconstruct, and write everything that docs/formats.md lists."""
@@ -44,11 +46,13 @@ def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
         raise InputError(f"tensorboard: not installed; {install('tensorboard')}") from None
     with ExitStack() as stack:
         writer: list[SummaryWriter] = []
+        written = [0.0]
 
         def write(step: Step) -> None:
             if not writer:  # the directory is looked at before the first step, and must be as it was until then
                 writer.append(stack.enter_context(SummaryWriter(str(settings.out / "tensorboard"))))
-            if step.step % 20 == 0:
+            if step.step % 20 == 0 or step.seconds - written[0] >= SCALARS_EVERY:
+                written[0] = step.seconds
                 for name, value in {**step.losses, "rays_per_second": step.rays_per_second}.items():
                     writer[0].add_scalar(name, value, step.step)
 

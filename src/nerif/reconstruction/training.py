@@ -46,6 +46,7 @@ PIONEERS = 0.1  # share of the run after which its pace is known
 DENSITY_EVERY = 60  # steps between looks at where the field varies
 LEVEL_POINTS = 1 << 14  # at which the ambient level is taken at the end
 LOG_EVERY, KEEP_EVERY = 20, 200  # steps
+LOG_SECONDS = 5.0  # after which a record is due as well, so that slow steps have a history
 
 
 class Training:
@@ -133,7 +134,8 @@ class Training:
             self.optimiser.step({"adam": rate, "muon": rate * settings.matrix_rate})
             budget.step += 1
             outcome = self._judge() or self._outcome()
-            if self.device.type == "cuda" and budget.step % LOG_EVERY and outcome is None:
+            due = outcome is not None or self._due(budget.step)
+            if self.device.type == "cuda" and not due:
                 continue  # looking at a number waits for the GPU, so look now and then
             empty = self.objective.of_nothing([p.part for p in pieces], [p.numbers for p in pieces])
             found = (*terms.values(), loss, empty)
@@ -148,7 +150,7 @@ class Training:
                 outcome = self._take_back("the field was lost") or budget.exhausted()
                 continue
             speed = budget.rays_per_second
-            if budget.step % LOG_EVERY == 0 or budget.step == 1 or outcome is not None:
+            if due:
                 self._log({**values, "rays_per_second": speed})
             if budget.step % KEEP_EVERY == 0 and self.watch.healthy and self._finite():
                 self.good = self._capture()
@@ -176,7 +178,7 @@ class Training:
         def log(step: int, loss: float) -> bool:
             nonlocal outcome
             values = {"fit_step": float(step), "fit_loss": loss}
-            if step % LOG_EVERY == 0 or step == 1:
+            if self._due(step):
                 self._log(values)
             self._agree()
             outcome = self._outcome()
@@ -335,6 +337,13 @@ class Training:
         return None
 
     # -- what is told and kept -----------------------------------------------------------------------------------
+
+    def _due(self, step: int) -> bool:
+        """Whether a step has a record in the history: the first, each LOG_EVERYth, and LOG_SECONDS after the last."""
+        if step == 1 or step % LOG_EVERY == 0:
+            return True
+        last = self.history[-1]["seconds"] if self.history else 0.0
+        return self.budget.seconds - last >= LOG_SECONDS
 
     def _log(self, values: dict[str, float]) -> None:
         self.history.append({**self.budget.where(), **values})
