@@ -188,6 +188,21 @@ def test_the_demo_keeps_a_measurement_that_is_not_its_own(tmp_path, monkeypatch)
     assert contents(out) == {"measurement.nc", "measurement.before.nc", "measurement.truth.nc"}
 
 
+def test_pictures_that_were_not_rendered_are_not_rendered_over(tmp_path):
+    from nerif.experiment import Experiment
+    from nerif.fields.phantoms import make_phantom
+    from nerif.geometry import Box, Ring
+
+    box = Box.around_origin((50.0, 50.0, 50.0))
+    cameras = Ring(views=2).cameras(0.0)
+    written(tmp_path / cameras[0].name / "flow", "flow_000.tif")
+    real = put(tmp_path / cameras[1].name / "reference" / "reference_000.tif")
+    with pytest.raises(InputError, match=r"holds reference_000\.tif, which nerif render did not write"):
+        Experiment().write(tmp_path, cameras, make_phantom("gaussians", box, 0), box, 1.00027)
+    assert real.read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 2  # nothing was begun
+
+
 def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
     from nerif.measurement_sequence import MEASURED, check_store

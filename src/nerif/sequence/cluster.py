@@ -32,7 +32,7 @@ CONFIG = {
 }
 ANSWER_WITHIN = "5s"  # a scheduler that is there already
 LOOPBACK = "127.0.0.1"
-SILENT = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+SILENT: dict[str, Any] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask opens an HTTP server whether or not there is a dashboard; by default it shows logs and file names to anybody."""
 IN_JOBS = [
     "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False",
