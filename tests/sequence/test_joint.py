@@ -29,6 +29,8 @@ from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
 from nerif.simulation import simulate
+from nerif.techniques.deflection import Deflection
+from nerif.techniques.interferometry import Interferometry
 from sequence_films import QUICK, blank
 
 SHAPE = NetworkShape(depth=2, width=16, octaves=2)
@@ -259,6 +261,24 @@ def test_a_frame_that_cannot_be_written_costs_only_itself(five, tmp_path, monkey
     store = SequenceStore(plan.out)
     assert store.status.tolist() == [DONE, DONE, FAILED, DONE, DONE]
     assert "no space left" in store.reasons[2]
+
+
+def test_a_frame_without_a_technique_costs_only_itself(cameras, box, ball, tmp_path):
+    """The second of three frames has no fringes."""
+    kinds = [Deflection, Interferometry]
+    seen = simulate(ball, cameras, box, 1.00027, 0.02, 0, 20, 532.0, techniques=kinds)
+    sequence = MeasurementSequence.create(tmp_path / "m.zarr", [0.0, 1.0, 2.0], seen)
+    for i in range(3):
+        fringes = seen.maps["fringes"]
+        maps = seen.maps if i != 1 else {**seen.maps, "fringes": torch.full_like(fringes, torch.nan)}
+        sequence.write_frame(i, replace(seen, maps=maps))
+    plan = begun(sequence.path, tmp_path / "r.zarr", 2)
+    reconstruct_jointly(plan, 0, 3)
+    store = SequenceStore(plan.out)
+    assert store.status.tolist() == [DONE, FAILED, DONE]
+    assert store.reasons[1] == (
+        "joint: expected displacement and fringes in every frame, got a frame that lacks one of them"
+    )
 
 
 CENTRES = torch.tensor([[-3.0, -1.0, 0.5], [3.0, 1.0, -0.5]], dtype=torch.float64)

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nerif.conventions import InputError
 from nerif.fields.space_time import SpaceTimeField
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.own_files import OwnFiles
@@ -57,6 +58,11 @@ def reconstruct_jointly(plan: SequencePlan, first: int, last: int, event: Event 
             frames[i] = _read(plan, sequence, i)
         except FAILURES as error:
             fail(i, error, 1)
+    techniques = max((frame.measurement.techniques for frame in frames.values()), key=len, default=())
+    for i in [i for i, frame in frames.items() if frame.measurement.techniques != techniques]:
+        names = " and ".join(kind.measured for kind in techniques)
+        fail(i, InputError(f"joint: expected {names} in every frame, got a frame that lacks one of them"), 1)
+        del frames[i]
     if not frames:
         return
     tau = torch.tensor([chunk_tau(sequence.times, i, first, last) for i in frames], dtype=torch.float32)
