@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -179,11 +180,14 @@ def test_command_lines_are_quoted():
     assert command_line(["info", "a b; rm -rf $HOME.nc"]) == "nerif info 'a b; rm -rf $HOME.nc'"
 
 
-def test_damaged_files_are_no_runs(tmp_path):
+@pytest.mark.parametrize("text", ["{", "[" * 100_000, "[1]", '{"id": 1}', "title", "arguments", "words"])
+def test_damaged_files_are_no_runs(tmp_path, text):
     jobs = Jobs(tmp_path)
+    entries = {"id": "bad", "title": "", "arguments": ["info"], "attempt": ["info"], "out": "", "asked": "", "place": 0}
+    wrong = {"title": {"title": "\ud800"}, "arguments": {"arguments": []}, "words": {"attempt": [1]}}
     bad: Path = jobs.directory / "bad"
     bad.mkdir(parents=True)
-    (bad / "job.json").write_text("{")
+    (bad / "job.json").write_text(json.dumps({**entries, **wrong[text]}) if text in wrong else text)
     assert jobs.all() == []
     assert os.listdir(bad) == ["job.json"]
 

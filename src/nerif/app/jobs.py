@@ -389,10 +389,11 @@ def claim(where: Path, pid: int) -> bool:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """The entries of a JSON file; none where it is missing or just being written."""
+    """The entries of a JSON file; none where it is missing, damaged or just being written."""
     try:
         found = json.loads(path.read_text())
-    except (FileNotFoundError, ValueError):
+        json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair is no text that a page can show
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 
