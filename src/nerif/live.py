@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -94,12 +94,14 @@ class Live:
     measurement : of which a view is shown
     reconstructor : settings of the method, whose forward model the view is predicted by
     view : its name; the one that the others cover best if empty
+    remark : gives a line to be shown beside the figures, empty where there is none
     """
 
     def __init__(
-        self, directory: Path, measurement: Measurement, reconstructor: Reconstructor, view: str = ""
-    ) -> None:
-        self.directory, self.measurement = directory, measurement
+        self, directory: Path, measurement: Measurement, reconstructor: Reconstructor, view: str = "",
+        remark: Callable[[], str] = str,
+    ) -> None:  # fmt: skip
+        self.directory, self.measurement, self.remark = directory, measurement, remark
         self.model = str(getattr(reconstructor, "model", AUTO))
         self.view = view or best_covered(measurement.cameras)[0]
         self._curve: list[dict[str, float]] = []
@@ -154,7 +156,7 @@ class Live:
             self._curve, self._every = self._curve[::2], 2 * self._every
 
     def _write(self, title: str, step: Step) -> None:
-        entries = {"title": title, "written": time.time(), "view": self.view}
+        entries = {"title": title, "written": time.time(), "view": self.view, "remark": self.remark()}
         for name in ("step", "epoch", "seconds", "progress", "losses", "rays_per_second"):
             entries[name] = getattr(step, name)
         names = list(dict.fromkeys(name for point in self._curve for name in point))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 
-from nerif.reconstruction.base import OnStep
+from nerif.reconstruction.base import OnStep, compose
 
 __all__ = ["QUIET", "Monitor"]
 
@@ -29,6 +29,16 @@ class Monitor:
     say: Callable[[str], None] = _quiet
     training: Callable[[str], AbstractContextManager[OnStep]] = lambda title: nullcontext(_quiet)
     counting: Callable[[str], AbstractContextManager[Callable[[int, int], None]]] = lambda title: nullcontext(_quiet)
+
+    def telling(self, on_step: OnStep) -> Monitor:
+        """Return a monitor that also calls that callback with every Step."""
+
+        @contextmanager
+        def training(title: str) -> Iterator[OnStep]:
+            with self.training(title) as told:
+                yield compose(on_step, told)
+
+        return replace(self, training=training)
 
 
 QUIET = Monitor()

@@ -37,6 +37,7 @@ from nerif.reconstruction.refit import refit
 from nerif.reconstruction.repetition import Repetitions
 from nerif.reconstruction.rig_posterior import with_posterior
 from nerif.reconstruction.shared_settings import SharedSettings
+from nerif.reconstruction.slow_run import SlowRun
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.threads import Cores
@@ -179,7 +180,8 @@ def _reconstruct_into(
                 f"view '{camera.name}': {camera.unseen:.1%} of its pixels left out, for which its distortion cannot be "
                 "inverted; calibrate it with pictures of a target that reaches into its corners"
             )
-    look = _first_look(out, run, reconstructor, training, repetitions, not resume, monitor)
+    slow = SlowRun(reconstructor, monitor.say)
+    look = _first_look(out, run, reconstructor, training, repetitions, not resume, monitor.telling(slow))
     state = out.state() if resume and (look is None or out.has(CHECKPOINT) or not look.begun) else None
     start = _start(run, measurement) if repetitions is not None or not resume else None
     if not resume:
@@ -190,12 +192,13 @@ def _reconstruct_into(
     if not ranks.is_first:  # under torchrun the first process tells, and writes
         with monitor.training("training") as told:
             return reconstructor(training, told, state, start if state is None else None)
+    monitor = monitor.telling(slow)
     settings = _settings(run, path, reconstructor, voxels, keep or {})
     if "density" not in quantities_of(measurement.quantity):
         del settings["gas"]
     run, begin = replace(run, hold_out=unseen), _begin(out, settings, resume, begun)
     data = measurement if look is None else look.data
-    looked = Live(out.path, data, reconstructor, *unseen[:1]) if live else None
+    looked = Live(out.path, data, reconstructor, next(iter(unseen), ""), lambda: slow.line) if live else None
     if looked is not None and look is not None:
         look = replace(look, monitor=looked.watching(monitor, held_out=True))
     watched = monitor if looked is None else looked.watching(monitor, held_out=bool(unseen))

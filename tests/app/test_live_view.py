@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from app.serving import opened
 from nerif.app.jobs import Jobs
 from nerif.app.live_surface import said_of
+from nerif.app.live_view import told
 from nerif.json_file import write_json
 from nerif.live import read_look
 from nerif.result import LIVE, LIVE_LOOK
@@ -54,6 +56,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = tmp_path_factory.mktemp("project")
     watched(found)
     return found
+
+
+def test_a_slow_run_is_shown_to_be_one():
+    job = SimpleNamespace(state="running", asked="")
+    live = {"title": "training", "step": 6, "seconds": 100.0, "progress": 0.1, "losses": {}, "remark": "a <b>"}
+    assert told(job, live).endswith("<p class=note>a &lt;b&gt;</p>")
+    assert "note" not in told(job, {**live, "remark": ""})
 
 
 def test_a_surface_is_told_in_words(folder, tmp_path):

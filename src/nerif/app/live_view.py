@@ -146,7 +146,8 @@ def told(job: Job, live: dict[str, Any], title: str = "") -> str:
             parts.append(f"{seconds * (1 / share - 1):.0f} s left")
         known = {name: value for name, value in live["losses"].items() if value is not None}
         parts += [f"{name.replace('_', ' ')} {value:.3g}" for name, value in known.items()]
-    return f"<p>{escape(' · '.join(parts))}</p>"
+    remark = f"<p class=note>{escape(live['remark'])}</p>" if live.get("remark") else ""
+    return f"<p>{escape(' · '.join(parts))}</p>{remark}"
 
 
 def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:

@@ -77,6 +77,7 @@ class Step:
     capture : gives the State to resume from
     field : gives the Field as it is now, to be looked at before the method goes on
     note : a line for the user on what changed before this step; nothing where nothing did
+    pass_steps : steps that a pass over all pixels takes on average, of a training
     """
 
     step: int
@@ -88,6 +89,7 @@ class Step:
     capture: Callable[[], State]
     field: Callable[[], Field]
     note: str = ""
+    pass_steps: float = 1.0
 
 
 OnStep = Callable[[Step], bool | None]

@@ -105,9 +105,8 @@ class Budget:
             return Outcome("epochs", f"all {settings.epochs:g} epochs done")
         if settings.max_steps and self.step >= settings.max_steps:
             return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may give more")
-        limit = settings.time_limit or (self.cycles.longest if self.cycles is not None else math.inf)
-        if self.seconds >= limit:
-            return Outcome("time_limit", f"time limit of {limit:g} s reached; more time may give more")
+        if self.seconds >= settings.latest:
+            return Outcome("time_limit", f"time limit of {settings.latest:g} s reached; more time may give more")
         return None if self.cycles is None else self.cycles.outcome
 
     def recount(self, rays: int) -> None:

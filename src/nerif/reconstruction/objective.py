@@ -108,8 +108,15 @@ class Objective:
 
     def draw(self, progress: float) -> Draw:
         """Draw how a pixel is sampled in a step at that progress."""
-        settings = self.settings
-        samples = sample_count(progress, *self.data.samples, settings.sample_jitter, self.generator)
+        samples = sample_count(progress, *self.data.samples, self.settings.sample_jitter, self.generator)
+        return self._draw(progress, samples)
+
+    @property
+    def typical(self) -> Draw:
+        """How a pixel is sampled on average."""
+        return self._draw(0.5, round(sum(self.data.samples) / 2))
+
+    def _draw(self, progress: float, samples: int) -> Draw:
         last = self.data.lens_rays
         if last == 1:
             return Draw(1, samples)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -164,6 +165,21 @@ class TrainingSettings(SharedSettings):
         else:
             first = replace(self, max_steps=self.first_cycle)
         return first, replace(self, rate_after_fit=1.0)  # a field found in haste is no end to start from
+
+    @property
+    def latest(self) -> float:
+        """Seconds after which a run ends at the latest."""
+        return self.time_limit or (math.inf if self.limited else self.longest)
+
+    def steps(self, of_pass: float) -> float:
+        """Return how many steps were asked for, inf where no limit but a clock ends the run.
+
+        Parameters
+        ----------
+        of_pass : steps of a pass over all rays
+        """
+        asked = [float(self.max_steps)] if self.max_steps else []
+        return min([*asked, *([self.epochs * of_pass] if self.epochs else [])], default=math.inf)
 
     @property
     def limited(self) -> bool:

@@ -356,8 +356,9 @@ class Training:
         progress = 1.0 if over else min(budget.share, 1.0)
         capture, note = self._capture, "; ".join(self.notes)
         self.notes.clear()
+        steps = len(self.data) * self.edge**2 / self.objective.pixels(self.objective.typical)
         return Step(
-            budget.step, budget.epoch, budget.seconds, progress, values, speed, capture, lambda: self.field, note
+            budget.step, budget.epoch, budget.seconds, progress, values, speed, capture, lambda: self.field, note, steps
         )  # fmt: skip
 
     def _capture(self) -> State:
