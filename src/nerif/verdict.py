@@ -1,15 +1,17 @@
 """The verdict on a result, in one of four words, from figures that any measurement has; no truth is used.
 
-    error^2 = (A e)^2 + (B f)^2 + (C s)^2        over the variation of the field
+    error^2 = (A rho e)^2 + (B f)^2 + (C s)^2 N0 / N        over the variation of the field
 
 with, each an rms over that of the signal,
 
-    s    the noise of a view,
+    s    the noise, of N pixels in all,
     f    the residual of the fitted views beyond the noise: detail that the field lacks, or views that contradict it,
     e    the residual of a withheld view beyond the noise: what the views leave open between them.
 
-A withheld view cannot show an error below the scatter of its mean square residual, so e is at least s (2 / n)^(1/4) for
-n pixels. The coefficients are those of simulated measurements, good and spoiled; how well they hold on others is in
+A view withheld from the whole run has rho = 1. One that was withheld from a first, short run has the error of that run,
+which the whole run reduces about as much as the misfit of the fitted views, rho = f / f_1. Noise scatters, so that a
+mean square residual cannot show what is below s^2 (2 / n)^(1/2) of n pixels: e, and f and f_1 in rho, are no less. The
+coefficients are those of simulated measurements, good and spoiled; how well they hold on others is in
 benchmarks/results/verdicts-cpu.md. Standard deviations, where there are some, count if they are larger.
 """
 
@@ -31,14 +33,10 @@ __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 
 WORDS = ("use", "use with care", "do not use", "cannot tell")
 
-WITHHELD = 0.3
-"""A, for a view that was withheld from the whole run."""
-FIRST_RUN = 0.08
-"""A, for a view that was withheld from a first, short run of a network only, whose error the whole run reduces."""
-MISFIT = 0.5
-"""B"""
-NOISE = 0.2
-"""C"""
+OPEN, MISFIT, NOISE, PIXELS = 0.35, 0.7, 0.2, 8000
+"""A, B, C and N0"""
+REDUCED = 0.15
+"""Least of rho: the part of the first run's error that a whole run is trusted to leave at the least."""
 SPREAD = {"views": 2.0, "deviations": 1.5}
 """Factor, up and down, within which nine in ten estimates hold, from views and from standard deviations."""
 
@@ -231,48 +229,70 @@ def _from_views(
     metrics = result.metrics
     first = metrics.get("first_look") or {}
     noise = _noise(fitted)
-    ahead = FIRST_RUN if str(result.settings.get("method", "")) == "nerif" else WITHHELD
     left_out = (metrics.get("ensemble") or {}).get("left_out") or []
-    ahead_of = first.get("views") or [], first.get("fitted_views") or []
-    for withheld, own, factor, basis in (
-        ([v for v in views if v["held_out"]], fitted, WITHHELD, "cross-validated on a withheld view"),
-        (left_out, fitted, WITHHELD, "cross-validated view by view"),
-        (*ahead_of, ahead, "cross-validated in a first run without a view"),
+    own = [v for v in first.get("fitted_views") or [] if _complete(v)]
+    share = _explained(own, noise)
+    for withheld, basis in (
+        ([v for v in views if v["held_out"]], "cross-validated on a withheld view"),
+        (left_out, "cross-validated view by view"),
+        (first.get("views") or [], "cross-validated in a first run without a view"),
     ):
         shown = [v for v in withheld if _complete(v) and v["measured"] in noise and v["measured"] in _kinds(withheld)]
         if not shown:
             continue
-        share = _explained([v for v in own if _complete(v)], noise)
-        if share is not None and share < EXPLAINED:
-            short = f"it explains {max(share, 0.0):.0%} of its data"
-            return None, f"the first run, without view {shown[0]['name']}, was too short for cross-validation: {short}"
-        squares = [(*_squares(v, noise[v["measured"]]), noise[v["measured"]] ** 2, v) for v in shown]
-        open_ = max(_ratio(max(r, n * _scatter(v)), signal) for r, signal, n, v in squares)
-        misfit, white = _of_fitted(fitted, noise)
-        error = math.hypot(factor * open_, MISFIT * misfit, NOISE * white)
+        reduced = 1.0
+        if withheld is first.get("views"):
+            if share is not None and share < EXPLAINED:
+                short = f"without view {shown[0]['name']}, was too short for cross-validation: it explains {share:.0%}"
+                return None, f"the first run, {short} of its data"
+            reduced = _reduced(fitted, own, noise)
+        misfit, white, pixels = _of_fitted(fitted, noise)
+        noisy = white * math.sqrt(PIXELS / pixels) if pixels else white
+        error = math.hypot(OPEN * reduced * max(_open(v, noise) for v in shown), MISFIT * misfit, NOISE * noisy)
         if not math.isfinite(error):
             return None, "a view shows no signal above the noise"
         return Estimate.within(error, SPREAD["views"], basis), ""
     return None, ""
 
 
-def _scatter(view: dict[str, Any]) -> float:
-    """Standard deviation of the mean square of white noise in a view, over the mean square."""
-    return math.sqrt(2 / view["pixels"]) if view.get("pixels") else 0.0
+def _open(view: dict[str, Any], noise: dict[str, float]) -> float:
+    """e of a withheld view."""
+    white = noise[view["measured"]]
+    residual, signal = _squares(view, white)
+    return _ratio(max(residual, white**2 * _scatter(view.get("pixels") or 0)), signal)
 
 
-def _ratio(square: float, signal: float) -> float:
-    return math.sqrt(square / signal) if signal > 0 else math.inf
+def _reduced(
+    fitted: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]], noise: dict[str, float]
+) -> float:
+    """rho: the misfit of the whole run over that of the first one; 1 where that is not known."""
+    if not first:
+        return 1.0
+    (after, white, pixels), (before, *_) = _of_fitted(fitted, noise), _of_fitted(first, noise)
+    hidden = white**2 * _scatter(pixels)
+    return min(max(_ratio(after**2 + hidden, before**2 + hidden), REDUCED), 1.0)
 
 
-def _of_fitted(fitted: Sequence[dict[str, Any]], noise: dict[str, float]) -> tuple[float, float]:
-    """f and s: misfit and noise of the fitted views over their signal, of the kind where the misfit is largest."""
-    found = []
+def _scatter(pixels: int) -> float:
+    """Standard deviation of the mean square of white noise in so many pixels, over the mean square."""
+    return math.sqrt(2 / pixels) if pixels else 0.0
+
+
+def _ratio(square: float, of: float) -> float:
+    return math.sqrt(square / of) if of > 0 else math.inf
+
+
+def _of_fitted(fitted: Sequence[dict[str, Any]], noise: dict[str, float]) -> tuple[float, float, int]:
+    """f, s and N of fitted views, of what was measured with the largest misfit."""
+    figures = []
     for name in _kinds(fitted):
-        squares = [_squares(v, noise[name]) for v in fitted if v["measured"] == name]
-        signal = statistics.fmean(s for _, s in squares)
-        found.append((_ratio(statistics.fmean(r for r, _ in squares), signal), _ratio(noise[name] ** 2, signal)))
-    return max(found)
+        own = [v for v in fitted if v["measured"] == name and name in noise]
+        if own:
+            squares = [_squares(v, noise[name]) for v in own]
+            residual, signal = (statistics.fmean(column) for column in zip(*squares, strict=True))
+            pixels = sum(v.get("pixels") or 0 for v in own)
+            figures.append((_ratio(residual, signal), _ratio(noise[name] ** 2, signal), pixels))
+    return max(figures)
 
 
 def _deviation(result: Result) -> float | None:
