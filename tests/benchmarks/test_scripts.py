@@ -15,6 +15,7 @@ SMALLEST = {
     "displacement": "--pixels 64 --phantom gaussians --background dots --method correlation",
     "ensemble": "--members 2 --steps 5 --phantoms gaussians --noise 0.05 --leave-one-out no",
     "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 5 --voxels 12",
+    "paper_preset": "--phantom gaussians --seeds 1 --pixels 12 --points 300 --epochs 0.05",
     "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",
     "one_camera": "--phantom gaussian-jet --noise 0.1 --half-angle 5 --pixels 16 --seeds 1 --only peers",
     "particles": "--per-pixel 0.05 --pixels 48 --depth 12 --displacement 1 --window 12 --seeds 1",

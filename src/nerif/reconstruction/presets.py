@@ -23,7 +23,7 @@ PRESETS: dict[str, NeRIF] = {
         points_per_batch=1 << 17,
         learning_rate=6e-3,
     ),
-    # the paper to the letter: three terms, lengths of residuals, constant learning rate, its stopping rule
+    # the paper: three terms, lengths of residuals, constant learning rate, its stopping rule (docs/method.md)
     "paper": NeRIF(
         network=NetworkShape(depth=7, width=256, octaves=5, directions=3, skip=4, head_width=64, gradient_head=True),
         wave_pixels=0,
