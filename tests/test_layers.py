@@ -13,7 +13,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 
 LAYERS = (
     ("atomic", "conventions", "finding", "installing", "interruption", "json_file", "netcdf", "own_files",
-     "pauses", "toml"),
+     "pauses", "toml", "transfer"),
     ("geometry",),
     ("techniques",),
     ("drawing",),

@@ -383,6 +383,20 @@ def test_compiled_network_is_the_plain_one():
     assert done.stdout.strip() == "same", done.stderr[-2000:]
 
 
+def test_without_a_compiler_a_run_goes_on_and_says_so(measurement, monkeypatch):
+    def compiled(function, dynamic):
+        def fail(p, heads):
+            raise RuntimeError("Failed to find C compiler.\nGive CC")
+
+        return fail
+
+    monkeypatch.setattr(torch, "compile", compiled)
+    asked, plain = (replace(SMALL, compile=c, max_steps=3)(measurement) for c in ("on", "off"))
+    assert "was not compiled (Failed to find C compiler.)" in asked.outcome.message
+    assert "compiled" not in plain.outcome.message
+    assert asked.history[-1]["loss"] == plain.history[-1]["loss"]
+
+
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
 def test_trains_on_a_gpu(measurement):

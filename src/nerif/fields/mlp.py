@@ -21,6 +21,7 @@ from nerif.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.encoding import check_directions, encode, encode_pullback, encoded_width, wave_vectors
 from nerif.geometry import Box
+from nerif.transfer import constant
 
 __all__ = ["ACTIVATIONS", "Network", "NetworkShape", "NeuralField"]
 
@@ -283,7 +284,7 @@ class NeuralField(Field):
 
     def normalise(self, points: Points) -> Points:
         """Map points in mm to the coordinates of the network."""
-        return (points - points.new_tensor(self.box.centre)) / self.half_edge
+        return (points - constant(self.box.centre, points)) / self.half_edge
 
     def _inputs(self, points: Points) -> Float[Tensor, "n k"]:
         """What the network is asked of points in mm."""

@@ -19,6 +19,7 @@ from nerif.conventions import InputError
 from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
 from nerif.geometry.lens import LensDiscs, spread_points
+from nerif.transfer import constant, sent
 
 __all__ = ["BackgroundPoints", "Rays"]
 
@@ -130,7 +131,7 @@ class Rays(Columns):
 
     def clip(self, box: Box) -> Rays:
         """Return the rays with near and far set to where they enter and leave the box (slab method)."""
-        lower, upper = self.origin.new_tensor(box.lower), self.origin.new_tensor(box.upper)
+        lower, upper = constant(box.lower, self.origin), constant(box.upper, self.origin)
         # a ray along a face divides 0 by 0: nudge the direction, not the answer
         direction = torch.where(self.direction.abs() < 1e-12, torch.full_like(self.direction, 1e-12), self.direction)
         a, b = (lower - self.origin) / direction, (upper - self.origin) / direction
@@ -184,7 +185,8 @@ class Rays(Columns):
         ----------
         generator : of where they are; None for the same places every time
         """
-        return self.through(spread_points(len(self), each, generator).to(self.near))
+        points = spread_points(len(self), each, generator).to(self.near.dtype)
+        return self.through(sent(points, self.near.device))
 
     def _of_window(
         self, square: Float[Tensor, "n k 2"]

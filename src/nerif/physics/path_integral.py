@@ -100,12 +100,12 @@ def places(
 def project(
     projector: Projector, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int | None = None
 ) -> Float[Tensor, "n c"]:
-    """Return what many rays see of a field, chunk by chunk; 0 where a ray misses the box."""
+    """Return what many rays see of a field, chunk by chunk, where the rays are; 0 where a ray misses the box."""
     if chunk is None:  # arrays that stay in the cache of a CPU, and fill a GPU
         chunk = 32 if torch.device(device).type == "cpu" else 4096
     if rays.lens is not None:
         chunk = max(1, chunk * 2 // LENS_RAYS)
-    result = torch.zeros(len(rays), projector.channels, dtype=rays.origin.dtype)
+    result = rays.origin.new_zeros(len(rays), projector.channels)
     index, field = rays.crosses.nonzero()[:, 0], field.to(device)
     for part in torch.split(index, chunk):
         pause()

@@ -197,7 +197,6 @@ class Objective:
         for part in self.data.unsettled:
             rays = replace(part.rays, lens=None)
             seen = project(PathIntegral(part.model.integral, SETTLING), self.field, rays, self.data.device)
-            seen = seen.to(part.measured.device)
             part.model.settle(seen, part.measured, part.inverse_scale, rays)
 
     @torch.no_grad()

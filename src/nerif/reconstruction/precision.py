@@ -15,6 +15,9 @@ from nerif.reconstruction.device import autocast_dtype, float32_products
 
 __all__ = ["MixedPrecision"]
 
+Both = Callable[[Tensor, bool], tuple[Tensor, Tensor, Tensor | None]]
+"""Network.value_and_gradient"""
+
 
 class MixedPrecision:
     """The network in bf16 while `low` is set and the settings allow it; an Evaluator, see losses.py.
@@ -30,9 +33,11 @@ class MixedPrecision:
         self.dtype = autocast_dtype(precision, device)
         tf32 = device.type == "cuda" and precision != "float32"
         self.products: Literal["highest", "high"] = "high" if tf32 else "highest"
+        self.remark = ""
+        """Why it is not compiled, where it should be."""
         self.both = network.value_and_gradient
         if compile == "on" or (compile == "auto" and device.type == "cuda"):
-            self.both = torch.compile(network.value_and_gradient, dynamic=True)
+            self.both = self._compiled(network.value_and_gradient)
         self.by_layers: Callable[[Network, Tensor], tuple[Tensor, Tensor]] | None = None
         if compile == "auto" and device.type == "cpu" and _is_plain(network):
             from nerif.reconstruction.fused import value_and_gradient
@@ -57,6 +62,23 @@ class MixedPrecision:
         """Differentiate a loss, with the products of matrices as the network has them."""
         with float32_products(self.products):
             loss.backward()
+
+    def _compiled(self, plain: Both) -> Both:
+        """A function compiled where it is called; where that fails, as without a C compiler, the plain one for good."""
+        quick = torch.compile(plain, dynamic=True)
+
+        def call(p: Tensor, heads: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+            try:
+                return quick(p, heads)
+            except torch.OutOfMemoryError:
+                raise
+            except Exception as error:  # whatever the compiler raises; what is wrong with the call, the plain one says
+                found = plain(p, heads)
+                reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+                self.both, self.remark = plain, f"; the network was not compiled ({reason}): slower, else the same"
+                return found
+
+        return call
 
     @contextmanager
     def _precision(self) -> Iterator[None]:

@@ -15,6 +15,7 @@ from torch import Tensor
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
 from nerif.reconstruction.losses import Evaluator
+from nerif.transfer import sent
 
 __all__ = ["SamplingDensity", "sample_count", "sample_rays"]
 
@@ -85,7 +86,7 @@ def sample_rays(
     else:
         draw = torch.rand(n // of_pixel, 1, generator=generator)
         draw = ((draw + torch.arange(of_pixel) / of_pixel) % 1).reshape(n, 1)
-    share = (torch.arange(count, device=device) + draw.to(device)) / count
+    share = (torch.arange(count, device=device) + sent(draw, device)) / count
     length = (rays.far - rays.near)[:, None]
     if sampling != "adaptive" or density is None or density.values is None:
         return rays.near[:, None] + share * length, (length / count).expand(n, count)

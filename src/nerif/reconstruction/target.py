@@ -16,6 +16,7 @@ from nerif.observation import Observation
 from nerif.reconstruction.bins import binned_rays, patches
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import AUTO, forward_models
+from nerif.transfer import sent
 
 __all__ = ["Part", "Target", "check_target"]
 
@@ -175,13 +176,11 @@ class Target:
         return sum(part.measured.numel() for part in self.parts)
 
     def __getitem__(self, index: Tensor) -> Target:
-        """Return the rays of those numbers, counted through all parts."""
-        if len(self.parts) == 1:
-            return replace(self, parts=(self.parts[0][index],))
+        """Return the rays of those numbers, which are on the CPU, counted through all parts."""
         chosen, first = [], 0
         for part in self.parts:
             own = index[(index >= first) & (index < first + len(part))]
-            chosen.append(part[own - first])
+            chosen.append(part[sent(own - first, part.measured.device)])
             first += len(part)
         return replace(self, parts=tuple(chosen))
 

@@ -412,7 +412,7 @@ class Training:
                     self.data.restore(self.data.stage, self.beside)
         if not outcome.failed:
             again = f"; taken back {self.retries} time(s) to the last good state" if self.retries else ""
-            outcome = Outcome(outcome.reason, outcome.message + again + self.watch.remark)
+            outcome = Outcome(outcome.reason, outcome.message + again + self.watch.remark + self.network.remark)
         self.field.network.eval().requires_grad_(False)
         ambient = self.objective.at_ambient(LEVEL_POINTS, torch.Generator().manual_seed(0))
         if ambient is not None and self.data.open and self.field.network.limits == UNBOUNDED:

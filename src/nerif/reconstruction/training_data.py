@@ -34,6 +34,7 @@ from nerif.reconstruction.sources import chosen_source, of_source, stages
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
 from nerif.techniques.base import ForwardModel
+from nerif.transfer import sent
 
 __all__ = ["FrameData", "TrainingData"]
 
@@ -242,7 +243,7 @@ class FrameData(TrainingData):
         return len(self.target)
 
     def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
-        return [(self.refined(part), None) for part in self.target[index.to(self.device)].parts if len(part)]
+        return [(self.refined(part), None) for part in self.target[index].parts if len(part)]
 
     def refined(self, part: Part, held_back: bool = False) -> Part:
         if self.refinement is None:
@@ -256,7 +257,7 @@ class FrameData(TrainingData):
         return drawn(self.target, len(self.names), seed)
 
     def ambient_points(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], None] | None:
-        return None if self.ambient is None else (self.ambient.sample(count, generator).to(self.device), None)
+        return None if self.ambient is None else (sent(self.ambient.sample(count, generator), self.device), None)
 
     @property
     def instants(self) -> list[Float[Tensor, " 1"] | None]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.training import LEVEL_POINTS
 from nerif.reconstruction.training_data import FrameData, TrainingData
 from nerif.techniques.base import ForwardModel
+from nerif.transfer import sent
 
 __all__ = ["ChunkData"]
 
@@ -67,6 +68,7 @@ class ChunkData(TrainingData):
         super().__init__(device, like.box, like.n_ambient, parts, like.open, like.quantity)
         self.bounds, self.shape, self.samples, self.lens_rays = like.bounds, like.shape, like.samples, like.lens_rays
         self.tau, self.time_octaves = tau, time_octaves
+        self._tau = tau.to(device)
         self.regions = [frame.ambient for frame in frames]
         targets = [frame.target for frame in frames]
         squares = [target.chi_square for target in targets]
@@ -75,7 +77,7 @@ class ChunkData(TrainingData):
         weights = [math.sqrt(c / mean) for c in squares]
         places = _places([f.measurement for f in frames], targets)
         self.films = [
-            Film.of([t.parts[i] for t in targets], [p[i] for p in places], weights)
+            Film.of([t.parts[i] for t in targets], [p[i] for p in places], weights).to(device)
             for i in range(len(targets[0].parts))
         ]
         self.noise = 1 / mean if all(t.sigma_known for t in targets) else 0.0
@@ -88,9 +90,10 @@ class ChunkData(TrainingData):
         found: list[tuple[Part, Float[Tensor, " n"] | None]] = []
         first = 0
         for film in self.films:
-            part, frame = film[index[(index >= first) & (index < first + len(film))] - first]
-            if len(part):
-                found.append((part.to(self.device), self.tau[frame].to(self.device)))
+            own = index[(index >= first) & (index < first + len(film))] - first
+            if len(own):
+                part, frame = film[sent(own, self.device)]
+                found.append((part, self._tau[frame]))
             first += len(film)
         return found
 
@@ -103,7 +106,7 @@ class ChunkData(TrainingData):
             return None
         points = [region.sample(count // AMBIENT_FRAMES, generator) for _, region in known]
         tau = torch.cat([self.tau[i].expand(len(p)) for (i, _), p in zip(known, points, strict=True)])
-        return torch.cat(points).to(self.device), tau.to(self.device)
+        return sent(torch.cat(points), self.device), sent(tau, self.device)
 
     @property
     def instants(self) -> list[Float[Tensor, " 1"] | None]:
@@ -156,6 +159,11 @@ class Film:
 
     def __len__(self) -> int:
         return len(self.known)
+
+    def to(self, device: torch.device) -> Film:
+        """Return the same on another device."""
+        moved = {name: getattr(self, name).to(device) for name in ("rays", "measured", "inverse_scale", "known")}
+        return replace(self, **moved)
 
     def __getitem__(self, index: Int[Tensor, " b"]) -> tuple[Part, Int[Tensor, " b"]]:
         """Return the rays of those numbers, and their frames."""

@@ -1,0 +1,171 @@
+"""Every way through a run on a GPU, without one: tensors are marked as being there, and must not meet others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from nerif.fields.mlp import NetworkShape
+from nerif.geometry import Lens
+from nerif.physics.path_integral import PathIntegral, project
+from nerif.reconstruction.presets import PRESETS
+from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.training import Training
+from nerif.reconstruction.training_data import FrameData
+from nerif.sequence.chunk_data import ChunkData
+from nerif.techniques.deflection import LeverArm
+
+pytestmark = pytest.mark.filterwarnings("ignore:User provided device_type of 'cuda'")
+
+CPU, GPU = torch.device("cpu"), torch.device("cuda:7")
+READ = ("tolist", "item", "__float__", "__int__", "__bool__", "nonzero", "unique")
+"""Functions that wait for what a GPU is at."""
+
+
+def place(x: Tensor) -> torch.device:
+    return x.__dict__.get("place", CPU)
+
+
+class PretendedGPU(TorchFunctionMode):
+    """Keeps all numbers on the CPU, marks tensors that are on the GPU, and refuses what torch would refuse there.
+
+    Notes what the CPU waits for, such as copies that are not `non_blocking`, and products of reduced precision.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: list[str] = []
+        self.rounded: set[str] = set()
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs, name = dict(kwargs or {}), func.__name__
+        tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+        there = any(place(x) == GPU for x in tensors)
+        if name == "__get__" and func in (Tensor.device.__get__, Tensor.is_cuda.__get__):
+            return place(args[0]) if func == Tensor.device.__get__ else there
+        if name in ("device", "_parse_to", "_has_compatible_shallow_copy_type"):
+            return func(*args, **kwargs)
+        if name == "pin_memory":
+            return args[0].detach()
+        if name in ("to", "cpu"):
+            return self._moved(args[0], "cpu" if name == "cpu" else args[1:], kwargs)
+        self._check(name, args, tensors, there)
+        to_gpu = GPU in tree_leaves((args, kwargs)) or there
+        if to_gpu and name in ("tensor", "new_tensor"):
+            self.waits.append(name)
+        args, kwargs = tree_map(lambda x: CPU if isinstance(x, torch.device) else x, (args, kwargs))
+        found = func(*args, **kwargs)
+        if name == "__set__" and func == Tensor.data.__set__:
+            args[0].__dict__["place"] = place(args[1])
+        for x in tree_leaves(found) if to_gpu else ():
+            if isinstance(x, Tensor):
+                x.__dict__["place"] = GPU
+        return found
+
+    def _check(self, name: str, args: Any, tensors: list[Tensor], there: bool) -> None:
+        if name in ("einsum", "bmm") and torch.get_float32_matmul_precision() != "highest":
+            self.rounded.add(name)
+        if there and name in READ:
+            self.waits.append(name)
+        if there and name == "numpy":
+            raise TypeError("numpy: expected a tensor on the CPU")
+        if name in ("__getitem__", "__setitem__") and place(args[0]) == GPU:
+            index = [i for i in tree_leaves(args[1]) if isinstance(i, Tensor)]
+            self.waits += [name for i in index if i.dtype == torch.bool or place(i) == CPU]
+        elif there and name not in ("copy_", "__set__") and any(place(x) == CPU and x.ndim for x in tensors):
+            raise RuntimeError(f"{name}: expected all tensors on one device")
+
+    def _moved(self, x: Tensor, asked: Any, kwargs: dict[str, Any]) -> Tensor:
+        target, dtype = place(x), x.dtype
+        for a in tree_leaves((asked, kwargs.get("device"), kwargs.get("dtype"), kwargs.get("other"))):
+            if isinstance(a, Tensor):
+                target, dtype = place(a), a.dtype
+            elif isinstance(a, torch.dtype):
+                dtype = a
+            elif isinstance(a, torch.device | str):
+                target = torch.device(a)
+        if target != place(x) and not kwargs.get("non_blocking"):
+            self.waits.append("to")
+        same = target == place(x) and dtype == x.dtype and not kwargs.get("copy")
+        with torch._C.DisableTorchFunction():
+            moved = x if same else x.to(dtype, copy=True)
+        moved.__dict__["place"] = target
+        return moved
+
+
+@pytest.fixture
+def gpu(monkeypatch) -> PretendedGPU:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 8)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: False)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 0)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1 << 34, 1 << 34))
+    return PretendedGPU()
+
+
+def test_what_rays_see_is_where_the_rays_are(measurement, ball, gpu):
+    rays, _, _ = measurement.rays()
+    with gpu:
+        seen = project(PathIntegral(LeverArm(1.0003), 4), ball, rays[:9].to(GPU), GPU)
+    assert place(seen) == GPU
+
+
+SHAPE = NetworkShape(depth=2, width=8, octaves=2, skip=1, head_width=4, gradient_head=True)
+SMALL = {"device": str(GPU), "compile": "off", "max_steps": 6, "samples": (6, 8), "sample_jitter": 1, "longest": 60.0}
+SMALL |= {"points_per_batch": 400, "epochs": 0.0, "stop_ratio": 0.0}
+RUNS = {name: replace(p, network=SHAPE, **SMALL) for name, p in PRESETS.items()}
+RUNS["curved"] = replace(RUNS["fast"], model="curved")
+RUNS["symmetric"] = replace(RUNS["fast"], symmetry="axis+1", network=replace(SHAPE, gradient_head=False))
+RUNS["refined"] = replace(RUNS["fast"], refine=("cameras", "shift"), max_steps=12)
+RUNS["bounded"] = replace(RUNS["fast"], upper=0.0)
+RUNS["voxels"] = TotalVariation(voxels=8, iterations=2, device=str(GPU))
+
+
+@pytest.mark.parametrize("lens", [None, Lens(12.0), Lens(window=3.0)], ids=["thin", "lens", "window"])
+@pytest.mark.parametrize("name", RUNS)
+def test_no_run_mixes_devices_or_rounds_what_is_no_network(measurement, gpu, name, lens):
+    seen = replace(measurement, cameras=tuple(replace(c, lens=lens) for c in measurement.cameras))
+    with gpu:
+        result = RUNS[name](seen)
+    assert not result.outcome.failed
+    assert result.device == str(GPU)
+    assert not gpu.rounded
+
+
+def test_a_run_by_pictures(measurement, gpu):
+    draw = torch.Generator().manual_seed(0)
+    reference = 100 + 30 * torch.randn(measurement.shape, generator=draw)
+    flow = 1.1 * reference + torch.randn(measurement.shape, generator=draw)
+    taken = replace(measurement, maps={"reference": reference, "flow": flow}, displacement=None, sigma=None)
+    with gpu:
+        assert not RUNS["fast"](taken).outcome.failed
+    assert not gpu.rounded
+
+
+@pytest.mark.parametrize("name", ["fast", "best", "paper"])
+def test_a_step_waits_for_nothing(measurement, gpu, name):
+    counts = []
+    with gpu:
+        for steps in (3, 7):
+            gpu.waits.clear()
+            replace(RUNS[name], max_steps=steps)(measurement)
+            counts.append(len(gpu.waits))
+    assert counts[1] <= counts[0]
+
+
+def test_frames_trained_together_are_moved_once(measurement, gpu):
+    counts = []
+    with gpu:
+        for steps in (3, 7):
+            settings = replace(RUNS["fast"], max_steps=steps, network=replace(SHAPE, gradient_head=False))
+            frames = [FrameData(replace(settings, device="cpu"), measurement, coarsest=1) for _ in range(2)]
+            data = ChunkData(settings, frames, torch.tensor([-1.0, 1.0]), 1)
+            gpu.waits.clear()
+            assert not Training(settings, data).run().outcome.failed
+            counts.append(len(gpu.waits))
+    assert counts[0] == counts[1]
