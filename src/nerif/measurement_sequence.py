@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from nerif.atomic import atomic
 from nerif.conventions import InputError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ZARR_FORMAT", "MeasurementSequence", "add_frames", "check_store", "require_zarr"]
 
-ZARR_FORMAT = 3
+ZARR_FORMAT: Final = 3
 """Of every store. The second one has filters that unpickle what they read: a store of somebody else could run code."""
 WRITTEN = "written"
 """Variable (time,) that is 1 where a frame is complete; stores of other programs may lack it."""
