@@ -133,9 +133,7 @@ def test_the_secret_is_the_users_alone(tmp_path, monkeypatch):
 
 def run(words: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
     """Run Python in a folder."""
-    return subprocess.run(
-        [sys.executable, *words], cwd=folder, capture_output=True, text=True, env=outside(), timeout=60
-    )
+    return subprocess.run([sys.executable, *words], cwd=folder, capture_output=True, text=True, env=outside())
 
 
 def test_the_command_imports_nothing_of_a_folder_nor_do_its_workers(tmp_path):
@@ -147,13 +145,13 @@ def test_the_command_imports_nothing_of_a_folder_nor_do_its_workers(tmp_path):
     command.write_text(
         "from nerif.cli import main\n"
         "if __name__ == '__main__':\n"
-        "    assert main() == 2\n"
+        "    assert main() == 0\n"
         "    import numba\n"
         "    from nerif.imaging.workers import work\n"
-        "    print(dict(work(divmod, 7, [2, 3], 2)), repr(numba.config.CACHE_DIR))\n"
+        "    print(dict(sorted(work(divmod, 7, [2, 3], 2))), repr(numba.config.CACHE_DIR))\n"
     )
-    done = run([str(command), "info", "m.nc"], folder)
-    assert done.stdout == "{0: (3, 1), 1: (2, 1)} ''\n", done.stderr
+    done = run([str(command), "--version"], folder)
+    assert done.stdout.splitlines()[1:] == ["{0: (3, 1), 1: (2, 1)} ''"], done.stderr
     assert not (folder / "mark").exists()
 
 
