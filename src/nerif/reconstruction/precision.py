@@ -35,7 +35,7 @@ class MixedPrecision:
         self.products: Literal["highest", "high"] = "high" if tf32 else "highest"
         self.remark = ""
         """Why it is not compiled, where it should be."""
-        self.both = network.value_and_gradient
+        self.both: Both = network.value_and_gradient
         if compile == "on" or (compile == "auto" and device.type == "cuda"):
             self.both = self._compiled(network.value_and_gradient)
         self.by_layers: Callable[[Network, Tensor], tuple[Tensor, Tensor]] | None = None
