@@ -329,6 +329,14 @@ def test_masks_widen_the_ambient_region(measurement, ball):
     assert len(points) == 400
     inside = ball(points.double()).abs() > 0.5 * 2e-4
     assert not bool(inside.any())
+    far = replace(region, faces=()).sample(20000, torch.Generator().manual_seed(1)).double()
+    in_hull = torch.ones(len(far), dtype=torch.bool)
+    for camera, own in zip(masked.cameras, mask, strict=True):
+        column, row = camera.project(far).round().long().unbind(-1)
+        height, width = camera.image_size
+        seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        in_hull &= ~seen | own[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    assert float(in_hull.double().mean()) < 1e-3  # a corner of a pixel that reaches into the side of a voxel
     result = replace(SMALL, ambient_faces=(), max_steps=20)(masked)
     assert result.outcome.reason == "steps"
 

@@ -49,16 +49,37 @@ def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
     """
     if measurement.flow_mask is None:
         raise InputError("flow_mask: expected masks in the measurement to carve the visual hull, got none")
+    inside = _in_hull(measurement, measurement.flow_mask, grid)
+    if not bool(inside.any()):
+        raise InputError("flow_mask: the masks leave no voxel of the box; are they inverted, or of other views?")
+    return inside
+
+
+def _in_hull(
+    measurement: Measurement, masks: Bool[Tensor, "view row column"], grid: Grid
+) -> Bool[Tensor, "z y x"]:  # fmt: skip
+    """Which points of a grid all views that see them see inside their masks."""
     points = grid.points(torch.float64).reshape(-1, 3)
     inside = torch.ones(len(points), dtype=torch.bool)
-    for camera, mask in zip(measurement.cameras, measurement.flow_mask, strict=True):
+    for camera, mask in zip(measurement.cameras, masks, strict=True):
         column, row = camera.project(points).round().long().unbind(-1)
         height, width = camera.image_size
         seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         inside &= ~seen | mask[row.clamp(0, height - 1), column.clamp(0, width - 1)]
-    if not bool(inside.any()):
-        raise InputError("flow_mask: the masks leave no voxel of the box; are they inverted, or of other views?")
     return inside.reshape(grid.shape)
+
+
+def _outside(measurement: Measurement, masks: Bool[Tensor, "view row column"], grid: Grid) -> Bool[Tensor, "z y x"]:
+    """Which voxels of a grid are outside the hull as a whole: their centres and their corners."""
+    half = [edge / 2 for edge in grid.spacing]
+    lower, upper = (
+        tuple(at + side * h for at, h in zip(corner, half, strict=True))
+        for corner, side in ((grid.box.lower, -1), (grid.box.upper, 1))
+    )
+    nz, ny, nx = grid.shape
+    corners = _in_hull(measurement, masks, Grid(Box(lower, upper), (nz + 1, ny + 1, nx + 1)))
+    near = torch.nn.functional.max_pool3d(corners[None, None].float(), 2, 1)[0, 0] > 0
+    return ~(near | visual_hull(measurement, grid))
 
 
 @dataclass(frozen=True)
@@ -69,7 +90,7 @@ class AmbientRegion:
     ----------
     box : Box, mm
     faces : names such as "x-"
-    empty : (m, 3) centres of voxels outside the hull, mm; may be of length 0
+    empty : (m, 3) centres of voxels that are outside the hull with all their corners, mm; may be of length 0
     voxel : edges of those voxels, mm
     """
 
@@ -88,7 +109,7 @@ class AmbientRegion:
         grid = Grid.of_resolution(measurement.box, resolution)
         empty = torch.zeros(0, 3)
         if measurement.flow_mask is not None:
-            empty = grid.points()[~visual_hull(measurement, grid)]
+            empty = grid.points()[_outside(measurement, measurement.flow_mask, grid)]
         check_gauge(measurement, faces, bool(len(empty)))
         if not faces and not len(empty):
             return None
