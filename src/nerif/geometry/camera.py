@@ -293,7 +293,8 @@ class Camera:
         local = self.local(points)
         image, slope = self.projection.image(local), self.projection.slope
         folded = image.norm(dim=-1, keepdim=True) > fold(self.distortion)
-        x, y, (xx, cross, yy) = distort(*image.masked_fill(folded, torch.nan).unbind(-1), self.distortion)
+        seen = image.masked_fill(folded, torch.nan)
+        x, y, (xx, cross, yy) = distort(seen[..., 0], seen[..., 1], self.distortion)
         k = self.intrinsics
         pixels = torch.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], dim=-1)
         # row by row: small matrix products are slow in a batch

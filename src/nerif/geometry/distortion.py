@@ -66,7 +66,7 @@ def undistort(distorted: Pixels, coefficients: Float[Tensor, 5]) -> Pixels:
         return distorted
     end = fold(coefficients)
     size = max(1.0, float(distorted.abs().amax()))
-    x, y = _within(*distorted.unbind(-1), START * end)
+    x, y = _within(distorted[..., 0], distorted[..., 1], START * end)
     for _ in range(20):
         xd, yd, (xx, cross, yy) = distort(x, y, coefficients)
         left, below = distorted[..., 0] - xd, distorted[..., 1] - yd
@@ -74,7 +74,7 @@ def undistort(distorted: Pixels, coefficients: Float[Tensor, 5]) -> Pixels:
             break
         determinant = xx * yy - cross * cross
         step = (yy * left - cross * below) / determinant, (xx * below - cross * left) / determinant
-        aside, down = _within(*step, STEP * end)
+        aside, down = _within(step[0], step[1], STEP * end)
         x, y = _within(x + aside, y + down, end)
     xd, yd, _ = distort(x, y, coefficients)
     error = (distorted - torch.stack([xd, yd], dim=-1)).abs().amax(dim=-1, keepdim=True)
