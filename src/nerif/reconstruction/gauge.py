@@ -71,13 +71,10 @@ def _in_hull(
 
 def _outside(measurement: Measurement, masks: Bool[Tensor, "view row column"], grid: Grid) -> Bool[Tensor, "z y x"]:
     """Which voxels of a grid are outside the hull as a whole: their centres and their corners."""
-    half = [edge / 2 for edge in grid.spacing]
-    lower, upper = (
-        tuple(at + side * h for at, h in zip(corner, half, strict=True))
-        for corner, side in ((grid.box.lower, -1), (grid.box.upper, 1))
-    )
+    (x0, y0, z0), (x1, y1, z1), (hx, hy, hz) = grid.box.lower, grid.box.upper, (edge / 2 for edge in grid.spacing)
+    around = Box((x0 - hx, y0 - hy, z0 - hz), (x1 + hx, y1 + hy, z1 + hz))  # voxels about the corners of those of grid
     nz, ny, nx = grid.shape
-    corners = _in_hull(measurement, masks, Grid(Box(lower, upper), (nz + 1, ny + 1, nx + 1)))
+    corners = _in_hull(measurement, masks, Grid(around, (nz + 1, ny + 1, nx + 1)))
     near = torch.nn.functional.max_pool3d(corners[None, None].float(), 2, 1)[0, 0] > 0
     return ~(near | visual_hull(measurement, grid))
 
