@@ -44,7 +44,7 @@ def judged(**metrics: Any) -> Any:
         ({"views": SEEN, "first_look": FIRST}, "use"),
         ({"views": SEEN}, "cannot tell"),
         ({}, "cannot tell"),
-        ({"views": [*SEEN, view("g", 0.1, True)]}, "use"),
+        ({"views": [*SEEN, view("g", 0.09, True)]}, "use"),
         ({"views": [*SEEN, view("g", 0.2, True)]}, "use with care"),
         ({"views": [*SEEN, view("g", 0.6, True)]}, "do not use"),
         ({"views": SEEN, "first_look": {**FIRST, "views": [view("a", 0.8, True)]}}, "use with care"),
@@ -56,7 +56,7 @@ def judged(**metrics: Any) -> Any:
         ({"views": SMEARED, "first_look": FIRST}, "use with care"),
         ({"views": SEEN, "first_look": FIRST, "outcome": "interrupted"}, "use with care"),
         ({"views": SEEN, "first_look": FIRST, "outcome": "diverged"}, "do not use"),
-        ({"views": SEEN, "ensemble": {"members": 3, "left_out": [view("a", 0.1, True)]}}, "use"),
+        ({"views": SEEN, "ensemble": {"members": 3, "left_out": [view("a", 0.09, True)]}}, "use"),
         ({"views": [{"name": "a", "held_out": False, "rms": 0.1, "measured": "displacement"}]}, "cannot tell"),  # older
     ],
 )  # fmt: skip

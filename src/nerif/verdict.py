@@ -33,9 +33,9 @@ __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 
 WORDS = ("use", "use with care", "do not use", "cannot tell")
 
-OPEN, MISFIT, NOISE, PIXELS = 0.35, 0.7, 0.2, 8000
+OPEN, MISFIT, NOISE, PIXELS = 0.4, 0.7, 0.2, 8000
 """A, B, C and N0"""
-REDUCED = 0.15
+REDUCED = 0.2
 """Least of rho: the part of the first run's error that a whole run is trusted to leave at the least."""
 SPREAD = {"views": 2.0, "deviations": 1.5}
 """Factor, up and down, within which nine in ten estimates hold, from views and from standard deviations."""

@@ -378,6 +378,7 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypat
     assert "--no-dashboard --dashboard-address 127.0.0.1:0" in script
     assert 'export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES="[]"' in script
     assert 'export DASK_TEMPORARY_DIRECTORY="$(mktemp -d)"' in script
+    assert "export PYTHONSAFEPATH=1" in script
     # stack samples fill a worker's memory; switched off before what the file itself wants
     prologue = ["export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False", "source ~/nerif/bin/activate"]
     assert [line for line in script.splitlines() if line in prologue] == prologue

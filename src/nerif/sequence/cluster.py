@@ -35,6 +35,7 @@ LOOPBACK = "127.0.0.1"
 SILENT: dict[str, Any] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask opens an HTTP server whether or not there is a dashboard; by default it shows logs and file names to anybody."""
 IN_JOBS = [
+    "export PYTHONSAFEPATH=1",  # nothing in the folder of a job is imported; SLURM may not pass the environment on
     "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False",
     'export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES="[]"',
     'export DASK_TEMPORARY_DIRECTORY="$(mktemp -d)"',  # see _private
