@@ -100,7 +100,7 @@ class PretendedGPU(TorchFunctionMode):
 
 
 @pytest.fixture
-def gpu(monkeypatch) -> PretendedGPU:
+def gpu(monkeypatch, unchecked) -> PretendedGPU:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 8)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: False)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 0)
@@ -126,14 +126,16 @@ RUNS["symmetric"] = replace(
 RUNS["refined"] = replace(RUNS["fast"], refine=("cameras", "shift"), max_steps=3)
 RUNS["bounded"] = replace(RUNS["fast"], upper=0.0)
 RUNS["voxels"] = TotalVariation(voxels=8, iterations=2, regularisation=1e-3, device=str(GPU))
+LONG = ("refined", "voxels")
 
 
 @pytest.mark.parametrize(
     ("name", "lens"),
     [
-        *((name, None) for name in RUNS),
-        *((name, Lens(12.0)) for name in ("fast", "paper", "refined", "voxels")),
+        *((name, None) for name in RUNS if name not in LONG),
+        *((name, Lens(12.0)) for name in ("fast", "paper")),
         ("fast", Lens(window=3.0)),
+        *(pytest.param(name, lens, marks=pytest.mark.slow) for name in LONG for lens in (None, Lens(12.0))),
     ],
 )
 def test_no_run_mixes_devices_or_rounds_what_is_no_network(measurement, gpu, name, lens):
@@ -145,6 +147,7 @@ def test_no_run_mixes_devices_or_rounds_what_is_no_network(measurement, gpu, nam
     assert not gpu.rounded
 
 
+@pytest.mark.slow
 def test_a_run_by_pictures(measurement, gpu):
     draw = torch.Generator().manual_seed(0)
     reference = 100 + 30 * torch.randn(measurement.shape, generator=draw)
@@ -155,7 +158,7 @@ def test_a_run_by_pictures(measurement, gpu):
     assert not gpu.rounded
 
 
-@pytest.mark.parametrize("name", ["fast", "best", "paper"])
+@pytest.mark.parametrize("name", ["fast", "paper"])
 def test_a_step_waits_for_nothing(measurement, gpu, name):
     counts = []
     with gpu:
