@@ -1,6 +1,6 @@
 """The verdict on a result, in one of four words, from figures that any measurement has; no truth is used.
 
-    error^2 = (A rho e)^2 + (B f)^2 + (C s)^2 N0 / N        over the variation of the field
+    error^2 = (A e)^2 + (B f)^2 + (C s)^2 N0 / N        over the variation of the field
 
 with, each an rms over that of the signal,
 
@@ -8,11 +8,15 @@ with, each an rms over that of the signal,
     f    the residual of the fitted views beyond the noise: detail that the field lacks, or views that contradict it,
     e    the residual of a withheld view beyond the noise: what the views leave open between them.
 
-A view withheld from the whole run has rho = 1. One that was withheld from a first, short run has the error of that run,
-which the whole run reduces about as much as the misfit of the fitted views, rho = f / f_1. Noise scatters, so that a
-mean square residual cannot show what is below s^2 (2 / n)^(1/2) of n pixels: e, and f and f_1 in rho, are no less. The
-coefficients are those of simulated measurements, good and spoiled; how well they hold on others is in
-benchmarks/results/verdicts-cpu.md. Standard deviations, where there are some, count if they are larger.
+A view that was withheld from a first, short run shows an error of that run, e_1, which the whole run reduces: what was
+not trained yet about as much as the misfit of the fitted views, to f / f_1; and what the views leave open, which is what
+exceeds K f_1, to G,
+
+    e = max(f / f_1 e_1, G (e_1^2 - K^2 f_1^2)^(1/2)).
+
+Noise scatters, so that a mean square residual cannot show what is below s^2 (2 / n)^(1/2) of n pixels: e, and f and f_1
+in their ratio, are no less. The coefficients are those of simulated measurements, good and spoiled; how well they hold
+on others is in benchmarks/results/verdicts-cpu.md. Standard deviations, where there are some, count if they are larger.
 """
 
 from __future__ import annotations
@@ -33,10 +37,12 @@ __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 
 WORDS = ("use", "use with care", "do not use", "cannot tell")
 
-OPEN, MISFIT, NOISE, PIXELS = 0.4, 0.7, 0.2, 8000
+OPEN, MISFIT, NOISE, PIXELS = 0.4, 0.8, 0.2, 8000
 """A, B, C and N0"""
-REDUCED = 0.2
-"""Least of rho: the part of the first run's error that a whole run is trusted to leave at the least."""
+UNTRAINED, LEFT_OPEN = 3.5, 0.4
+"""K and G"""
+LEAST = 0.07
+"""Least f / f_1 that is believed."""
 SPREAD = {"views": 2.0, "deviations": 1.5}
 """Factor, up and down, within which nine in ten estimates hold, from views and from standard deviations."""
 
@@ -240,37 +246,39 @@ def _from_views(
         shown = [v for v in withheld if _complete(v) and v["measured"] in noise and v["measured"] in _kinds(withheld)]
         if not shown:
             continue
-        reduced = 1.0
+        largest = max(_withheld(v, noise) for v in shown)
         if withheld is first.get("views"):
             if share is not None and share < EXPLAINED:
                 short = f"without view {shown[0]['name']}, was too short for cross-validation: it explains {share:.0%}"
                 return None, f"the first run, {short} of its data"
-            reduced = _reduced(fitted, own, noise)
+            largest = _after_first_run(largest, fitted, own, noise)
         misfit, white, pixels = _of_fitted(fitted, noise)
         noisy = white * math.sqrt(PIXELS / pixels) if pixels else white
-        error = math.hypot(OPEN * reduced * max(_open(v, noise) for v in shown), MISFIT * misfit, NOISE * noisy)
+        error = math.hypot(OPEN * largest, MISFIT * misfit, NOISE * noisy)
         if not math.isfinite(error):
             return None, "a view shows no signal above the noise"
         return Estimate.within(error, SPREAD["views"], basis), ""
     return None, ""
 
 
-def _open(view: dict[str, Any], noise: dict[str, float]) -> float:
+def _withheld(view: dict[str, Any], noise: dict[str, float]) -> float:
     """e of a withheld view."""
     white = noise[view["measured"]]
     residual, signal = _squares(view, white)
     return _ratio(max(residual, white**2 * _scatter(view.get("pixels") or 0)), signal)
 
 
-def _reduced(
-    fitted: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]], noise: dict[str, float]
+def _after_first_run(
+    error: float, fitted: Sequence[dict[str, Any]], first: Sequence[dict[str, Any]], noise: dict[str, float]
 ) -> float:
-    """rho: the misfit of the whole run over that of the first one; 1 where that is not known."""
+    """e after the whole run, by e_1, the misfit then and now; e_1 where the first run's misfit is not known."""
     if not first:
-        return 1.0
+        return error
     (after, white, pixels), (before, *_) = _of_fitted(fitted, noise), _of_fitted(first, noise)
     hidden = white**2 * _scatter(pixels)
-    return min(max(_ratio(after**2 + hidden, before**2 + hidden), REDUCED), 1.0)
+    trained = min(max(_ratio(after**2 + hidden, before**2 + hidden), LEAST), 1.0)
+    open_ = math.sqrt(max(error**2 - (UNTRAINED * before) ** 2, 0.0))
+    return max(trained * error, LEFT_OPEN * open_)
 
 
 def _scatter(pixels: int) -> float:
