@@ -9,8 +9,8 @@ with, each an rms over that of the signal,
     e    the residual of a withheld view beyond the noise: what the views leave open between them.
 
 A view that was withheld from a first, short run shows an error of that run, e_1, which the whole run reduces: what was
-not trained yet about as much as the misfit of the fitted views, to f / f_1; and what the views leave open, which is what
-exceeds K f_1, to G,
+not trained yet about as much as the misfit of the fitted views, to f / f_1; and what the views leave open, which is
+what exceeds K f_1, to G,
 
     e = max(f / f_1 e_1, G (e_1^2 - K^2 f_1^2)^(1/2)).
 
