@@ -302,7 +302,7 @@ def test_many_flow_pictures_become_a_sequence(copy, capsys):
 
     views = [folder for folder in sorted((copy / "pictures").iterdir()) if (folder / "flow").is_dir()]
     for folder in views:
-        (picture,) = (folder / "flow").iterdir()
+        (picture,) = (folder / "flow").glob("*.tif*")
         rest = sorted((folder / "reference").iterdir())[0]
         picture.rename(picture.with_name(f"flow0{picture.suffix}"))
         for number in (1, 2):  # nothing flows in these
@@ -338,7 +338,7 @@ def test_many_flow_pictures_become_a_sequence(copy, capsys):
 
 def test_flow_pictures_of_another_depth_than_the_reference_are_refused(copy, capsys):
     view = next(p for p in sorted((copy / "pictures").iterdir()) if (p / "flow").is_dir())
-    (picture,) = (view / "flow").iterdir()
+    (picture,) = (view / "flow").glob("*.tif*")
     whole = iio.imread(picture)
     assert whole.dtype == np.uint16
     iio.imwrite(picture, (whole >> 8).astype(np.uint8))

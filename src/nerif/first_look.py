@@ -125,10 +125,10 @@ class FirstLook:
         if result.outcome.failed:
             say(f"without {name}: {result.outcome.reason}; all views begin from nothing")
             return None
-        fitted = next(n for n in best_covered(self.data.cameras) if n != name)
-        pair = self.data.select([name, fitted])
+        other = best_covered(self.data.cameras)[1]
         with self.monitor.counting(f"predicting {name}"):
-            scores = evaluate_views(reproject(result.field, pair, [name], result.device, model=result.model))
+            pair = reproject(result.field, self.data.select([name, other]), [name], result.device, model=result.model)
+            scores = evaluate_views(pair)
         views, used = ([v for v in scores if v["held_out"] is held] for held in (True, False))
         taken = time.monotonic() - started
         with self._directory.writing(SCORES) as path:
@@ -148,8 +148,8 @@ class FirstLook:
         if scores:
             first, box, n_ambient = self._directory.field()
             grid = Grid.of_resolution(box, VOXELS)
-            both = (f.sample(grid).numpy() for f in (field, first))
-            scores["change"] = volume_errors(*both, n_ambient)["l2_variation"]
+            whole, short = (f.sample(grid).numpy() for f in (field, first))
+            scores["change"] = volume_errors(whole, short, n_ambient)["l2_variation"]
         return scores
 
     def _scores(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -81,8 +82,7 @@ def test_what_is_listed_and_what_is_said_of_it(folder):
     assert "has not ended" in row.sentence
     with pytest.raises(InputError, match="no field to show yet"):
         Still(unfinished).volume("index_excess")
-    (unfinished / "run.toml").unlink()
-    unfinished.rmdir()
+    shutil.rmtree(unfinished)
 
 
 def test_sources_follow_the_files(folder, tmp_path):

@@ -101,7 +101,8 @@ def test_the_command_writes_pdf_and_png(copy, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "left out: volume.nc is not there" in out
     assert sorted(p.name for p in (tmp_path / "f").iterdir()) == [
-        f"{n}.{e}" for n in ("history", "reliability", "slice_scores", "views") for e in ("pdf", "png")
+        *(f"{n}.{e}" for n in ("history", "reliability", "slice_scores", "views") for e in ("pdf", "png")),
+        "written.json",
     ]
     assert (tmp_path / "f" / "views.pdf").read_bytes().startswith(b"%PDF")
 

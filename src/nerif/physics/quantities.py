@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,9 +26,10 @@ __all__ = [
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; beyond, gases of the table condense or dissociate, and one composition holds no more."""
 
-BOTH_SIGNS = 0.3
-"""Root of the share of the squared density difference, above or below ambient, from which compression or expansion is
-assumed: of a hot or cold flow at uniform pressure the other sign is the error of the field."""
+BOTH_SIGNS, EXTREME = 0.4, 1e-3
+"""Ratio of the smaller to the larger of the extreme density differences above and below ambient, from which compression
+and expansion are assumed, and the share of the voxels beyond each extreme. Of a hot or cold flow at uniform pressure
+the other sign is the error of the field."""
 
 NOT_UNIFORM = (
     "the pressure is not uniform (density is both above and below ambient, as behind compression and expansion waves); "
@@ -75,9 +77,8 @@ class GasSettings:
         """Return the settings for a flow, with yes or no for whether its pressure is uniform."""
         if self.uniform_pressure != "auto":
             return self
-        values = excess.values.double().nan_to_num(0.0)
-        total, above = float(values.square().sum()), float(values.clamp(min=0).square().sum())
-        both = total > 0 and min(above, total - above) > BOTH_SIGNS**2 * total
+        low, high = np.quantile(excess.values.nan_to_num(0.0).numpy(), [EXTREME, 1 - EXTREME])
+        both = min(high, -low) > BOTH_SIGNS * max(high, -low)
         return replace(self, uniform_pressure="no" if both else "yes")
 
     def quantities_of(self, excess: Volume) -> tuple[str, ...]:
