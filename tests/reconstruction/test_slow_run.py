@@ -24,7 +24,7 @@ def said(settings, seconds: float, steps: int, first: int = 1, pass_steps: float
     lines: list[str] = []
     slow = SlowRun(settings, lines.append)
     for i in range(first, first + steps):
-        slow(Step(i, 0.0, seconds * i, 0.0, {}, 1.0, lambda: None, lambda: None, pass_steps))
+        slow(Step(i, 0.0, seconds * i, 0.0, {}, 1.0, lambda: None, lambda: None, pass_steps=pass_steps))
     return lines
 
 
