@@ -152,8 +152,9 @@ def test_flow_that_leaves_through_a_face_is_told_where_no_gauge_names_the_face()
     cameras = Ring(views=6, arc=(0.0, 150.0), image_size=(20, 36), pixel_pitch=0.16).cameras()
     small = replace(simulate(both, cameras, wide, 1.00027, steps=30, techniques=[Emission]), box=box)
     assert "x-" in small.ambient_faces
-    [said] = open_faces(ball, small)
-    assert said.startswith("face x-: ")
+    [finding] = open_faces(ball, small)
+    assert finding.code == "open_face"
+    assert "x-" in finding.sentence
     assert open_faces(both, replace(small, box=wide)) == []
 
 

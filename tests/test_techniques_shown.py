@@ -177,13 +177,14 @@ def test_metrics_of_displacements_alone_are_still_read(absorption):
 
 def test_mistakes_are_those_that_a_technique_can_make(both, absorption):
     combined, alone = (Measurement.read(p.with_suffix(".nc")) for p in (both, absorption))
-    said = [[c.words for c in of_one_view(0, o)] for o in (*combined.observations, *alone.observations)]
+    pairs = [(o, m.cameras) for m in (combined, alone) for o in m.observations]
+    said = [[c.words for c in of_one_view(0, o, cameras)] for o, cameras in pairs]
     assert "u and v are swapped" in said[0]
     assert said[1] == [*said[2], "the sign is flipped"]
     assert not any("u" in words.split() for words in said[2])
-    assert len(everywhere(3, alone.observations[0])) == 2
+    assert len(everywhere(alone.observations[0], alone.cameras)) == 2
     values = combined.observations[1].values
-    for correction in of_one_view(1, combined.observations[1]):
+    for correction in of_one_view(1, combined.observations[1], combined.cameras):
         changed = correction.undo(values, combined.cameras)
         assert not torch.equal(changed[1], values[1])
         assert torch.equal(correction.undo(changed, combined.cameras).nan_to_num(), values.nan_to_num())
