@@ -15,7 +15,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.report.summary import headline
 from nerif.result import Missing, Result, ResultDirectory
 from nerif.simulation import simulate
-from nerif.verdict import ONE_CAMERA, WORDS, verdict
+from nerif.verdict import ONE_CAMERA, WORDS, Estimate, verdict
 from nerif.volume import Volume
 from nerif.workflow import Run, reconstruct_into
 
@@ -202,7 +202,16 @@ def test_standard_deviations_tell_the_error():
     three = verdict(Result(Path(), metrics={"views": SEEN[:3]}, volumes=volumes))
     assert three.word == "use with care"  # what three views do not show is in no deviation
     worse = {"views": [*SEEN, view("g", 0.3, True)]}
-    assert verdict(Result(Path(), metrics=worse, volumes=volumes)).error > 0.08
+    assert verdict(Result(Path(), metrics=worse, volumes=volumes)).error > 0.07
+
+
+def test_two_estimates_are_averaged_where_they_agree():
+    views, deviations = Estimate.within(0.04, 2.0, "a"), Estimate.within(0.02, 1.5, "b")
+    both = views.combined(deviations)
+    assert deviations.error < both.error < (views.error * deviations.error) ** 0.5  # nearer to the closer one
+    assert both.high / both.error < deviations.high / deviations.error
+    assert views.combined(Estimate.within(0.01, 1.5, "b")) == views
+    assert views.combined(Estimate.within(0.2, 1.5, "b")).error == 0.2
 
 
 def test_the_first_screen_has_it():

@@ -16,7 +16,8 @@ what exceeds K f_1, to G,
 
 Noise scatters, so that a mean square residual cannot show what is below s^2 (2 / n)^(1/2) of n pixels: e, and f and f_1
 in their ratio, are no less. The coefficients are those of simulated measurements, good and spoiled; how well they hold
-on others is in benchmarks/results/verdicts-cpu.md. Standard deviations, where there are some, count if they are larger.
+on others is in benchmarks/results/verdicts-cpu.md. Standard deviations, where there are some, are a second estimate:
+the mean of both counts where their ranges overlap, else the larger.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 
 WORDS = ("use", "use with care", "do not use", "cannot tell")
 
-OPEN, MISFIT, NOISE, PIXELS = 0.4, 0.8, 0.2, 8000
-"""A, B, C and N0"""
+WITHHELD, FIRST_RUN = 0.25, 0.4
+"""A, for a view withheld from the whole run and from a first one."""
+MISFIT, NOISE, PIXELS = 0.8, 0.2, 8000
+"""B, C and N0"""
 UNTRAINED, LEFT_OPEN = 3.5, 0.4
 """K and G"""
 LEAST = 0.07
@@ -81,6 +84,15 @@ class Estimate:
     def within(cls, error: float, factor: float, basis: str) -> Estimate:
         """Return the estimate with a range of a factor up and down."""
         return cls(error, error / factor, error * factor, basis)
+
+    def combined(self, other: Estimate) -> Estimate:
+        """Return the mean of two estimates that agree, of logarithms weighed by their ranges; else the larger one."""
+        if other.high < self.low or self.high < other.low or not min(self.error, other.error) > 0:
+            return max(self, other, key=lambda e: e.error)
+        weights = [math.log(e.high / e.error) ** -2 for e in (self, other)]
+        total = sum(weights)
+        mean = sum(w * math.log(e.error) for w, e in zip(weights, (self, other), strict=True)) / total
+        return Estimate.within(math.exp(mean), math.exp(total**-0.5), f"{self.basis} and {other.basis}")
 
 
 @dataclass(frozen=True)
@@ -222,10 +234,10 @@ def _estimate(
     """The estimated error, or None, and why a withheld view gives none."""
     by_views, void = _from_views(result, views, fitted)
     deviation = _deviation(result)
-    known = [] if by_views is None else [by_views]
-    if deviation is not None:
-        known.append(Estimate.within(deviation, SPREAD["deviations"], "from its standard deviations"))
-    return max(known, key=lambda e: e.error, default=None), void
+    if deviation is None:
+        return by_views, void
+    by_deviations = Estimate.within(deviation, SPREAD["deviations"], "from its standard deviations")
+    return (by_deviations if by_views is None else by_views.combined(by_deviations)), void
 
 
 def _from_views(
@@ -246,15 +258,15 @@ def _from_views(
         shown = [v for v in withheld if _complete(v) and v["measured"] in noise and v["measured"] in _kinds(withheld)]
         if not shown:
             continue
-        largest = max(_withheld(v, noise) for v in shown)
+        largest, factor = max(_withheld(v, noise) for v in shown), WITHHELD
         if withheld is first.get("views"):
             if share is not None and share < EXPLAINED:
                 short = f"without view {shown[0]['name']}, was too short for cross-validation: it explains {share:.0%}"
                 return None, f"the first run, {short} of its data"
-            largest = _after_first_run(largest, fitted, own, noise)
+            largest, factor = _after_first_run(largest, fitted, own, noise), FIRST_RUN
         misfit, white, pixels = _of_fitted(fitted, noise)
         noisy = white * math.sqrt(PIXELS / pixels) if pixels else white
-        error = math.hypot(OPEN * largest, MISFIT * misfit, NOISE * noisy)
+        error = math.hypot(factor * largest, MISFIT * misfit, NOISE * noisy)
         if not math.isfinite(error):
             return None, "a view shows no signal above the noise"
         return Estimate.within(error, SPREAD["views"], basis), ""
