@@ -87,7 +87,7 @@ def test_what_is_packed_comes_back():
 def test_relations_are_those_of_the_files(quantity):
     volume = smooth((9, 8, 7))
     volume.values[0, 0, :3] = torch.tensor([-2.8e-4, -2.6999e-4, 3e-4])  # below vacuum, far too hot, too cold
-    derived = derive(volume, quantity, GasSettings("N2", pressure_pa=9e4))
+    derived = derive(volume, quantity, GasSettings("N2", pressure_pa=9e4, uniform_pressure="yes"))
     expected = derived.values.double().numpy() - (quantity == "n")
     found = quantity_of(packing.relation(quantity, derived.attributes), volume.values.double().numpy())
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
