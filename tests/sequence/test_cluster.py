@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import importlib
 import os
 import shutil
@@ -35,6 +36,16 @@ from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slur
 from nerif.sequence.plan import SequenceSettings
 from nerif.sequence.reconstruct import reconstruct_sequence
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
+
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed <(socket|ssl):ResourceWarning")
+
+
+@pytest.fixture(autouse=True)
+def _sockets_that_dask_leaves() -> Iterator[None]:
+    """Collect them here: Dask drops the socket of a connection that it refuses, or that ends as the cluster does."""
+    yield
+    gc.collect()
+
 
 CHUNKS = ["--workers", "2", "--threads", "1", "--chunk", "6"]
 
