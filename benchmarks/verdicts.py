@@ -2,7 +2,7 @@
 
     python benchmarks/verdicts.py --cases 200 --folder out/verdicts --write benchmarks/results/verdicts-cpu.md
 
-The coefficients of verdict.py were set on cases 0 to 53 of benchmarks/spoiling.py; the table is of others, from --first
+The coefficients of verdict.py were set on cases 0 to 34 of benchmarks/spoiling.py; the table is of others, from --first
 on. What a verdict rests on is kept in --folder, a file for each case; a case that is there is judged anew and not
 reconstructed again.
 """
