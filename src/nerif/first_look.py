@@ -10,13 +10,10 @@ from typing import Any
 
 from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, rms_text
-from nerif.fields.base import Field
-from nerif.geometry import Grid
 from nerif.halves import HALVES, kept_half
 from nerif.json_file import write_json
 from nerif.kept_run import KeptRun
 from nerif.measurement import Measurement
-from nerif.metrics import volume_errors
 from nerif.monitor import QUIET, Monitor
 from nerif.prediction import reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
@@ -38,8 +35,6 @@ LIMITS = ("epochs", "max_steps", "time_limit", "longest", "iterations")
 """Settings that a run may be gone on with others of."""
 
 SCORES = "views.json"
-VOXELS = 48
-"""Along the longest edge of the box, on which the fields of the short and of the whole run are compared."""
 
 
 def kept_out(hold_out: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
@@ -120,7 +115,7 @@ class FirstLook:
         except InputError as error:
             say(f"no view is kept out first: without {name}, {error}")
             return None
-        if result.outcome.reason == "interrupted" or self._scores():
+        if result.outcome.reason == "interrupted" or self.scores():
             return result
         if result.outcome.failed:
             say(f"without {name}: {result.outcome.reason}; all views begin from nothing")
@@ -137,22 +132,8 @@ class FirstLook:
             say(f"{name}, not seen so far, is predicted with CC {v['cc']:.4f}, rms error {rms_text(v)}")
         return result
 
-    def scores(self, field: Field) -> dict[str, Any]:
-        """Return how well the views were predicted, and in which time; nothing where they were not.
-
-        Parameters
-        ----------
-        field : of the whole run; `change` is the rms difference of the short run's field from it, over its rms
-        """
-        scores = self._scores()
-        if scores:
-            first, box, n_ambient = self._directory.field()
-            grid = Grid.of_resolution(box, VOXELS)
-            whole, short = (f.sample(grid).numpy() for f in (field, first))
-            scores["change"] = volume_errors(whole, short, n_ambient)["l2_variation"]
-        return scores
-
-    def _scores(self) -> dict[str, Any]:
+    def scores(self) -> dict[str, Any]:
+        """Return how well the views were predicted, and in which time; nothing where they were not."""
         path = self._directory / SCORES
         return json.loads(path.read_text()) if path.is_file() else {}
 

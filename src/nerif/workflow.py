@@ -212,7 +212,7 @@ def _reconstruct_into(
             callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
             result = method(training, compose(*callbacks), state, origin if state is None else None)
     begin(None)
-    scores = {} if look is None else look.scores(result.field)
+    scores = {} if look is None else look.scores()
     _write(out, measurement, result, run, settings, gains, voxels, monitor, {"first_look": scores} if scores else {})
     _tell_axis(out, result, whole, monitor)
     try:

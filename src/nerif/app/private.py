@@ -1,4 +1,4 @@
-"""Files for the user alone, outside of every project: whoever may only read the machine or a project cannot read them.
+"""Files that the user alone can read, outside of every project.
 
 They are in $XDG_STATE_HOME/nerif, by default ~/.local/state/nerif.
 """

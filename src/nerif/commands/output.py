@@ -18,7 +18,7 @@ from nerif.reconstruction.base import OnStep, Step, compose
 __all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say", "silence"]
 
 SAME_SIGNAL = 0.5  # seconds
-SOON, EVERY = 2.0, 15.0  # seconds until work is told where there is no terminal, and between the lines
+SOON, EVERY = 2.0, 15.0  # seconds before the first line without a terminal, and between lines
 
 
 def say(text: str) -> None:
@@ -81,7 +81,7 @@ def interruptible() -> Iterator[list[bool]]:
 def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """Show a bar that goes away when done: a callable that is told how many are done, and out of how many.
 
-    Without a terminal it is a line after SOON, and one EVERY so many seconds, also while nothing is told.
+    Without a terminal it is a line after SOON seconds, and one EVERY so many, also between counts.
     """
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
