@@ -1,4 +1,4 @@
-# make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo
+# make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo (two minutes)
 # make test   set up, run the tests, lint and types among them (five minutes on 2 cores; make test-all: the long ones too)
 # make app    set up, and work on out/demo (make demo) in the browser
 # make docs   the documentation site: open docs/_build/html/index.html

@@ -54,7 +54,8 @@ def test_every_figure_is_whole(whole):
     views = ["0deg", "56.6667deg", "113.333deg", "170deg"]
     expected = [f"slices_{q}" for q in quantities] + ["comparison"]
     expected += [f"isosurface_{q}" for q in ("n", "density", "temperature")] + [f"view_{v}" for v in views]
-    assert names == [*expected, "residuals", "rig", "views", "history", "slice_scores"]
+    bands = [f"bands_{q}" for q in ("n", "density", "temperature")]
+    assert names == [*expected, "residuals", "rig", "views", *bands, "reliability", "history", "slice_scores"]
 
 
 def figure_of_a_view(size: tuple[int, int], sigma: bool) -> Figure:

@@ -29,7 +29,7 @@ class Demo(Settings):
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
     """Directory to write."""
-    time_limit: float = 40.0
+    time_limit: float = 22.0
     """Seconds of training, three times: of the reconstruction, and of two that tell how far off it may be."""
     pixels: int = 64
     """Pixels along an edge of each view (the paper has 200)."""
