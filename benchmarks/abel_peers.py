@@ -22,7 +22,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Camera, Grid
 
 __all__ = ["ORDERS", "PEERS", "SMOOTHING", "HalfView", "ParallelView", "Peer", "Revolution", "attempts", "pyabel"]

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import torch
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 
 __all__ = ["N_AMBIENT", "Table", "add_write", "alone", "machine"]
 

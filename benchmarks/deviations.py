@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import Table, add_write
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.trials import LOST, Deviations
 from nerif.result import ResultDirectory

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from bench import N_AMBIENT, Table, add_write
-from nerif.conventions import Points, Values, Vectors
+from nerif.common.conventions import Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig

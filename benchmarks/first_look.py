@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from bench import Table, add_write, alone
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 
 def run(path: Path, truth: Path, method: str, limit: float, hold_out: str) -> tuple[float, float, float, float]:

@@ -23,7 +23,7 @@ from typing import Any
 
 from abel_peers import ORDERS, PEERS, ParallelView, Peer, Revolution, attempts, pyabel
 from bench import N_AMBIENT, Table, add_write
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.jets import AXISYMMETRIC

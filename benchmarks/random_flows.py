@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bench import N_AMBIENT
-from nerif.conventions import Points, Values, Vectors
+from nerif.common.conventions import Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.turbulence import inertial_scalar

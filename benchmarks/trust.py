@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from bench import N_AMBIENT, Table, add_write, alone
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.total_variation import TotalVariation

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import Table, add_write
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from nerif.result import Result
 from nerif.verdict import WORDS, Verdict, verdict
 from spoiling import RIGS, SPOILED, case

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 
 
 def test_a_file_takes_its_name_at_the_end_and_keeps_its_ending(tmp_path):

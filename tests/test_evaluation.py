@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import Points, Values, Vectors
+from nerif.common.conventions import Points, Values, Vectors
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary, VoxelField

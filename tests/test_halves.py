@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
 from nerif.geometry.symmetry import Symmetry

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from nerif.cli import main
-from nerif.installing import DISTRIBUTION, install, stranger
+from nerif.common.installation import DISTRIBUTION, install, stranger
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("src", "docs", "examples", "benchmarks", "tests")
@@ -77,7 +77,7 @@ def test_an_older_installation_of_this_program_is_none_of_another_project(instal
 
 
 def test_a_verb_says_it_in_one_line(monkeypatch, capsys):
-    monkeypatch.setattr("nerif.installing.stranger", lambda: "the package nerif 1.4.0")
+    monkeypatch.setattr("nerif.common.installation.stranger", lambda: "the package nerif 1.4.0")
     assert main(["info", "nowhere.nc"]) == 2
     first, second = capsys.readouterr().err.splitlines()
     assert first == "nerif: the package nerif 1.4.0"
@@ -85,5 +85,5 @@ def test_a_verb_says_it_in_one_line(monkeypatch, capsys):
 
 
 def test_help_does_not_look_for_it():
-    code = "import sys; from nerif.cli import main; main(['--help']); sys.exit('nerif.installing' in sys.modules)"
+    code = "import sys; from nerif.cli import main; main(['--help']); sys.exit('nerif.common.installation' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0

@@ -9,11 +9,11 @@ from dataclasses import replace
 import pytest
 
 from nerif import workflow
-from nerif.atomic import atomic, written
 from nerif.cli import VERBS, main
 from nerif.commands import info, output, simulate
 from nerif.commands.output import MONITOR, counting_bar
-from nerif.interruption import Interrupted, if_interrupted
+from nerif.common.files import atomic, written
+from nerif.common.interruption import Interrupted, if_interrupted
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.tikhonov import Tikhonov

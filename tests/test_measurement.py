@@ -10,7 +10,7 @@ import pytest
 import torch
 import xarray as xr
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Lens, Ring
 from nerif.measurement import Measurement
 from nerif.measurement_file import variables

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.kept_run import ASKED
-from nerif.own_files import WRITTEN, OwnFiles
 from nerif.result import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Ring
 from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.resampling import common_grid, difference, resampled
 from nerif.volume import Volume

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Ring, paper_rig
 from nerif.physics.path_integral import PathIntegral

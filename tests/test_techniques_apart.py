@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate
 from nerif.fields.phantoms import GaussianBalls
 from nerif.gains import fit_gains, with_gains

@@ -13,7 +13,7 @@ import torch
 
 from nerif import drawing
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import score_lines
 from nerif.geometry import Box, Grid
 from nerif.measurement import Measurement

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from nerif.cli import main
+from nerif.common.conventions import InputError
 from nerif.consistency import binned
-from nerif.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
 from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras

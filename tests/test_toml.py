@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.toml import check_known, read_toml, write_toml
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 import xarray as xr
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.exports import export
 from nerif.geometry import Box, Grid
 from nerif.volume import Volume

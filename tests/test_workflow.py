@@ -10,9 +10,9 @@ import torch
 
 from nerif import workflow
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.written_files import WRITTEN
 from nerif.monitor import Monitor
-from nerif.own_files import WRITTEN
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.tikhonov import Tikhonov

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from nerif import __version__
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.presets import preset
 from study.cases import FULL, QUICK, SECTIONS, Case, Scale, cases, check_sections

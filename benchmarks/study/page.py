@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from study.cases import SECTIONS, Case
 from study.claim import Claim, Verdict
 from study.claims import claims

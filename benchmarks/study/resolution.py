@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.phantoms import Octahedron
 from nerif.resolution import COARSEST, MTF

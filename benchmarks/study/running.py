@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom

@@ -1,7 +1,7 @@
 """The names that are here, and their homes: read by type checkers, and at run time to load them when asked for."""
 
+from .common.conventions import InputError as InputError
 from .consistency import check_consistency as check_consistency
-from .conventions import InputError as InputError
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluate_views as evaluate_views
 from .evaluation import evaluate_volume as evaluate_volume

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import Points, Values, Vectors
+from nerif.common.conventions import Points, Values, Vectors
 from nerif.fields.base import Field, in_chunks
 from nerif.geometry.correction import turned
 from nerif.volume import Volume

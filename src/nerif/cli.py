@@ -86,8 +86,8 @@ def _run(words: list[str]) -> int:
         near = difflib.get_close_matches(verb, VERBS, n=1, cutoff=0)
         return _refuse(f"unknown verb '{verb}'; the nearest known one is '{near[0]}'; see nerif --help")
 
-    from nerif.conventions import InputError
-    from nerif.installing import stranger
+    from nerif.common.conventions import InputError
+    from nerif.common.installation import stranger
 
     if warning := stranger():
         print(f"nerif: {warning}", file=sys.stderr)
@@ -112,7 +112,7 @@ def _run(words: list[str]) -> int:
 
 def _left_behind() -> str:
     """What a command that was broken off has written, and how to go on, where nothing else is known."""
-    from nerif.atomic import written
+    from nerif.common.files import written
 
     if not written:
         return "nothing was written; the same command starts again"

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
-from nerif.finding import Finding
+from nerif.common.conventions import InputError
+from nerif.common.findings import Finding
 from nerif.geometry import Grid
 from nerif.geometry.plausibility import rig_findings
 from nerif.measurement import Measurement

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from nerif.conventions import STATISTICS
+from nerif.common.conventions import STATISTICS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.alignment import aligned
-from nerif.conventions import InputError, with_unit
+from nerif.common.conventions import InputError, with_unit
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.gains import gains_of, with_gains

@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.fields.base import Field
 from nerif.geometry import Box, Camera, Grid
 from nerif.imaging.background import Background
 from nerif.imaging.bundle import Pose
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.targets import CalibrationTarget
-from nerif.own_files import WRITTEN, OwnFiles
 from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
 from nerif.toml import write_toml
 from nerif.volume import Volume

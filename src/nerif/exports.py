@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
 from nerif.volume import Volume
 from nerif.volume_file import write_netcdf
 from nerif.vti import write_vti

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.reconstruction.operator import VoxelOperator

@@ -20,7 +20,7 @@ import torch.nn.functional as functional
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Camera
 from nerif.geometry.symmetry import Symmetry
 from nerif.measurement import Measurement

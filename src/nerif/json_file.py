@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 
 __all__ = ["write_json"]
 

@@ -7,8 +7,8 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
 from nerif.fields.base import Field
 from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
+from nerif.common.written_files import OwnFiles
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
 from nerif.json_file import write_json
 from nerif.measurement import Measurement
 from nerif.monitor import Monitor
 from nerif.observation import Observation
-from nerif.own_files import OwnFiles
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
 from nerif.reconstruction.trials import best_covered

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
+from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
+from nerif.common.netcdf import reading, values
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
-from nerif.netcdf import reading, values
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.registry import TECHNIQUES, technique

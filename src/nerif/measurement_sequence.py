@@ -14,12 +14,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
-from nerif.installing import install
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
+from nerif.common.installation import install
+from nerif.common.netcdf import reading, values
 from nerif.measurement import Measurement
 from nerif.measurement_file import CONVENTIONS, PLAIN, known_conventions, map_names, variables
-from nerif.netcdf import reading, values
 from nerif.techniques.registry import TECHNIQUES
 
 if TYPE_CHECKING:

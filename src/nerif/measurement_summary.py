@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from nerif.conventions import with_unit
+from nerif.common.conventions import with_unit
 from nerif.notebook import PIXELS, number, panel, show_views
 from nerif.observation import Observation
 from nerif.techniques.deflection import Deflection

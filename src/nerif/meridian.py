@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from nerif.atomic import atomic
-from nerif.conventions import FACES
+from nerif.common.conventions import FACES
+from nerif.common.files import atomic
 from nerif.geometry.symmetry import Symmetry
 from nerif.volume import Volume, describe
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from nerif.conventions import with_unit
+from nerif.common.conventions import with_unit
 from nerif.drawing import (
     Drawable,
     add_colour_bar,

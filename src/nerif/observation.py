@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError, unit_shown
+from nerif.common.conventions import InputError, unit_shown
 from nerif.geometry import Camera
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES, forward_model

@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.pauses import pause
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import NeuralField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.measurement import Measurement, measurement_of
-from nerif.pauses import pause
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, Projector, project
 from nerif.physics.ray_tracing import CurvedRays
 from nerif.reconstruction.operator import rays_through

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError, Points
+from nerif.common.conventions import InputError, Points
 from nerif.fields.base import Field
 from nerif.geometry import Box, Camera, Lens, Plane, Rays
 from nerif.physics.ray_tracing import trace

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError, with_unit
+from nerif.common.conventions import InputError, with_unit
+from nerif.common.files import atomic
+from nerif.common.netcdf import opened
 from nerif.measurement import Measurement
 from nerif.measurement_file import encoding, from_dataset, to_dataset
-from nerif.netcdf import opened
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED
 

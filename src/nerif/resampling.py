@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.geometry import Box, Grid
 from nerif.volume import Volume

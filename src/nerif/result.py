@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from nerif import __version__
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
+from nerif.common.written_files import WARN, OwnFiles, remove_empty
 from nerif.exports import export
 from nerif.fields.base import Field
 from nerif.geometry import Box
@@ -23,7 +24,6 @@ from nerif.geometry.symmetry import Symmetry
 from nerif.json_file import write_json
 from nerif.measurement import Measurement
 from nerif.meridian import Meridian
-from nerif.own_files import WARN, OwnFiles, remove_empty
 from nerif.reconstruction import files as kept
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state

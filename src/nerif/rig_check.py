@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerif.finding import Finding
+from nerif.common.findings import Finding
 from nerif.geometry.plausibility import rig_findings
 from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor

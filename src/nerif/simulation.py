@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
+from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Scaled, make_phantom

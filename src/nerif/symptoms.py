@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import FACES
+from nerif.common.conventions import FACES
+from nerif.common.findings import Finding
 from nerif.fields.base import Field
-from nerif.finding import Finding
 from nerif.measurement import Measurement
 from nerif.prediction import predict_view
 from nerif.quick_views import path_integral, values_of

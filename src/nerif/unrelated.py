@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import torch
 
-from nerif.conventions import InputError
-from nerif.finding import Finding
+from nerif.common.conventions import InputError
+from nerif.common.findings import Finding
 from nerif.geometry.plausibility import suspects
 from nerif.measurement import Measurement
 from nerif.mistakes import orders

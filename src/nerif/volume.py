@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import STATISTICS, InputError, ambient_index
+from nerif.common.conventions import STATISTICS, InputError, ambient_index
 from nerif.geometry import Grid
 
 __all__ = ["INDEX", "QUANTITIES", "Volume", "describe", "field_of", "name_of", "quantities_of"]

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.atomic import atomic
-from nerif.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
+from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
+from nerif.common.files import atomic
+from nerif.common.netcdf import opened, values
 from nerif.geometry import Box, Grid
-from nerif.netcdf import opened, values
 from nerif.volume import QUANTITIES, Volume, describe, field_of, name_of
 from nerif.vti import read_vti
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError, ambient_index
+from nerif.common.conventions import InputError, ambient_index
+from nerif.common.files import atomic
+from nerif.common.netcdf import reading
 from nerif.geometry import Box, Grid
 from nerif.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
-from nerif.netcdf import reading
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, technique
 from nerif.volume import Volume, describe, field_of, name_of

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
 from nerif.geometry import Box, Grid
 
 __all__ = ["read_vti", "write_vti"]

@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.interruption import if_interrupted
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
 from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
 from nerif.gains import fit_gains, with_gains
 from nerif.halves import departure_sentence, departures, halved
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
-from nerif.interruption import if_interrupted
 from nerif.live import Live
 from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities

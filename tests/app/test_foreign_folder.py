@@ -17,7 +17,7 @@ from nerif.app.jobs import Jobs
 from nerif.app.private import secret
 from nerif.app.project import Project
 from nerif.app.workspace import Workspace
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 MODULES = ("numpy", "psutil", "torch", "types", "lazy_loader", "multiprocessing", "selectors", "nicegui", "zarr")
 PLANTED = {

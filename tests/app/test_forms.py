@@ -13,7 +13,7 @@ from nerif.app.pages.reconstruct import form_of
 from nerif.commands.design import Design
 from nerif.commands.methods import RECORDS
 from nerif.commands.settings import help_of, parse
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Ring
 
 FORM = Form(Design(), ("design",))

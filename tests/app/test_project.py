@@ -8,7 +8,7 @@ import pytest
 
 from nerif.app.project import Project
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from nerif.app.project import Project
 from nerif.app.result_look import ResultLook
 from nerif.app.result_table import rows_of
 from nerif.app.sources import Film, Still
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.exports import export
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Flame

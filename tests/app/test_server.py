@@ -23,7 +23,7 @@ from nerif.app.private import page_leading_to
 from nerif.app.server import Address, told_of
 from nerif.cli import main
 from nerif.commands.settings import read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from report.browsing import needs_browser, wait_for
 
 STATIC = "/_nicegui/3.18.0/static/nicegui.css"

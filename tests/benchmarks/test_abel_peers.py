@@ -10,7 +10,7 @@ import torch
 
 from abel_peers import PEERS, HalfView, ParallelView, Revolution, attempts, pyabel, quadrature
 from bench import N_AMBIENT
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.jets import GaussianJet
 from nerif.geometry import Box, Grid, Ring
 from nerif.metrics import volume_errors

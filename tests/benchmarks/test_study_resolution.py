@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron

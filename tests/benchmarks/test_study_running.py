@@ -18,7 +18,7 @@ import torch
 import study
 from benchmarks.study_records import record
 from nerif import __version__
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Box, Ring

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.conventions import FACES, InputError
+from nerif.common.conventions import FACES, InputError
 from nerif.fields.grid import Boundary, VoxelField, spline_weights
 from nerif.geometry import Box, Grid
 

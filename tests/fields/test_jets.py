@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.jets import AXISYMMETRIC, Axisymmetric
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid

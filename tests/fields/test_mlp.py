@@ -10,7 +10,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.encoding import encode, encode_pullback, encoded_width, wave_vectors
 from nerif.fields.mlp import ACTIVATIONS, Network, NetworkShape, NeuralField
 from nerif.geometry import Box

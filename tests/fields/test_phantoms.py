@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import FLAME_INTERVAL, Flame, GaussianBalls, Octahedron, make_phantom
 from nerif.fields.turbulence import LONGEST, Fire, TurbulentPlume, inertial_scalar

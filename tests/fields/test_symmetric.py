@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.fields.mlp import NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels

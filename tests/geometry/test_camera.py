@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import PROJECTIONS, Box, Camera, Plane, projection_named
 from nerif.geometry.distortion import distort, fold, undistort
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import PROJECTIONS, Box, Lens, Plane, Ring, spread_points
 
 BOX = Box.cube(40.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera, Plane, Ring, paper_rig
 from nerif.geometry.plausibility import likely_cause, rig_findings
 from nerif.measurement import Measurement

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nerif.conventions import FACES, InputError, parse_faces
+from nerif.common.conventions import FACES, InputError, parse_faces
 from nerif.geometry import TELECENTRIC, Box, Grid, Rays, Ring, paper_rig
 
 F64 = torch.float64

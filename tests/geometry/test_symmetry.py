@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box
 from nerif.geometry.symmetry import Symmetry, parse_symmetry
 

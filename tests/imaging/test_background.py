@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.background import KINDS, Background
 from nerif.imaging.printing import MARGIN, paper_for, print_pattern
 from nerif.imaging.targets import CalibrationTarget

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from calibration_pictures import detection, target_pictures
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.experiment import target_poses, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.bundle import Bundle, Observation, Pose, _Layout, adjust

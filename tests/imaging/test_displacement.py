@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.background import Background
 from nerif.imaging.correlation import normalised_median_outliers, window_correlation
 from nerif.imaging.displacement import DisplacementSettings, displacement, measure

@@ -15,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerif.commands import calibrate
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
 from nerif.imaging.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
 from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration_pictures import target_pictures
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Ring
 from nerif.imaging.calibration import calibrate, calibrate_views
 from nerif.imaging.calibration_result import read_errors, rms_of

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.line_scans import LineScan
 from nerif.reconstruction.tikhonov import Tikhonov
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.mask_shapes import MaskShape, mask_of, write_masks
 from nerif.imaging.masks import drawn_masks, read_mask
 

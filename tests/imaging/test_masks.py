@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.imaging.masks import MaskSettings, drawn_masks, flow_mask, read_mask, with_flow_masks

@@ -12,7 +12,7 @@ import tifffile
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
 from nerif.imaging.assembly import Scene

@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.crop import Crop
 from nerif.imaging.picture_looks import address_of, look_at, reduced
 from nerif.imaging.views import find_views

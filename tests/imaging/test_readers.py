@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.crop import Crop
 from nerif.imaging.frames import Frames, read_each
 from nerif.imaging.readers import open_frames

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from imaging_files import write_images
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens
 from nerif.imaging.cameras_file import read_box, read_cameras, write_cameras
 from nerif.imaging.importers import ImportSettings, import_box, import_cameras

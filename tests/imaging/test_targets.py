@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.experiment import place
 from nerif.geometry import Camera, Plane
 from nerif.imaging.bundle import Pose

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from calibration_pictures import target_pictures
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.experiment import side_of_one, world_axes
 from nerif.geometry import TELECENTRIC, Camera, Ring
 from nerif.imaging.bundle import _Layout

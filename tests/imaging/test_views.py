@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.targets import CalibrationTarget
 from nerif.imaging.views import _pose_keys, find_targets, find_views, good_pictures
 

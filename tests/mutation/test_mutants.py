@@ -17,7 +17,7 @@ import torch
 
 from mutation.mutators import make
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.exports import export
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import NetworkShape

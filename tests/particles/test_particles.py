@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.particles.cloud import Particles, quality_factor, spread
 from nerif.particles.pictures import picture, pictures

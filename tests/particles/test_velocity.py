@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.imaging.correlation import normalised_median_outliers
 from nerif.particles.cloud import Particles

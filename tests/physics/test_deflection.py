@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Plane, Rays, Ring

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
 from nerif.physics.design import DesignSettings, expect

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.physics.gas_optics import (
     GAS_CONSTANT,
     GASES,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid
 from nerif.physics.gas_optics import ambient_index

@@ -10,8 +10,8 @@ import torch
 import xarray as xr
 
 from nerif.cli import main
+from nerif.common.conventions import InputError
 from nerif.consistency import check_consistency
-from nerif.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import make_phantom

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Grid, paper_rig

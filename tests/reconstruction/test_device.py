@@ -7,7 +7,7 @@ from contextlib import suppress
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.mlp import Network, NetworkShape
 from nerif.reconstruction.device import (
     autocast_dtype,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Box
 from nerif.measurement import Measurement

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.mlp import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays, Ring
 from nerif.reconstruction.operator import VoxelOperator

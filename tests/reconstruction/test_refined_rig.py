@@ -13,7 +13,7 @@ import torch
 from matplotlib.figure import Figure
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring

@@ -11,7 +11,7 @@ import torch
 
 from nerif.alignment import Moved, aligned
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.geometry.correction import GEOMETRY, Corrections

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.conventions import InputError, Points
+from nerif.common.conventions import InputError, Points
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Lens, paper_rig

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from nerif.common.pauses import at_pauses, pause
 from nerif.consistency import check_consistency
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
-from nerif.pauses import at_pauses, pause
 from nerif.prediction import predict, reproject
 from nerif.reconstruction import threads
 from nerif.reconstruction.threads import Cores, Used, free_threads

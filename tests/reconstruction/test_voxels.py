@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors import SafetensorError
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid

@@ -15,7 +15,7 @@ pytest.importorskip("imageio_ffmpeg", reason="pip install '.[movie]'")
 from imageio_ffmpeg import get_ffmpeg_exe
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.report.movie import Movie, _points, _surfaces, frames_there, instants

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_views
 from nerif.geometry import Box, Grid
 from nerif.notebook import number

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.volume_sequence import VolumeSequence
 

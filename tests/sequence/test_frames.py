@@ -14,7 +14,7 @@ import xarray as xr
 import zarr
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.symmetric import symmetry_of_field
 from nerif.geometry import Grid
 from nerif.measurement_sequence import MeasurementSequence

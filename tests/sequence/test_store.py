@@ -14,7 +14,7 @@ import torch
 import xarray as xr
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.mlp import Network, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, Ring

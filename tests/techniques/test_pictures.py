@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.ndimage import map_coordinates
 
 from nerif.cli import main
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import evaluate_views
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary

@@ -11,8 +11,8 @@ from typing import Annotated
 import tyro
 
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError
-from nerif.installing import install
+from nerif.common.conventions import InputError
+from nerif.common.installation import install
 
 __all__ = ["App", "main", "run"]
 

@@ -9,7 +9,7 @@ from nicegui import ui
 from nerif.app.jobs import REFUSED, Job
 from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["LINES", "JobTold"]
 

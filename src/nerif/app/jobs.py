@@ -37,7 +37,7 @@ from typing import Any
 from nerif.app.private import secret
 from nerif.app.project import OWN
 from nerif.app.runner import ENDED, JOB, LOG, STARTED
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.json_file import write_json
 from nerif.result import RUN
 

@@ -11,7 +11,7 @@ from nicegui import ui
 from nerif.app.jobs import REFUSED, Job
 from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.live import read_live
 from nerif.report.movie import frames_there
 from nerif.volume_sequence import VolumeSequence

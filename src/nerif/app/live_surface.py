@@ -10,7 +10,7 @@ from nicegui import ui
 
 from nerif.app.box_scene import BoxScene
 from nerif.app.result_answers import live_address
-from nerif.conventions import unit_shown
+from nerif.common.conventions import unit_shown
 from nerif.geometry import Box
 from nerif.live import Look
 from nerif.report.isosurface import default_level, surface_triangles

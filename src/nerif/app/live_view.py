@@ -15,7 +15,7 @@ from nerif.app.jobs_drawer import film_progress
 from nerif.app.live_surface import LiveSurface, said_of
 from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
-from nerif.conventions import unit_shown
+from nerif.common.conventions import unit_shown
 from nerif.drawing import colour_range, map_range
 from nerif.geometry import Box
 from nerif.live import Look, read_live, read_look

@@ -9,7 +9,7 @@ from threading import Lock
 from typing import Any
 
 from nerif.app.project import Project
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.crop import Crop
 from nerif.imaging.picture_looks import SourceLook, address_of, look_at
 from nerif.imaging.targets import CalibrationTarget, Detection

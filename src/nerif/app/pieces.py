@@ -9,7 +9,7 @@ from html import escape
 from nicegui import ui
 
 from nerif.app.jobs import command_line
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["CommandLine", "card", "figures", "refusals", "text_html"]
 

@@ -13,7 +13,7 @@ from html import escape
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["page_leading_to", "secret"]
 

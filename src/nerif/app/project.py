@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from nerif.commands.info import is_measurement
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.views import View, find_views
 from nerif.result import LIVE, RUN
 

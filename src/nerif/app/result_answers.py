@@ -14,7 +14,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from nerif.app.sources import source_of
 from nerif.app.workspace import Workspace
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.live import read_look
 from nerif.report.isosurface import default_level, stl_of, surface_triangles
 from nerif.result import REPORT

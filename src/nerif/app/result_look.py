@@ -17,7 +17,7 @@ from nerif.app.slices_view import Panel, SlicesView
 from nerif.app.sources import Source, source_of
 from nerif.app.surface_view import Surface, SurfaceView
 from nerif.app.workspace import Workspace
-from nerif.conventions import InputError, unit_shown
+from nerif.common.conventions import InputError, unit_shown
 from nerif.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_pictures import colours_of
 from nerif.resampling import common_grid, difference, resampled

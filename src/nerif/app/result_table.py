@@ -9,7 +9,7 @@ from html import escape
 from nicegui import ui
 
 from nerif.app.project import Contents, Project
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import rms_text
 from nerif.glance import glance
 from nerif.reconstruction.files import FIELD

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from nicegui import ui
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration_result import ImageError, read_errors, rms_of
 from nerif.imaging.importers import import_box, import_cameras

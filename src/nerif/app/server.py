@@ -27,7 +27,7 @@ from nerif.app.project import Project
 from nerif.app.result_answers import ROUTES
 from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.commands.output import say
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["Address", "serve", "told_of"]
 

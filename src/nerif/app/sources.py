@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
-from nerif.conventions import STATISTICS, InputError
+from nerif.common.conventions import STATISTICS, InputError
 from nerif.drawing import colour_range, shown
 from nerif.report.isosurface import default_level
 from nerif.report.movie import frames_there, ranges_over_time

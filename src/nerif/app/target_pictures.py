@@ -9,7 +9,7 @@ from nicegui import ui
 
 from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.calibration_result import ImageError
 from nerif.imaging.targets import CalibrationTarget, Detection
 from nerif.imaging.views import View, pose_names

@@ -13,7 +13,7 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration import CalibrationSettings, calibrate_views, target_pictures
 from nerif.imaging.calibration_result import MOUNT, Calibration

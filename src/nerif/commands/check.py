@@ -10,8 +10,8 @@ import tyro
 
 from nerif.commands.output import MONITOR, check_file, counting_bar, say
 from nerif.commands.settings import Settings, read_settings
+from nerif.common.conventions import InputError
 from nerif.consistency import Consistency, check_consistency
-from nerif.conventions import InputError
 from nerif.corrected import corrected
 from nerif.measurement import Measurement
 from nerif.rig_check import RigCheck, check_rig

@@ -12,9 +12,9 @@ from nerif.commands import evaluate, reconstruct, simulate
 from nerif.commands.methods import ReconstructNeRIF
 from nerif.commands.output import MONITOR, say
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.installation import install
 from nerif.geometry import Ring
-from nerif.installing import install
 from nerif.reconstruction.neural import NeRIF
 from nerif.result import ResultDirectory
 from nerif.simulation import Simulation

@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import check_file, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Ring
 from nerif.physics.design import DesignSettings, Expectation, expect
 

@@ -11,7 +11,8 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.interruption import if_interrupted
 from nerif.geometry import Box
 from nerif.imaging.assembly import Scene, Surroundings
 from nerif.imaging.displacement import DisplacementSettings
@@ -19,7 +20,6 @@ from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, measure_instant
 from nerif.imaging.over_time import frame_numbers, instants_of, measure_recording
 from nerif.imaging.views import find_views
-from nerif.interruption import if_interrupted
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.techniques.deflection import Deflection

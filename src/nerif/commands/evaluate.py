@@ -11,7 +11,7 @@ import tyro
 
 from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import FLOW, evaluate, rms_text
 from nerif.volume import INDEX, name_of
 

@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.exports import FORMATS, export
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, derive, masked_lines

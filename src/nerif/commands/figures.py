@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.report.pages import JOURNALS, save_figures
 from nerif.result import FIGURES, ResultDirectory
 

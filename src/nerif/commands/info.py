@@ -13,11 +13,11 @@ from torch import Tensor
 
 from nerif.commands.output import say
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError, with_unit
+from nerif.common.conventions import InputError, with_unit
+from nerif.common.netcdf import opened
 from nerif.evaluation import rms_text
 from nerif.measurement import Measurement
 from nerif.measurement_file import known_conventions
-from nerif.netcdf import opened
 from nerif.notebook import number
 from nerif.result import METRICS, ResultDirectory
 from nerif.techniques.registry import TECHNIQUES

@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Grid
 from nerif.imaging.masks import MaskSettings, drawn_masks, with_flow_masks
 from nerif.measurement import Measurement

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import OnStep, Step, compose
 

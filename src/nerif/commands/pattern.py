@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import check_file, say
 from nerif.commands.settings import Flat, Settings, read_settings, value_given
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging import background, targets
 from nerif.imaging.background import Background
 from nerif.imaging.printing import paper_for, print_pattern

@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError, with_unit
+from nerif.common.conventions import InputError, with_unit
 from nerif.geometry import Ring
 from nerif.measurement import Measurement
 from nerif.prediction import predict

@@ -12,8 +12,8 @@ import tyro
 from nerif.commands.methods import RECORDS, Reconstruct
 from nerif.commands.output import MONITOR
 from nerif.commands.settings import flag_value, read_settings, value_given
-from nerif.conventions import InputError
-from nerif.installing import install
+from nerif.common.conventions import InputError
+from nerif.common.installation import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Step
 from nerif.reconstruction.presets import preset
 from nerif.result import RUN

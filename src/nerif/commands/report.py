@@ -10,7 +10,7 @@ import tyro
 
 from nerif.commands.output import MONITOR, check_file
 from nerif.commands.settings import Settings, read_settings
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.result import REPORT
 from nerif.workflow import write_report, write_sequence_report
 

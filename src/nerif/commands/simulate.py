@@ -10,9 +10,9 @@ import tyro
 
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
-from nerif.conventions import InputError, with_unit
+from nerif.common.conventions import InputError, with_unit
+from nerif.common.interruption import if_interrupted
 from nerif.geometry import Ring
-from nerif.interruption import if_interrupted
 from nerif.simulation import Simulation
 from nerif.volume_file import write_netcdf
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import Points, Values, Vectors
+from nerif.common.conventions import Points, Values, Vectors
+from nerif.common.pauses import pause
 from nerif.geometry import Grid
-from nerif.pauses import pause
 
 __all__ = ["Field", "in_chunks"]
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["DIRECTIONS", "encode", "encode_pullback", "encoded_width", "wave_vectors"]
 

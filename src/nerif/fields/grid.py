@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError, Points, Values, Vectors, parse_faces
+from nerif.common.conventions import InputError, Points, Values, Vectors, parse_faces
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 

@@ -17,11 +17,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerif.conventions import InputError, Points, Values, Vectors
+from nerif.common.conventions import InputError, Points, Values, Vectors
+from nerif.common.transfer import constant
 from nerif.fields.base import Field
 from nerif.fields.encoding import check_directions, encode, encode_pullback, encoded_width, wave_vectors
 from nerif.geometry import Box
-from nerif.transfer import constant
 
 __all__ = ["ACTIVATIONS", "Network", "NetworkShape", "NeuralField"]
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerif.conventions import Points
+from nerif.common.conventions import Points
 from nerif.fields.encoding import encode, encode_pullback, encoded_width
 from nerif.fields.mlp import UNBOUNDED, Network, NetworkShape, NeuralField
 from nerif.geometry import Box

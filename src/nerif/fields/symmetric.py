@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerif.conventions import InputError, Points, Values, Vectors
+from nerif.common.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.encoding import encode, encode_pullback
 from nerif.fields.grid import VoxelField

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError, Points, Values, Vectors
+from nerif.common.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
+from nerif.common.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
 from nerif.geometry.distortion import distort, fold, undistort
 from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.projection import PERSPECTIVE, Projection

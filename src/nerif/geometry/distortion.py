@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import Pixels
+from nerif.common.conventions import Pixels
 from nerif.geometry.projection import Array
 
 __all__ = ["POWERS", "distort", "fold", "undistort"]

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import FACES, LARGEST_LENGTH, InputError
+from nerif.common.conventions import FACES, LARGEST_LENGTH, InputError
 
 __all__ = ["Box", "Grid"]
 

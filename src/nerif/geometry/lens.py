@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import LARGEST_LENGTH, InputError
+from nerif.common.conventions import LARGEST_LENGTH, InputError
 from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
 

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError, Points
-from nerif.finding import Finding
+from nerif.common.conventions import InputError, Points
+from nerif.common.findings import Finding
 from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box
 from nerif.geometry.rays import Rays

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import LARGEST_LENGTH, InputError, Pixels, Points, Values
+from nerif.common.conventions import LARGEST_LENGTH, InputError, Pixels, Points, Values
 
 __all__ = [
     "PERSPECTIVE", "PROJECTIONS", "TELECENTRIC", "Perspective", "Projection", "Telecentric", "projection_named",

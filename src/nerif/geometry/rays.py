@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Bool, Float, Int16
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.transfer import constant, sent
 from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
 from nerif.geometry.lens import LensDiscs, spread_points
-from nerif.transfer import constant, sent
 
 __all__ = ["BackgroundPoints", "Rays"]
 

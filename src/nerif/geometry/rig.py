@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box
 from nerif.geometry.projection import Projection, projection_named

@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import FACES, InputError, Points, Vectors
+from nerif.common.conventions import FACES, InputError, Points, Vectors
 from nerif.geometry.grid import Box
 
 __all__ = ["NO_SYMMETRY", "Symmetry", "parse_symmetry"]

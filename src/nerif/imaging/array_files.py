@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.frames import Frames
 
 __all__ = ["ArrayFrames", "Hdf5Frames"]

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from nerif.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES
+from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES
 from nerif.geometry import Box, Camera
 from nerif.imaging.displacement import DisplacementMap
 from nerif.measurement import Measurement

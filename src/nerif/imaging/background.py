@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["KINDS", "Background"]
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from nerif.conventions import FACES, InputError
+from nerif.common.conventions import FACES, InputError
 from nerif.geometry import Projection, projection_named
 from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
 from nerif.imaging.calibration_result import Calibration

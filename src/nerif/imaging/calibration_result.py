@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
 from nerif.imaging.bundle import Bundle, Observation, Pose, crossing
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras

@@ -31,7 +31,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError, Matrix3
+from nerif.common.conventions import InputError, Matrix3
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.toml import check_known, read_toml, write_toml
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.frames import as_float
 from nerif.imaging.warping import warp
 

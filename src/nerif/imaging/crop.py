@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.frames import size_in_words
 
 __all__ = ["Crop"]

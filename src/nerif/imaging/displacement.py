@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.exposure import saturated
 from nerif.imaging.frames import as_float
 from nerif.imaging.noise import FLOOR, local_correlation, smoothed_away, structure_variance

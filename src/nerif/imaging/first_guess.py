@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
 from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation
 from nerif.imaging.guess import Guess

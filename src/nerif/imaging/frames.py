@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "read_each", "size_in_words"]
 

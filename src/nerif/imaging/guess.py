@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.bundle import Pose
 from nerif.imaging.targets import ViewPictures
 

@@ -14,9 +14,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.installation import install
 from nerif.imaging.frames import Frames
-from nerif.installing import install
 
 __all__ = ["FileFrames"]
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
 from nerif.imaging.cameras_file import CalibratedCamera, check_names, checked, read_box

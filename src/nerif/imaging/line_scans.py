@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.geometry.projection import TELECENTRIC
 from nerif.measurement import Measurement, measurement_of

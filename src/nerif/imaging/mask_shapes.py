@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
 
 __all__ = ["MaskShape", "mask_of", "write_masks"]
 

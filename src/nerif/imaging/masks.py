@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Shaped
 
-from nerif.conventions import InputError, unit_shown
+from nerif.common.conventions import InputError, unit_shown
 from nerif.imaging.frames import as_float
 from nerif.imaging.readers import open_frames
 from nerif.measurement import Measurement

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.cameras_file import (
     CalibratedCamera,
     check_distortion,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Camera
 from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.cameras_file import CalibratedCamera

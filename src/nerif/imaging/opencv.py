@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.cameras_file import (
     CalibratedCamera,
     check_distortion,

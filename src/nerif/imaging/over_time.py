@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Camera, Lens
 from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.measuring import Recording, RestingView

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.bundle import Pose
 from nerif.imaging.guess import DISAGREE, Guess, angles, contradiction, enough, next_camera
 from nerif.imaging.targets import ViewPictures

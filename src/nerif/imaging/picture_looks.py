@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.exposure import check_exposure, full_scale, saturated
 from nerif.imaging.frames import as_float, read_each
 from nerif.imaging.views import View

@@ -11,7 +11,7 @@ import os
 import re
 from pathlib import Path
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.frames import Frames, SelectedFrames
 from nerif.imaging.image_files import FileFrames

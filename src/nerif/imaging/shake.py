@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = ["border", "remove_shake"]
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane
 from nerif.imaging.cameras_file import CalibratedCamera, checked
 from nerif.imaging.importers import ImportSettings

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, projection_named
 from nerif.imaging.cameras_file import FORMAT, CalibratedCamera, five, image_size, numbers, plane, read_cameras, upright
 from nerif.toml import check_known, read_toml

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.corners import eight_bit, first_at_a_black_square, first_at_the_upper_left, saddle_points, spacing
 
 __all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewPictures"]

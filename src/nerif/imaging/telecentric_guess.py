@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.bundle import Bundle, Pose
 from nerif.imaging.guess import DISAGREE, Guess, angles, contradiction, enough, next_camera
 from nerif.imaging.targets import Detection, ViewPictures

@@ -27,7 +27,7 @@ from typing import overload
 import numpy as np
 from jaxtyping import Bool
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.crop import Crop
 from nerif.imaging.exposure import check_exposure, full_scale
 from nerif.imaging.frames import Frames, read_each, size_in_words

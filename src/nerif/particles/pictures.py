@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import AMBIENT_INDEX, InputError
+from nerif.common.conventions import AMBIENT_INDEX, InputError
 from nerif.geometry import Camera
 from nerif.measurement import Measurement, measurement_of
 from nerif.particles.cloud import DIAMETER, QUANTITY, Particles, spread

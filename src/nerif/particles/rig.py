@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera, Ring
 
 __all__ = ["four_cameras"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Ring
 from nerif.physics.gas_optics import ambient_index
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = [
     "GASES",

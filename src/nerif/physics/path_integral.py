@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.pauses import pause
 from nerif.fields.base import Field
 from nerif.geometry import Rays
-from nerif.pauses import pause
 from nerif.techniques.base import ForwardModel, midpoints
 
 __all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]

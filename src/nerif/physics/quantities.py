@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
 from nerif.volume import QUANTITIES, Volume, quantities_of
 

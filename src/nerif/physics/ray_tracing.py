@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.pauses import pause
 from nerif.fields.base import Field
 from nerif.geometry import Rays
-from nerif.pauses import pause
 from nerif.physics.path_integral import LENS_RAYS, Projector
 
 __all__ = ["CurvedRays", "background_points", "trace"]

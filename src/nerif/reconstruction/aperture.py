@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.measurement import Measurement
 
 __all__ = ["APERTURES", "check_aperture", "lens_rays", "seen_through"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.measurement import Measurement
 
 __all__ = ["check_bounds", "check_resumed", "field_bounds", "in_units"]

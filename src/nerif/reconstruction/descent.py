@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.pauses import pause
 from nerif.fields.base import Field
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
-from nerif.pauses import pause
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds

@@ -13,7 +13,7 @@ from typing import Literal
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 __all__ = [
     "autocast_dtype", "available_memory", "float32_products", "keep_freed_memory", "peak_memory", "resolve_device",

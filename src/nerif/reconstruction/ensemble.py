@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Grid
 from nerif.measurement import Measurement
 from nerif.physics.quantities import LINEAR, GasSettings, derive, derive_all, deviation

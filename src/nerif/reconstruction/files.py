@@ -11,15 +11,15 @@ from typing import Any
 
 import torch
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
+from nerif.common.written_files import OwnFiles
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
-from nerif.own_files import OwnFiles
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
 from nerif.volume import INDEX
 

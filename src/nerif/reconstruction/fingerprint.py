@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Camera
 from nerif.measurement import Measurement
 from nerif.techniques.registry import forward_model

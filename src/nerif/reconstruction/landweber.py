@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.reconstruction.operator import operator_norm
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.voxels import VoxelReconstructor

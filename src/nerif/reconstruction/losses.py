@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
 from nerif.physics.path_integral import places

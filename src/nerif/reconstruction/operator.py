@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.planes import Bundle

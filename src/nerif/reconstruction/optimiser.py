@@ -20,7 +20,7 @@ import math
 
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.encoding import encoded_width
 from nerif.fields.mlp import Network, NetworkShape
 from nerif.reconstruction.adam import Adam

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import spline_weights
 from nerif.geometry import Grid, Rays
 from nerif.techniques.base import ForwardModel

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Camera
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.measurement import Measurement

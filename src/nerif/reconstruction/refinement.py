@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.measurement import Measurement

@@ -12,10 +12,10 @@ import torch.nn.functional as functional
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.common.transfer import sent
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Rays
 from nerif.reconstruction.losses import Evaluator
-from nerif.transfer import sent
 
 __all__ = ["SamplingDensity", "sample_count", "sample_rays"]
 

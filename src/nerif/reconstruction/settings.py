@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.losses import LossWeights

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from nerif.conventions import InputError, parse_faces
+from nerif.common.conventions import InputError, parse_faces
 from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
 from nerif.reconstruction.aperture import check_aperture
 from nerif.reconstruction.base import Reconstructor

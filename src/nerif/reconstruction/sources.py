@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.measurement import Measurement
 from nerif.observation import Observation
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import torch
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry.axis import Axis
 from nerif.geometry.symmetry import Symmetry, parse_symmetry
 from nerif.measurement import Measurement

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.transfer import sent
 from nerif.geometry import Rays
 from nerif.measurement import Measurement
 from nerif.observation import Observation
 from nerif.reconstruction.bins import binned_rays, patches
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import AUTO, forward_models
-from nerif.transfer import sent
 
 __all__ = ["Part", "Target", "check_target"]
 

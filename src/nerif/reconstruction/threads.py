@@ -21,7 +21,7 @@ from typing import NamedTuple, ParamSpec, TypeVar
 
 import torch
 
-from nerif.pauses import at_pauses
+from nerif.common.pauses import at_pauses
 
 __all__ = ["Cores", "free_threads", "on_free_cores", "share_threads"]
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.reconstruction.problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels import WeightedVoxelReconstructor
 

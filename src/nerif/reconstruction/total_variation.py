@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.reconstruction.problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels import WeightedVoxelReconstructor
 

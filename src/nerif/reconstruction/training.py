@@ -18,10 +18,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.pauses import pause
 from nerif.fields.base import Field
 from nerif.fields.mlp import UNBOUNDED
-from nerif.pauses import pause
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import check_resumed
 from nerif.reconstruction.budget import Budget

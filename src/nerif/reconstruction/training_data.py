@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.transfer import sent
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box
@@ -34,7 +35,6 @@ from nerif.reconstruction.sources import chosen_source, of_source, stages
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
 from nerif.techniques.base import ForwardModel
-from nerif.transfer import sent
 
 __all__ = ["FrameData", "TrainingData"]
 

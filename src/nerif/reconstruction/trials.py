@@ -29,7 +29,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera, Grid
 from nerif.measurement import Measurement

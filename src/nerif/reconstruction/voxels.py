@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES
 from nerif.geometry import Grid

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from nerif.imaging.calibration_result import Calibration
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from nerif.geometry import Ring
 from nerif.physics.design import DesignSettings, expect
 

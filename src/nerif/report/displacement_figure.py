@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from nerif.drawing import draw_map
 from nerif.measurement import Measurement
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerif import __version__
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from nerif.drawing import drawn_of, map_colours
 from nerif.evaluation import rms_text
 from nerif.meridian import Meridian

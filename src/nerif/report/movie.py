@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
+from nerif.common.installation import install
 from nerif.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
-from nerif.installing import install
 from nerif.report.isosurface import default_level, filled
 from nerif.volume import Volume, field_of
 from nerif.volume_sequence import VolumeSequence

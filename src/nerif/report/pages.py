@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from nerif.atomic import atomic
-from nerif.conventions import with_unit
+from nerif.common.conventions import with_unit
+from nerif.common.files import atomic
+from nerif.common.written_files import OwnFiles
 from nerif.drawing import (
     DIVERGING,
     add_colour_bar,
@@ -27,7 +28,6 @@ from nerif.drawing import (
     style,
 )
 from nerif.observation import Observation
-from nerif.own_files import OwnFiles
 from nerif.report.figures import draw_history, draw_line, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerif.atomic import atomic
+from nerif.common.files import atomic
 from nerif.geometry import Box, Camera
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.conventions import unit_shown
+from nerif.common.conventions import unit_shown
 from nerif.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, colour_range, drawn_of, shown
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerif.conventions import InputError, with_unit
+from nerif.common.conventions import InputError, with_unit
 from nerif.notebook import number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import frames_there

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nerif.conventions import with_unit
+from nerif.common.conventions import with_unit
 from nerif.drawing import LABELS, drawn_of, shown
 from nerif.evaluation import rms_text
 from nerif.notebook import number, percent, span

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerif.conventions import unit_shown
+from nerif.common.conventions import unit_shown
 from nerif.drawing import map_colours, map_range
 from nerif.measurement import Measurement
 from nerif.observation import Observation

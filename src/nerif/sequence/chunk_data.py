@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.transfer import sent
 from nerif.fields.mlp import UNBOUNDED
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Rays
@@ -29,7 +30,6 @@ from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.training import LEVEL_POINTS
 from nerif.reconstruction.training_data import FrameData, TrainingData
 from nerif.techniques.base import ForwardModel
-from nerif.transfer import sent
 
 __all__ = ["ChunkData"]
 

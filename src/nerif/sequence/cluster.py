@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from nerif import __version__
-from nerif.conventions import InputError
-from nerif.installing import install
+from nerif.common.conventions import InputError
+from nerif.common.installation import install
 from nerif.toml import check_known
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.evaluation import check_inside
 from nerif.json_file import write_json
 from nerif.metrics import volume_errors

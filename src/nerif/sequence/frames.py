@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Grid

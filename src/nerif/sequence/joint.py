@@ -14,10 +14,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.written_files import OwnFiles
 from nerif.fields.space_time import SpaceTimeField
 from nerif.measurement_sequence import MeasurementSequence
-from nerif.own_files import OwnFiles
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step, compose
 from nerif.reconstruction.files import CHECKPOINT, checkpoints, read_state
 from nerif.reconstruction.training import Training

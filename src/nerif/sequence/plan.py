@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF

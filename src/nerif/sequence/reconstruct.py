@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.interruption import Interrupted
 from nerif.geometry import Grid
-from nerif.interruption import Interrupted
 from nerif.measurement import Measurement
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.aperture import seen_through

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from nerif.conventions import with_unit
+from nerif.common.conventions import with_unit
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.sequence.frames import ATTEMPTS, reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly

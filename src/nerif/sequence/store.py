@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.atomic import atomic
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
+from nerif.common.files import atomic
+from nerif.common.netcdf import reading
+from nerif.common.written_files import OwnFiles, remove_empty
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.measurement_sequence import MeasurementSequence, add_frames, check_store
-from nerif.netcdf import reading
-from nerif.own_files import OwnFiles, remove_empty
 from nerif.reconstruction.bounds import in_units
 from nerif.volume import Volume
 from nerif.volume_sequence import FIELDS, VolumeSequence, score_names

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.techniques.base import ForwardModel, Light
 from nerif.techniques.line_integral import LineIntegral
 

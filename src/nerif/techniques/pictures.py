@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.geometry import Rays
 from nerif.techniques.base import ForwardModel, Light, Weights
 from nerif.techniques.deflection import LeverArm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.techniques import absorption, deflection
 from nerif.techniques.absorption import Absorption
 from nerif.techniques.base import ForwardModel, Light

@@ -20,7 +20,7 @@ from nerif.app.target_pictures import TargetPictures
 from nerif.app.workspace import Workspace
 from nerif.commands.calibrate import Calibrate
 from nerif.commands.settings import merge
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.calibration_result import ImageError
 from nerif.imaging.simple_rig import SimpleRig
 from nerif.imaging.targets import KINDS, CalibrationTarget

@@ -15,7 +15,7 @@ from nerif.app.histogram import histogram
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.imaging.crop import Crop
 from nerif.imaging.picture_looks import SourceLook
 from nerif.imaging.views import View

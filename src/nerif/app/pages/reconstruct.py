@@ -19,7 +19,7 @@ from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.commands.methods import RECORDS, Reconstruct
 from nerif.commands.sequence import Sequence
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.trials import KINDS

@@ -22,8 +22,8 @@ from nerif.app.workspace import Workspace
 from nerif.commands.export import Export
 from nerif.commands.figures import Figures
 from nerif.commands.movie import MovieCommand
+from nerif.common.installation import install
 from nerif.exports import FORMATS
-from nerif.installing import install
 from nerif.report.movie import STYLES
 from nerif.report.pages import JOURNALS
 

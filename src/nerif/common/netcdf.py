@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerif.conventions import InputError
+from nerif.common.conventions import InputError
 
 if TYPE_CHECKING:
     import xarray as xr
