@@ -30,7 +30,7 @@ VERSIONS = ("before", "now")
 
 def train(path: Path, seconds: float) -> int:
     """Return the steps of a run of so many seconds in this process."""
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural import NeRIF
 

@@ -17,6 +17,7 @@ from functools import partial
 import torch
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame
@@ -26,7 +27,6 @@ from nerif.reconstruction.fused import value_and_gradient
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import add_noise, simulate
-from nerif.volume import Volume
 
 
 def rate(work: Callable[[], object], points: int) -> float:

@@ -37,7 +37,7 @@ WARM = 3  # turns that are not counted
 
 def take_turns(work: str, data: Path) -> None:
     """Do the work in this process: wait for a line, do a turn, print its seconds a step, for ever."""
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
     from nerif.reconstruction.base import Reconstructor
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural import NeRIF

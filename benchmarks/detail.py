@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
-from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import predict_view
 from nerif.reconstruction.device import keep_freed_memory
@@ -26,7 +27,6 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.simulation import simulate
 from nerif.techniques.registry import forward_model
-from nerif.volume import Volume
 
 BOX = Box.cube(50.0)
 TRUTH = 100  # voxels along an edge

@@ -18,13 +18,13 @@ from dataclasses import replace
 import torch
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.encoding import DIRECTIONS
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import add_noise, simulate
-from nerif.volume import Volume
 
 PHANTOMS = ("1", "2", "3", "4", "5", "6", "7", "octahedron", "fire", "turbulence")
 NOISES = (0.05, 0.10, 0.15)

@@ -16,6 +16,7 @@ from dataclasses import replace
 import torch
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
@@ -23,7 +24,6 @@ from nerif.reconstruction.base import Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.simulation import add_noise, simulate
-from nerif.volume import Volume
 
 COLUMNS = (
     "preset", "noise", "L2", "L2 of variation", "CC", "SSIM", "steps", "epochs", "seconds", "memory [GiB]", "outcome",

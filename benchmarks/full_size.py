@@ -17,18 +17,18 @@ from pathlib import Path
 import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, paper_rig
-from nerif.measurement import Measurement
 from nerif.prediction import predict
 from nerif.reconstruction import bins
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
 from nerif.simulation import add_noise
-from nerif.volume import Volume
 
 COLUMNS = (
     "pixels", "edge of the bins [px]", "steps", "passes", "seconds", "memory [GiB]", "L2", "L2 of variation", "outcome",

@@ -18,18 +18,18 @@ from pathlib import Path
 import torch
 
 from bench import Table, add_write, alone
+from nerif.data.measurement import Measurement
+from nerif.data.reprojection import Reprojection
 from nerif.evaluation import evaluate_views
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.measurement import Measurement
 from nerif.members import all_quantities
 from nerif.physics.quantities import GasSettings
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.precision import MixedPrecision
 from nerif.reconstruction.warm_start import fit_network
-from nerif.reprojection import Reprojection
 from nerif.result import ResultDirectory
 from nerif.workflow import write_report
 

@@ -68,11 +68,11 @@ SHOWN = {"l2": "{:.3%}", "l2_variation": "{:.2%}", "residual": "{:.2f}", "second
 
 def simulated(case: Case, seed: int, folder: Path) -> tuple[Path, Path]:
     """Return the files of measurement and truth, made if they are not there."""
+    from nerif.data.volume import Volume
+    from nerif.data.volume_file import write_netcdf
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import Grid, paper_rig
     from nerif.simulation import add_noise, simulate
-    from nerif.volume import Volume
-    from nerif.volume_file import write_netcdf
 
     name = f"{case.phantom}-{case.pixels}-{case.noise:g}-{seed}"
     data, truth = folder / f"{name}.nc", folder / f"{name}.truth.nc"
@@ -90,8 +90,9 @@ def run(case: Case, seed: int, data: Path, truth: Path) -> dict[str, Any]:
     """Reconstruct in this process; return errors, seconds, the residual and why it ended."""
     import torch
 
+    from nerif.data.measurement import Measurement
+    from nerif.data.volume_file import read_volume
     from nerif.evaluation import evaluate_volume
-    from nerif.measurement import Measurement
     from nerif.physics.path_integral import PathIntegral, project
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.landweber import Landweber
@@ -99,7 +100,6 @@ def run(case: Case, seed: int, data: Path, truth: Path) -> dict[str, Any]:
     from nerif.reconstruction.tikhonov import Tikhonov
     from nerif.reconstruction.total_variation import TotalVariation
     from nerif.techniques.registry import forward_model
-    from nerif.volume_file import read_volume
 
     keep_freed_memory()
     methods = {kind.__name__: kind for kind in (NeRIF, TotalVariation, Tikhonov, Landweber)}

@@ -16,10 +16,11 @@ from typing import Literal
 import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.measurement import Measurement
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.landweber import Landweber
@@ -28,7 +29,6 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.voxels import VoxelReconstructor
 from nerif.simulation import add_noise, simulate
-from nerif.volume import Volume
 
 COLUMNS = (
     "phantom", "noise", "method", "grid", "L2", "L2 of variation", "CC", "SSIM", "seconds", "memory [GiB]",

@@ -24,19 +24,19 @@ from typing import Any
 from abel_peers import ORDERS, PEERS, ParallelView, Peer, Revolution, attempts, pyabel
 from bench import N_AMBIENT, Table, add_write
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Grid, Ring
-from nerif.measurement import Measurement
 from nerif.metrics import volume_errors
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.simulation import add_noise, simulate
-from nerif.volume import Volume
 
 BOX = Box.cube(50.0)
 EVALUATED = Box((-25.0, -25.0, -20.0), (25.0, 25.0, 20.0))

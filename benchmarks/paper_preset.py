@@ -17,10 +17,11 @@ from statistics import fmean
 from types import SimpleNamespace
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.measurement import Measurement
 from nerif.reconstruction import budget
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
@@ -28,7 +29,6 @@ from nerif.reconstruction.losses import DATA
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
 from nerif.simulation import simulate
-from nerif.volume import Volume
 
 METHODS = ("paper", "fast, equal steps", "fast, equal seconds")
 WHAT = ("steps", "CPU seconds", "L2 of variation", "CC")

@@ -13,6 +13,7 @@ import statistics
 from dataclasses import replace
 
 from bench import Table, add_write
+from nerif.data.volume import Volume
 from nerif.geometry import Grid
 from nerif.particles.cloud import Particles, quality_factor
 from nerif.particles.pictures import pictures
@@ -22,7 +23,6 @@ from nerif.particles.velocity import velocity_between
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.presets import preset
-from nerif.volume import Volume
 
 SECONDS, VOXEL = 1e-3, 0.1
 METHODS = ("MART", "MLEM", "NeRIF")

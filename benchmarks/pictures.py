@@ -20,17 +20,17 @@ import numpy as np
 import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.imaging.assembly import Scene, Surroundings, join_views
 from nerif.imaging.background import Background
 from nerif.imaging.displacement import DisplacementSettings, measure
-from nerif.measurement import Measurement
 from nerif.prediction import predict
 from nerif.rendering import Sensor, background_texture, pattern_size, render
-from nerif.volume import Volume
-from nerif.volume_file import read_volume, write_netcdf
 
 REFERENCES = 5
 CHECKER = "checker"

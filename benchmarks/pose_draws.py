@@ -18,9 +18,9 @@ from pathlib import Path
 import torch
 
 from bench import Table, add_write, alone
+from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
 from nerif.geometry.correction import GEOMETRY, Corrections
-from nerif.measurement import Measurement
 
 SIZES = {"small": (0.2, 0.01), "large": (0.5, 0.03)}
 """Standard deviation of each camera's place along each axis, mm, and of its turns about them, degrees."""
@@ -41,9 +41,9 @@ def turned(camera: Camera, degrees: float) -> Camera:
 
 def of_views(folder: Path, views: int, seed: int) -> Measurement:
     """Return the measurement by 5, 9 or 18 views, their cameras as they are."""
+    from nerif.data.volume_file import read_volume
     from nerif.fields.grid import VoxelField
     from nerif.prediction import predict
-    from nerif.volume_file import read_volume
 
     thin = Measurement.read(folder / "thin.nc")
     if views <= len(thin.cameras):
@@ -75,10 +75,10 @@ def knocked(measurement: Measurement, mm: float, degrees: float, seed: int) -> M
 def run(folder: Path, views: int, size: str, seed: int, refine: bool, steps: int) -> tuple[float, float]:
     """Reconstruct, and return L2 before and after the best rigid motion of the field."""
     from nerif.alignment import aligned
+    from nerif.data.volume_file import read_volume
     from nerif.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural import NeRIF
-    from nerif.volume_file import read_volume
 
     keep_freed_memory()
     mm, degrees = SIZES[size]

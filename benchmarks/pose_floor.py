@@ -25,13 +25,13 @@ from torch import Tensor
 
 from bench import Table, add_write, alone
 from nerif.alignment import Moved
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volume
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera
-from nerif.measurement import Measurement
 from nerif.reconstruction.refinement import Refinement
 from nerif.reconstruction.refit import refit
-from nerif.volume import Volume
-from nerif.volume_file import read_volume
 
 RIGS = ("pose_small", "pose_large")
 PIXELS, ROUNDS = 3000, 10  # of a view, and steps, to fit cameras to the truth

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from bench import N_AMBIENT
 from nerif.common.conventions import Points, Values, Vectors
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.turbulence import inertial_scalar
 from nerif.geometry import Box, Ring
-from nerif.measurement import Measurement
 from nerif.simulation import simulate
 
 __all__ = ["Bodies", "RandomFlow", "random_flow"]

@@ -58,8 +58,9 @@ def goals(name: str, method: str, way: Way) -> tuple[float | None, float | None]
 def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[str, Any]:
     """Reconstruct a file, and compare with the truth beside it."""
     from nerif.alignment import aligned
+    from nerif.data.measurement import Measurement
+    from nerif.data.volume_file import read_volume
     from nerif.evaluation import evaluate_views, evaluate_volume
-    from nerif.measurement import Measurement
     from nerif.prediction import reproject
     from nerif.reconstruction.aperture import seen_through
     from nerif.reconstruction.device import keep_freed_memory
@@ -67,7 +68,6 @@ def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[st
     from nerif.reconstruction.refined_rig import with_corrections
     from nerif.reconstruction.sources import of_source
     from nerif.reconstruction.total_variation import TotalVariation
-    from nerif.volume_file import read_volume
 
     keep_freed_memory()
     measurement = Measurement.read(path)

@@ -25,8 +25,9 @@ import numpy as np
 from bench import N_AMBIENT, Table, add_write
 from nerif.commands.simulate import Simulate, instants
 from nerif.commands.simulate import run as simulate
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Ring
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.metrics import volume_errors
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
@@ -36,7 +37,6 @@ from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.store import DONE, Frame, SequenceStore
 from nerif.simulation import Simulation
-from nerif.volume_sequence import VolumeSequence
 
 COLUMNS = (
     "views", "s between frames", "change", "how", "steps a frame", "seconds a frame", "L2", "L2 of variation", "CC",

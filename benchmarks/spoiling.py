@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from bench import N_AMBIENT
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring
 from nerif.geometry.correction import GEOMETRY, Corrections
-from nerif.measurement import Measurement
 from nerif.simulation import simulate
 from random_flows import random_flow
 

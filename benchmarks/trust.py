@@ -55,14 +55,14 @@ def case(
     from scipy.ndimage import gaussian_filter
     from scipy.stats import spearmanr
 
+    from nerif.data.volume import Volume
+    from nerif.data.volume_file import write_netcdf
     from nerif.evaluation import FLOW, evaluate
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import Box, Grid, Ring
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.result import ResultDirectory
     from nerif.simulation import simulate
-    from nerif.volume import Volume
-    from nerif.volume_file import write_netcdf
     from nerif.workflow import reconstruct_into
 
     keep_freed_memory()

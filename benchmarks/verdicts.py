@@ -72,6 +72,8 @@ def record(number: int, folder: Path, method: str, steps: int, pixels: int) -> R
 
 
 def _reconstructed(number: int, method: str, steps: int, pixels: int) -> dict[str, Any]:
+    from nerif.data.volume import Volume
+    from nerif.data.volume_file import write_netcdf
     from nerif.evaluation import evaluate
     from nerif.geometry import Grid
     from nerif.reconstruction.base import Reconstructor
@@ -79,8 +81,6 @@ def _reconstructed(number: int, method: str, steps: int, pixels: int) -> dict[st
     from nerif.reconstruction.neural import NeRIF
     from nerif.reconstruction.total_variation import TotalVariation
     from nerif.result import ResultDirectory
-    from nerif.volume import Volume
-    from nerif.volume_file import write_netcdf
     from nerif.workflow import Run, reconstruct_into
 
     keep_freed_memory()

@@ -16,9 +16,9 @@ from typing import Literal
 import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
+from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.measurement import Measurement
 from nerif.reconstruction.device import keep_freed_memory, peak_memory, resolve_device
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov

@@ -12,16 +12,16 @@ import argparse
 from dataclasses import replace
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.measurement import Measurement
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import preset
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.simulation import add_noise, simulate
-from nerif.volume import Volume
 
 COLUMNS = (
     "start", "fit steps", "rate after it", "seconds of the start", "seconds in all", "L2", "L2 of variation", "CC",

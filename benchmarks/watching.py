@@ -49,8 +49,8 @@ def steps_of(way: str, path: Path, preset_name: str, seconds: float, device: str
     """Return the steps a second of a run of so many seconds."""
     from dataclasses import replace
 
+    from nerif.data.measurement import Measurement
     from nerif.live import Live
-    from nerif.measurement import Measurement
     from nerif.monitor import QUIET
     from nerif.reconstruction.base import Step
     from nerif.reconstruction.device import keep_freed_memory

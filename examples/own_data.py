@@ -13,8 +13,8 @@ import sys
 import numpy as np
 import torch
 
+from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera, Plane
-from nerif.measurement import Measurement
 
 # What a calibration gives, one entry a camera. World frame and lengths in mm, image quantities in px.
 K = np.array([[2500.0, 0, 99.5], [0, 2500.0, 74.5], [0, 0, 1]])

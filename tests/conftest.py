@@ -45,10 +45,10 @@ CHECKED += tuple(f"reconstruction.{p.stem}" for p in SOLVERS.glob("[!_]*.py") if
 # shapes in annotations are checked on every call; the hook must be there before nerif is imported
 install_import_hook([f"nerif.{part}" for part in CHECKED], "typecheck.check")
 
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
-from nerif.measurement import Measurement
 from nerif.reconstruction import budget
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.voxels import VoxelReconstructor

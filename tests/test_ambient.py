@@ -10,14 +10,14 @@ import torch
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
+from nerif.data.volume_file import write_netcdf
 from nerif.evaluation import evaluate
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.result import ResultDirectory
 from nerif.simulation import Simulation, simulate
-from nerif.volume import Volume
-from nerif.volume_file import write_netcdf
 
 N_AMBIENT = 1.00027
 
@@ -83,11 +83,11 @@ def test_a_truth_over_an_unknown_ambient_is_refused(truth, perfect, tmp_path, ca
 
 def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_path):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
+    from nerif.data.measurement_sequence import MeasurementSequence
+    from nerif.data.volume_sequence import VolumeSequence
     from nerif.fields.mlp import Network, NetworkShape, NeuralField
-    from nerif.measurement_sequence import MeasurementSequence
     from nerif.sequence.evaluation import evaluate_sequence
     from nerif.sequence.store import Frame, SequenceStore
-    from nerif.volume_sequence import VolumeSequence
 
     shape, grid = NetworkShape(2, 8, 1), Grid(measurement.box, (6, 7, 8))
     sequence = MeasurementSequence.create(tmp_path / "m.zarr", [0.0], measurement)

@@ -16,12 +16,12 @@ import torch
 import xarray as xr
 
 from nerif.cli import main
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volumes, write_netcdf
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid
-from nerif.measurement import Measurement
 from nerif.reconstruction.base import Step
-from nerif.volume import Volume
-from nerif.volume_file import read_volumes, write_netcdf
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "3", "--steps", "30", "--truth-voxels", "12"]
 QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "80", "--tolerance", "1e-7"]

@@ -15,10 +15,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerif.cli import main
+from nerif.data.measurement import Measurement
+from nerif.data.volume_file import read_volume
 from nerif.imaging.cameras_file import read_cameras
-from nerif.measurement import Measurement
 from nerif.simulation import view_displacement
-from nerif.volume_file import read_volume
 
 BOX = ["--lower", "-25", "-25", "-25", "--upper", "25", "25", "25"]
 VIEWS = 4
@@ -298,7 +298,7 @@ def test_a_mirrored_camera_is_refused(copy, capsys):
 @pytest.mark.slow
 def test_many_flow_pictures_become_a_sequence(copy, capsys):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
-    from nerif.measurement_sequence import MeasurementSequence
+    from nerif.data.measurement_sequence import MeasurementSequence
 
     views = [folder for folder in sorted((copy / "pictures").iterdir()) if (folder / "flow").is_dir()]
     for folder in views:

@@ -18,8 +18,8 @@ import torch
 import xarray as xr
 
 from nerif.cli import main
+from nerif.data.measurement import Measurement
 from nerif.fields.grid import VoxelField
-from nerif.measurement import Measurement
 from nerif.reconstruction.files import read_field
 
 TINY = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "5", "--steps", "40", "--truth-voxels", "16"]

@@ -13,11 +13,11 @@ import pytest
 import xarray as xr
 
 from nerif.cli import main
+from nerif.data.volume_file import read_volumes
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import Outcome
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.report.pages import slices
-from nerif.volume_file import read_volumes
 from nerif.workflow import Run, reconstruct_into
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "4", "--steps", "30", "--truth-voxels", "12"]

@@ -10,9 +10,9 @@ from scipy.ndimage import gaussian_filter
 
 from nerif.cli import main
 from nerif.consistency import check_consistency
+from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring, paper_rig
-from nerif.measurement import Measurement
 from nerif.quick_views import binned, fit, without_spikes
 from nerif.simulation import simulate
 from nerif.symptoms import open_faces

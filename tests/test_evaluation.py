@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from nerif.common.conventions import Points, Values, Vectors
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary, VoxelField
@@ -18,7 +19,6 @@ from nerif.physics.path_integral import PathIntegral, project
 from nerif.prediction import predict_view, reproject
 from nerif.result import METRICS, ResultDirectory
 from nerif.techniques.deflection import MODELS
-from nerif.volume import Volume
 
 
 class Scaled(Field):

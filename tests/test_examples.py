@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

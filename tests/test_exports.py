@@ -9,11 +9,11 @@ import pytest
 import torch
 import xarray as xr
 
-from nerif.exports import FORMATS, export
+from nerif.data.exports import FORMATS, export
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volumes
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, GasSettings, derive
-from nerif.volume import Volume
-from nerif.volume_file import read_volumes
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
 

@@ -12,11 +12,11 @@ import torch
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.halves import Reflection, departures, halved, kept_half, left_of_axis
-from nerif.measurement import Measurement
 from nerif.monitor import Monitor
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.result import ResultDirectory

@@ -8,14 +8,14 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from nerif.cli import main
+from nerif.data.meridian import Meridian
+from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, paper_rig
 from nerif.geometry.symmetry import Symmetry
-from nerif.meridian import Meridian
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles
 from nerif.result import ResultDirectory
 from nerif.simulation import simulate
-from nerif.volume import Volume
 
 
 def test_it_is_the_field_around_the_axis():

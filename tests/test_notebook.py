@@ -16,12 +16,12 @@ import pytest
 import torch
 
 import nerif
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
-from nerif.measurement import Measurement
 from nerif.notebook import VIEWS, panel, show_views
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.volume import Volume
 
 
 @pytest.mark.parametrize("name", nerif.__all__)

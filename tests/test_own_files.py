@@ -205,8 +205,8 @@ def test_pictures_that_were_not_rendered_are_not_rendered_over(tmp_path):
 
 def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
-    from nerif.measurement_sequence import MEASURED, check_store
-    from nerif.volume_sequence import FIELDS
+    from nerif.data.measurement_sequence import MEASURED, check_store
+    from nerif.data.volume_sequence import FIELDS
 
     def store(name: str, attributes: dict, *arrays: str) -> Path:
         for part in ("", *arrays):
@@ -228,7 +228,7 @@ def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
 
 def test_a_film_is_not_overwritten_by_its_own_reconstruction(tmp_path, capsys):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
-    from nerif.measurement_sequence import MeasurementSequence
+    from nerif.data.measurement_sequence import MeasurementSequence
     from sequence_films import QUICK, simulated
 
     film = simulated(tmp_path / "film.zarr", 2)

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from nerif import prediction
+from nerif.data.measurement import Measurement
+from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
-from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import SampledViews, on_voxels, reproject
-from nerif.reprojection import Accuracy, Reprojection
 from nerif.techniques.deflection import MODELS, Deflection
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.resampling import common_grid, difference, resampled
-from nerif.volume import Volume
 
 
 def sloping(grid: Grid) -> Volume:

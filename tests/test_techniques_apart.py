@@ -11,11 +11,11 @@ import torch
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.evaluation import evaluate
 from nerif.fields.phantoms import GaussianBalls
 from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Ring
-from nerif.measurement import Measurement
 from nerif.prediction import predict
 from nerif.quick_views import binned
 from nerif.reconstruction.tikhonov import Tikhonov

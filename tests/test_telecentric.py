@@ -13,10 +13,11 @@ import torch
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.consistency import binned
+from nerif.data.measurement import Measurement, measurement_of
+from nerif.data.volume import Volume
 from nerif.fields.grid import Boundary
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
 from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
-from nerif.measurement import Measurement, measurement_of
 from nerif.physics.path_integral import PathIntegral
 from nerif.physics.quantities import GasSettings, derive
 from nerif.physics.ray_tracing import background_points
@@ -33,7 +34,6 @@ from nerif.simulation import simulate, view_displacement
 from nerif.techniques.absorption import Absorption
 from nerif.techniques.deflection import LeverArm
 from nerif.techniques.registry import TECHNIQUES, forward_model
-from nerif.volume import Volume
 
 AMBIENT = 1.00027
 

@@ -10,9 +10,9 @@ import torch
 
 from nerif.cli import main
 from nerif.consistency import check_consistency
+from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring
-from nerif.measurement import Measurement
 from nerif.mistakes import Change, Correction, of_one_view, orders
 from nerif.quick_views import compare, predicted_by_others
 from nerif.residuals import CAUSES

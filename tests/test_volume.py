@@ -10,10 +10,10 @@ import torch
 import xarray as xr
 
 from nerif.common.conventions import InputError
-from nerif.exports import export
+from nerif.data.exports import export
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.geometry import Box, Grid
-from nerif.volume import Volume
-from nerif.volume_file import read_volume, write_netcdf
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
 VALUES = torch.arange(60, dtype=torch.float32).reshape(5, 3, 4) * 1e-6

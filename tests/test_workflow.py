@@ -110,7 +110,7 @@ def test_projecting_takes_the_model_of_the_run(made, measurement, tmp_path):
     out, path = made[0], tmp_path / "p.nc"
     measurement.write(tmp_path / "m.nc")
     words = ["project", str(out.path), "-o", str(path), "--cameras", str(tmp_path / "m.nc"), "--names", "72deg"]
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
 
     seen = {}
     for chosen in ("", "paraxial", "lever_arm"):

@@ -2,10 +2,15 @@
 
 from .common.conventions import InputError as InputError
 from .consistency import check_consistency as check_consistency
+from .data.exports import export as export
+from .data.measurement import Measurement as Measurement
+from .data.reprojection import Reprojection as Reprojection
+from .data.volume import Volume as Volume
+from .data.volume_file import read_volume as read_volume
+from .data.volume_file import read_volumes as read_volumes
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluate_views as evaluate_views
 from .evaluation import evaluate_volume as evaluate_volume
-from .exports import export as export
 from .fields.phantoms import make_phantom as make_phantom
 from .geometry import Box as Box
 from .geometry import Camera as Camera
@@ -13,7 +18,6 @@ from .geometry import Grid as Grid
 from .geometry import Plane as Plane
 from .geometry import Ring as Ring
 from .geometry import paper_rig as paper_rig
-from .measurement import Measurement as Measurement
 from .physics.quantities import GasSettings as GasSettings
 from .physics.quantities import derive as derive
 from .prediction import predict as predict
@@ -26,16 +30,12 @@ from .reconstruction.neural import NeRIF as NeRIF
 from .reconstruction.presets import preset as preset
 from .reconstruction.tikhonov import Tikhonov as Tikhonov
 from .reconstruction.total_variation import TotalVariation as TotalVariation
-from .reprojection import Reprojection as Reprojection
 from .result import ResultDirectory as ResultDirectory
 from .sequence.plan import SequenceSettings as SequenceSettings
 from .sequence.reconstruct import reconstruct_sequence as reconstruct_sequence
 from .simulation import Simulation as Simulation
 from .simulation import add_noise as add_noise
 from .simulation import simulate as simulate
-from .volume import Volume as Volume
-from .volume_file import read_volume as read_volume
-from .volume_file import read_volumes as read_volumes
 from .workflow import Run as Run
 from .workflow import reconstruct_into as reconstruct_into
 from .workflow import write_report as write_report

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import Points, Values, Vectors
+from nerif.data.volume import Volume
 from nerif.fields.base import Field, in_chunks
 from nerif.geometry.correction import turned
-from nerif.volume import Volume
 
 __all__ = ["Moved", "aligned"]
 

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
+from nerif.data.measurement import Measurement
+from nerif.data.volume import INDEX
 from nerif.geometry import Grid
 from nerif.geometry.plausibility import rig_findings
-from nerif.measurement import Measurement
 from nerif.mistakes import Correction, everywhere, exchanges, of_one_view, orders
 from nerif.observation import Observation, integrals_of
 from nerif.quick_views import (
@@ -35,7 +36,6 @@ from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.threads import on_free_cores
 from nerif.symptoms import looks, open_faces
 from nerif.unrelated import NOISY, repeatable, unrelated, unrelated_finding
-from nerif.volume import INDEX
 
 __all__ = ["Consistency", "ViewAgreement", "check_consistency"]
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.consistency import Consistency
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
 from nerif.mistakes import Correction
 from nerif.observation import integrals_of
 

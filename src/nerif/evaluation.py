@@ -15,24 +15,24 @@ from torch import Tensor
 
 from nerif.alignment import aligned
 from nerif.common.conventions import InputError, with_unit
+from nerif.data.measurement import Measurement
+from nerif.data.reprojection import Reprojection
+from nerif.data.volume import INDEX, Volume
+from nerif.data.volume_file import read_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.gains import gains_of, with_gains
 from nerif.geometry import Box
 from nerif.halves import kept_half
-from nerif.measurement import Measurement
 from nerif.metrics import coverage, slice_metrics, view_metrics, volume_metrics
 from nerif.notebook import number
 from nerif.observation import Observation
 from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.refined_rig import with_corrections
-from nerif.reprojection import Reprojection
 from nerif.residuals import leftover, white_noise
 from nerif.result import METRICS, VOLUME, ResultDirectory
 from nerif.techniques.registry import AUTO, forward_model
-from nerif.volume import INDEX, Volume
-from nerif.volume_file import read_volume
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN, OwnFiles
+from nerif.data.volume import Volume
+from nerif.data.volume_file import write_netcdf
 from nerif.fields.base import Field
 from nerif.geometry import Box, Camera, Grid
 from nerif.imaging.background import Background
@@ -24,8 +26,6 @@ from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.targets import CalibrationTarget
 from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
 from nerif.toml import write_toml
-from nerif.volume import Volume
-from nerif.volume_file import write_netcdf
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "side_of_one", "target_poses", "world_axes"]
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.evaluation import evaluate_views, rms_text
 from nerif.halves import HALVES, kept_half
 from nerif.json_file import write_json
 from nerif.kept_run import KeptRun
-from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
 from nerif.prediction import reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor

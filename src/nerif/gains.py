@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.techniques.registry import forward_model
 

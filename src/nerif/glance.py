@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from nerif.data.volume import Volume
 from nerif.reconstruction.files import FIELD
 from nerif.result import METRICS, RUN, UNREADABLE, VOLUME, Missing, Result, ResultDirectory
-from nerif.volume import Volume
 
 __all__ = ["glance"]
 

@@ -21,9 +21,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
 from nerif.geometry.symmetry import Symmetry
-from nerif.measurement import Measurement
 from nerif.observation import Observation
 
 __all__ = [

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step, compose
 from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, write_state

@@ -22,10 +22,11 @@ import torch
 
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
 from nerif.json_file import write_json
-from nerif.measurement import Measurement
 from nerif.monitor import Monitor
 from nerif.observation import Observation
 from nerif.physics.path_integral import PathIntegral, project
@@ -34,7 +35,6 @@ from nerif.reconstruction.trials import best_covered
 from nerif.result import LIVE, LIVE_LOOK
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import AUTO, forward_model
-from nerif.volume import Volume, describe
 
 __all__ = ["Live", "Look", "read_live", "read_look"]
 

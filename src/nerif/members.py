@@ -11,18 +11,18 @@ from typing import Any
 
 import torch
 
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, rms_text
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 from nerif.kept_run import KeptRun
-from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.repetition import Found, Maps, Repetitions, certainty
 from nerif.result import ResultDirectory
-from nerif.volume import Volume
 
 __all__ = ["Members", "all_quantities"]
 

@@ -16,7 +16,7 @@ from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES, forward_model
 
 if TYPE_CHECKING:
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
 
 __all__ = ["Observation", "arguments_of", "cameras_of", "check_maps", "check_observations", "integrals_of"]
 

@@ -12,21 +12,21 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
+from nerif.data.measurement import Measurement, measurement_of
+from nerif.data.reprojection import Accuracy, Reprojection
+from nerif.data.volume import name_of
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import NeuralField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.geometry import Box, Camera, Grid, Rays
-from nerif.measurement import Measurement, measurement_of
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, Projector, project
 from nerif.physics.ray_tracing import CurvedRays
 from nerif.reconstruction.operator import rays_through
 from nerif.reconstruction.symmetric_operator import seen_of
 from nerif.reconstruction.threads import on_free_cores
-from nerif.reprojection import Accuracy, Reprojection
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
-from nerif.volume import name_of
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.data.measurement import Measurement, measurement_of
 from nerif.fields.base import Field
-from nerif.measurement import Measurement, measurement_of
 from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import predict_view
 from nerif.reconstruction.tikhonov import Tikhonov

@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.geometry import Box, Grid
-from nerif.volume import Volume
 
 __all__ = ["common_grid", "difference", "resampled"]
 

@@ -17,20 +17,20 @@ from nerif import __version__
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.written_files import WARN, OwnFiles, remove_empty
-from nerif.exports import export
+from nerif.data.exports import export
+from nerif.data.measurement import Measurement
+from nerif.data.meridian import Meridian
+from nerif.data.reprojection import Reprojection
+from nerif.data.volume import INDEX, Volume, field_of
+from nerif.data.volume_file import read_volume, read_volumes
 from nerif.fields.base import Field
 from nerif.geometry import Box
 from nerif.geometry.symmetry import Symmetry
 from nerif.json_file import write_json
-from nerif.measurement import Measurement
-from nerif.meridian import Meridian
 from nerif.reconstruction import files as kept
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
-from nerif.reprojection import Reprojection
 from nerif.toml import read_toml, write_toml
-from nerif.volume import INDEX, Volume, field_of
-from nerif.volume_file import read_volume, read_volumes
 
 __all__ = [
     "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions",

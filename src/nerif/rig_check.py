@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerif.common.findings import Finding
+from nerif.data.measurement import Measurement
 from nerif.geometry.plausibility import rig_findings
-from nerif.measurement import Measurement
 from nerif.monitor import QUIET, Monitor
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.neural import NeRIF

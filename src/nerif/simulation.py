@@ -16,19 +16,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
+from nerif.data.measurement import Measurement, measurement_of
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.volume import INDEX, Volume
+from nerif.data.volume_file import read_volume
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Box, Camera, Grid, Rays
-from nerif.measurement import Measurement, measurement_of
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.ray_tracing import background_points
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, TECHNIQUES, check_simulated, forward_model, technique
-from nerif.volume import INDEX, Volume
-from nerif.volume_file import read_volume
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["Simulation", "add_noise", "add_quantum_noise", "simulate", "view_displacement"]
 

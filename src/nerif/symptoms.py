@@ -11,8 +11,8 @@ from torch import Tensor
 
 from nerif.common.conventions import FACES
 from nerif.common.findings import Finding
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.measurement import Measurement
 from nerif.prediction import predict_view
 from nerif.quick_views import path_integral, values_of
 from nerif.reconstruction.gauge import ambient_faces

@@ -16,8 +16,8 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
+from nerif.data.measurement import Measurement
 from nerif.geometry.plausibility import suspects
-from nerif.measurement import Measurement
 from nerif.mistakes import orders
 from nerif.quick_views import compare, predicted_by_others, values_of, with_values
 

@@ -28,11 +28,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nerif.data.volume import field_of
 from nerif.halves import camera_of
 from nerif.residuals import CAUSES
 from nerif.result import Result
 from nerif.techniques.registry import TECHNIQUES
-from nerif.volume import field_of
 
 __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 

@@ -12,6 +12,9 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
+from nerif.data.measurement import Measurement
+from nerif.data.volume import quantities_of
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
 from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
@@ -19,7 +22,6 @@ from nerif.gains import fit_gains, with_gains
 from nerif.halves import departure_sentence, departures, halved
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.live import Live
-from nerif.measurement import Measurement
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import NOT_UNIFORM, GasSettings, masked_lines
@@ -49,8 +51,6 @@ from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.result import CALIBRATION, REPORT, ResultDirectory, versions
 from nerif.verdict import verdict
-from nerif.volume import quantities_of
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["METHODS", "Run", "reconstruct_into", "write_report", "write_sequence_report"]
 

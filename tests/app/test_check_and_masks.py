@@ -12,9 +12,9 @@ import torch
 
 from app.serving import opened
 from app.test_pages import put
+from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.measurement import Measurement
 from nerif.simulation import simulate
 from report.browsing import errors, needs_browser, text, wait_for
 

@@ -19,15 +19,15 @@ from nerif.app.result_look import ResultLook
 from nerif.app.result_table import rows_of
 from nerif.app.sources import Film, Still
 from nerif.common.conventions import InputError
-from nerif.exports import export
+from nerif.data.exports import export
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volumes
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.result import ResultDirectory
-from nerif.volume import Volume
-from nerif.volume_file import read_volumes
-from nerif.volume_sequence import VolumeSequence
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
 BOX = Box((-25.0, -24.0, -20.0), (25.0, 24.0, 20.0))

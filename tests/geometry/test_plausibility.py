@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera, Plane, Ring, paper_rig
 from nerif.geometry.plausibility import likely_cause, rig_findings
-from nerif.measurement import Measurement
 
 BOX = Box((-25.0, -20.0, -15.0), (20.0, 25.0, 30.0))
 RIGS = sorted(Path(__file__).parents[3].glob("shared/data/rigs/*.nc"))

@@ -11,10 +11,10 @@ import torch
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.imaging.masks import MaskSettings, drawn_masks, flow_mask, read_mask, with_flow_masks
-from nerif.measurement import Measurement
 from nerif.reconstruction.gauge import visual_hull
 from nerif.simulation import simulate
 from nerif.techniques.emission import Emission

@@ -18,21 +18,21 @@ import torch
 from mutation.mutators import make
 from nerif.cli import main
 from nerif.common.conventions import InputError
-from nerif.exports import export
+from nerif.data.exports import export
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Grid, Ring
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.importers import import_cameras
-from nerif.measurement import Measurement
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.sequence.store import Frame, SequenceStore
 from nerif.simulation import simulate
-from nerif.volume import Volume
-from nerif.volume_file import read_volume, write_netcdf
 
 pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 

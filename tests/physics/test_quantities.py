@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid
 from nerif.physics.gas_optics import ambient_index
 from nerif.physics.quantities import NOT_UNIFORM, GasChanges, GasSettings, derive, derive_all, deviation
-from nerif.volume import Volume
 
 
 def test_hot_air_from_its_index():

@@ -12,11 +12,12 @@ import xarray as xr
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.consistency import check_consistency
+from nerif.data.measurement import Measurement
+from nerif.data.volume_file import read_volume
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Lens, Ring
-from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.prediction import predict_view, reproject
 from nerif.reconstruction.aperture import lens_rays, seen_through
@@ -33,7 +34,6 @@ from nerif.result import ResultDirectory
 from nerif.simulation import simulate, view_displacement
 from nerif.techniques.pictures import Pictures
 from nerif.techniques.registry import forward_model
-from nerif.volume_file import read_volume
 
 BOX = Box.cube(50.0)
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(14, 16), pixel_pitch=0.25)

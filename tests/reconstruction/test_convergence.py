@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import measurement_of
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Grid, paper_rig
-from nerif.measurement import measurement_of
 from nerif.reconstruction import convergence, objective
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.convergence import Cycles
@@ -24,7 +25,6 @@ from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import add_noise
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.interferometry import Interferometry
-from nerif.volume import Volume
 
 ENDLESS = NeRIF(
     network=NetworkShape(depth=2, width=32, octaves=2), samples=(12, 16), points_per_batch=512, first_cycle=40,

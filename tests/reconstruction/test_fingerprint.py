@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.fields.mlp import NetworkShape
 from nerif.geometry import Box
-from nerif.measurement import Measurement
 from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.neural import NeRIF

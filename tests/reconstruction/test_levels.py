@@ -8,9 +8,9 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import GaussianBalls, make_phantom
 from nerif.geometry import Box, Grid, Ring, paper_rig
-from nerif.measurement import Measurement
 from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.layout import InSpace

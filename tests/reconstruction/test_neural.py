@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.mlp import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.measurement import Measurement
 from nerif.reconstruction import bins, objective, training
 from nerif.reconstruction.base import Reconstruction, Step
 from nerif.reconstruction.files import read_state, write_state
@@ -26,7 +27,6 @@ from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import simulate
 from nerif.techniques.base import Weights
-from nerif.volume import Volume
 
 SMALL = NeRIF(
     network=NetworkShape(depth=2, width=32, octaves=2),

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.geometry.correction import GEOMETRY, Corrections
-from nerif.measurement import Measurement
 from nerif.reconstruction.refined_numbers import NAMES
 from nerif.reconstruction.refined_rig import UNTOLD, moved_lines, with_corrections
 from nerif.reconstruction.refinement import Refinement

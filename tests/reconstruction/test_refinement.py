@@ -12,11 +12,12 @@ import torch
 from nerif.alignment import Moved, aligned
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.imaging.cameras_file import read_cameras
-from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.refined_numbers import NAMES, displaced
@@ -26,7 +27,6 @@ from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import simulate
 from nerif.techniques.absorption import Absorption
-from nerif.volume import Volume
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
 RING = Ring(views=5, arc=(0.0, 144.0), image_size=(24, 26), pixel_pitch=0.15)
@@ -304,7 +304,7 @@ def test_the_command_line_refines_writes_and_evaluates(measured, tmp_path, capsy
     wrong, _ = spoiled(measured)
     grid = Grid.of_resolution(BOX, 24)
     truth = Volume.of(BALLS.sample(grid), grid, "index_excess", 1.00027)
-    from nerif.volume_file import write_netcdf
+    from nerif.data.volume_file import write_netcdf
 
     write_netcdf(tmp_path / "truth.nc", [truth])
     wrong.write(tmp_path / "m.nc")

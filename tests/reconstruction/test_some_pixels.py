@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerif.data.measurement import Measurement, measurement_of
 from nerif.geometry import paper_rig
-from nerif.measurement import Measurement, measurement_of
 from nerif.reconstruction.some_pixels import some_pixels
 from nerif.techniques.deflection import Deflection
 from nerif.techniques.interferometry import Interferometry

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid, Ring
 from nerif.physics.quantities import GasSettings
@@ -17,7 +18,6 @@ from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.repetition import VOXELS, Found, Member
 from nerif.reconstruction.trials import BLOCK, LOST, WIDTH, Deviations, Trials, best_covered
-from nerif.volume import Volume
 
 AMBIENT = 1.00027
 

@@ -10,6 +10,7 @@ import torch
 from safetensors import SafetensorError
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
@@ -22,7 +23,6 @@ from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.volume import Volume
 
 METHODS = [
     Tikhonov(voxels=24, device="cpu"),

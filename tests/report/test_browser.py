@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from nerif.cli import main
+from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.report import html
 from nerif.report.packing import relation
 from nerif.report.pages import error_of
 from nerif.result import Result, ResultDirectory
-from nerif.volume import Volume
 from report.browsing import (
     choose,
     drag,

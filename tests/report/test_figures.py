@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 
 from nerif import drawing
 from nerif.cli import main
+from nerif.data.measurement import Measurement
+from nerif.data.reprojection import Reprojection
+from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid, Ring
-from nerif.measurement import Measurement
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
 from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, view
-from nerif.reprojection import Reprojection
 from nerif.result import Result, ResultDirectory
-from nerif.volume import Volume
 
 
 @pytest.fixture

@@ -16,11 +16,11 @@ from imageio_ffmpeg import get_ffmpeg_exe
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.report.movie import Movie, _points, _surfaces, frames_there, instants
-from nerif.volume import Volume
-from nerif.volume_sequence import VolumeSequence
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def _whole(volume: Volume) -> Volume:
 
 def test_only_frames_that_are_there_are_drawn(store, tmp_path):
     assert frames_there(store) == [0, 1, 2]
-    from nerif.volume_sequence import add_frames
+    from nerif.data.volume_sequence import add_frames
 
     path = tmp_path / "v.zarr"
     partial = VolumeSequence.create(path, store.times, store.grid, ("index_excess",), 1.00027)

@@ -13,6 +13,8 @@ import torch
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.reprojection import Reprojection
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views
 from nerif.geometry import Box, Grid
 from nerif.notebook import number
@@ -22,9 +24,7 @@ from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
 from nerif.report.summary import LEVELS, Statement, trust
 from nerif.report.view_images import _shrink, lattice_step, view_images
-from nerif.reprojection import Reprojection
 from nerif.result import Result, ResultDirectory
-from nerif.volume import Volume
 from report.page_reading import quantity_of, unpack
 
 PARTS = ("run.toml", "metrics.json", "history.csv", "volume.nc", "reprojection.nc")

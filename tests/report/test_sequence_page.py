@@ -13,13 +13,13 @@ pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
+from nerif.data.volume_sequence import VolumeSequence, add_frames
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.report import sequence_page
 from nerif.report.sequence_page import render_sequence
-from nerif.volume import Volume
-from nerif.volume_sequence import VolumeSequence, add_frames
 from report.browsing import errors, needs_browser, picture, requests, show, text, wait_for
 
 GAS = {"composition": "air", "wavelength_nm": 532.0, "pressure_pa": 101325.0}

@@ -9,10 +9,10 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
+from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.report.isosurface import stl_of
 from nerif.report.slice_pictures import bar_picture, slice_aspect, slice_picture
-from nerif.volume import Volume
 
 
 def pixels(address: str) -> np.ndarray:

@@ -9,10 +9,10 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.metrics import LEVELS, coverage
 from nerif.report.uncertainty_figure import WIDE, banded, draw_bands, draw_reliability
-from nerif.volume import Volume
 
 GRID = Grid(Box((-4.0, -3.0, -2.0), (4.0, 3.0, 2.0)), (4, 6, 8))
 

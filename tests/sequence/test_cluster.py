@@ -30,7 +30,7 @@ pytest.importorskip("distributed", reason="pip install '.[sequence]'")
 from nerif import __version__
 from nerif.cli import main
 from nerif.common.conventions import InputError
-from nerif.measurement_sequence import MeasurementSequence
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.sequence import cluster
 from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
 from nerif.sequence.plan import SequenceSettings

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from nerif.common.conventions import InputError
-from nerif.measurement_sequence import MeasurementSequence
-from nerif.volume_sequence import VolumeSequence
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.volume_sequence import VolumeSequence
 
 
 class Evil:

@@ -15,9 +15,9 @@ import zarr
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.symmetric import symmetry_of_field
 from nerif.geometry import Grid
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.symmetry import with_axis
 from nerif.sequence import frames
 from nerif.sequence.frames import reconstruct_frames

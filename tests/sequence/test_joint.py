@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from nerif.cli import main
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.fields.space_time import AtTimes, SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Box, Grid
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction import files, training
 from nerif.reconstruction.base import State
 from nerif.reconstruction.losses import LossWeights

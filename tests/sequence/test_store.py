@@ -15,11 +15,13 @@ import xarray as xr
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.volume import Volume
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.mlp import Network, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, Ring
-from nerif.measurement import Measurement
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.report.movie import Movie
 from nerif.report.sequence_page import render_sequence
 from nerif.sequence.evaluation import evaluate_sequence
@@ -28,8 +30,6 @@ from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.run import outcome_table
 from nerif.sequence.store import SequenceStore
 from nerif.simulation import Simulation
-from nerif.volume import Volume
-from nerif.volume_sequence import VolumeSequence
 from sequence_films import COLD, RIG, blank
 
 

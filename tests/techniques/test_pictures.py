@@ -14,11 +14,12 @@ from scipy.ndimage import map_coordinates
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.mlp import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Grid, Ring
-from nerif.measurement import Measurement
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.operator import VoxelOperator
@@ -32,7 +33,6 @@ from nerif.techniques.interferometry import Interferometry
 from nerif.techniques.pictures import Pictures
 from nerif.techniques.registry import forward_model
 from nerif.techniques.warped import References
-from nerif.volume import Volume
 
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
 RING = Ring(views=4, image_size=(38, 43), pixel_pitch=0.06, distance=400.0, background_distance=300.0)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement, measurement_of
 from nerif.evaluation import evaluate_views
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
@@ -21,7 +22,6 @@ from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls, Scaled
 from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Grid, Lens, Rays, Ring
-from nerif.measurement import Measurement, measurement_of
 from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstructor, State

@@ -11,10 +11,10 @@ from nicegui import ui
 from nerif.app.box_scene import BoxScene
 from nerif.app.result_answers import live_address
 from nerif.common.conventions import unit_shown
+from nerif.data.volume import describe, name_of
 from nerif.geometry import Box
 from nerif.live import Look
 from nerif.report.isosurface import default_level, surface_triangles
-from nerif.volume import describe, name_of
 
 __all__ = ["LiveSurface", "said_of"]
 

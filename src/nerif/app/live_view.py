@@ -16,12 +16,12 @@ from nerif.app.live_surface import LiveSurface, said_of
 from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import unit_shown
+from nerif.data.volume import name_of
 from nerif.drawing import colour_range, map_range
 from nerif.geometry import Box
 from nerif.live import Look, read_live, read_look
 from nerif.report.view_images import picture_address
 from nerif.result import LIVE, LIVE_LOOK
-from nerif.volume import name_of
 
 __all__ = ["LiveView", "curve_options", "look_html", "told"]
 

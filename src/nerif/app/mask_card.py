@@ -18,9 +18,9 @@ from nerif.app.project import OWN
 from nerif.app.view_maps import magnitude_address, threshold_address
 from nerif.app.workspace import Workspace
 from nerif.commands.mask import Mask
+from nerif.data.measurement import Measurement
 from nerif.imaging.mask_shapes import write_masks
 from nerif.imaging.masks import MaskSettings
-from nerif.measurement import Measurement
 
 __all__ = ["MaskCard"]
 

@@ -10,6 +10,7 @@ from nicegui import ui
 
 from nerif.app.project import Contents, Project
 from nerif.common.conventions import InputError
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.evaluation import rms_text
 from nerif.glance import glance
 from nerif.reconstruction.files import FIELD
@@ -17,7 +18,6 @@ from nerif.report.movie import frames_there
 from nerif.report.summary import trust_figures
 from nerif.result import LIVE, METRICS, RUN, VOLUME, Result
 from nerif.verdict import verdict
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["Row", "result_table", "rows_of"]
 

@@ -11,9 +11,9 @@ from nicegui import ui
 
 from nerif.app.range_slider import RangeSlider
 from nerif.app.workspace import Workspace
+from nerif.data.volume import Volume
 from nerif.geometry import Grid
 from nerif.report.slice_pictures import bar_picture, slice_aspect, slice_picture
-from nerif.volume import Volume
 
 __all__ = ["Panel", "SlicesView"]
 

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Protocol
 
 from nerif.common.conventions import STATISTICS, InputError
+from nerif.data.volume import INDEX, Volume
+from nerif.data.volume_file import read_volumes
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.drawing import colour_range, shown
 from nerif.report.isosurface import default_level
 from nerif.report.movie import frames_there, ranges_over_time
 from nerif.report.packing import coarsen
 from nerif.result import VOLUME
-from nerif.volume import INDEX, Volume
-from nerif.volume_file import read_volumes
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["Film", "Source", "Still", "source_of"]
 

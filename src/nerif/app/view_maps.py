@@ -6,8 +6,8 @@ from html import escape
 
 import torch
 
+from nerif.data.measurement import Measurement
 from nerif.imaging.masks import MaskSettings, with_flow_masks
-from nerif.measurement import Measurement
 from nerif.observation import integrals_of
 from nerif.report.view_images import picture_address
 

@@ -14,6 +14,7 @@ import tyro
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration import CalibrationSettings, calibrate_views, target_pictures
 from nerif.imaging.calibration_result import MOUNT, Calibration
@@ -22,7 +23,6 @@ from nerif.imaging.importers import ImportSettings, import_box, import_cameras, 
 from nerif.imaging.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
 from nerif.imaging.targets import CalibrationTarget
 from nerif.imaging.views import find_views
-from nerif.measurement import Measurement
 
 __all__ = ["Calibrate", "main", "run"]
 

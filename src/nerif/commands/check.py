@@ -13,7 +13,7 @@ from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.consistency import Consistency, check_consistency
 from nerif.corrected import corrected
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
 from nerif.rig_check import RigCheck, check_rig
 
 __all__ = ["Check", "main", "run"]

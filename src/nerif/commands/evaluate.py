@@ -12,8 +12,8 @@ import tyro
 from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
+from nerif.data.volume import INDEX, name_of
 from nerif.evaluation import FLOW, evaluate, rms_text
-from nerif.volume import INDEX, name_of
 
 __all__ = ["Evaluate", "main", "run"]
 

@@ -11,11 +11,11 @@ import tyro
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
-from nerif.exports import FORMATS, export
+from nerif.data.exports import FORMATS, export
+from nerif.data.volume import Volume, quantities_of
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, derive, masked_lines
 from nerif.result import ResultDirectory
-from nerif.volume import Volume, quantities_of
 
 __all__ = ["Export", "main", "run"]
 

@@ -15,14 +15,14 @@ from nerif.commands.output import say
 from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.netcdf import opened
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_file import known_conventions
+from nerif.data.volume import INDEX, Volume, name_of
+from nerif.data.volume_file import read_volume
 from nerif.evaluation import rms_text
-from nerif.measurement import Measurement
-from nerif.measurement_file import known_conventions
 from nerif.notebook import number
 from nerif.result import METRICS, ResultDirectory
 from nerif.techniques.registry import TECHNIQUES
-from nerif.volume import INDEX, Volume, name_of
-from nerif.volume_file import read_volume
 
 __all__ = ["Info", "is_measurement", "main", "run"]
 

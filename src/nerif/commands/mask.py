@@ -11,9 +11,9 @@ import tyro
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
 from nerif.imaging.masks import MaskSettings, drawn_masks, with_flow_masks
-from nerif.measurement import Measurement
 from nerif.reconstruction.gauge import visual_hull
 
 __all__ = ["Mask", "main", "run"]

@@ -11,8 +11,8 @@ import tyro
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.report.movie import Movie, frames_there
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["MovieCommand", "main", "run"]
 

@@ -11,8 +11,8 @@ import tyro
 from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError, with_unit
+from nerif.data.measurement import Measurement
 from nerif.geometry import Ring
-from nerif.measurement import Measurement
 from nerif.prediction import predict
 from nerif.reconstruction.aperture import seen_through
 from nerif.result import ResultDirectory

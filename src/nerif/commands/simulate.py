@@ -12,9 +12,9 @@ from nerif.commands.output import check_file, counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
+from nerif.data.volume_file import write_netcdf
 from nerif.geometry import Ring
 from nerif.simulation import Simulation
-from nerif.volume_file import write_netcdf
 
 __all__ = ["Simulate", "main", "run"]
 

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES
+from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.displacement import DisplacementMap
-from nerif.measurement import Measurement
 
 __all__ = ["Scene", "Surroundings", "join_views"]
 

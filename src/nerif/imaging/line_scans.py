@@ -21,9 +21,9 @@ import torch
 from jaxtyping import Float, Int
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement, measurement_of
 from nerif.geometry import Box, Camera
 from nerif.geometry.projection import TELECENTRIC
-from nerif.measurement import Measurement, measurement_of
 from nerif.techniques.absorption import Absorption
 
 __all__ = ["LineScan", "Told"]

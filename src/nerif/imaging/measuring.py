@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
 from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.cameras_file import CalibratedCamera
@@ -21,7 +22,6 @@ from nerif.imaging.exposure import check_exposure
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.views import View, good_pictures
 from nerif.imaging.workers import cores, work
-from nerif.measurement import Measurement
 
 __all__ = ["Recording", "RestingView", "camera_of", "measure_instant"]
 

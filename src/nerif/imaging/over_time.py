@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_file import from_dataset
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Camera, Lens
 from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.measuring import Recording, RestingView
 from nerif.imaging.views import View
 from nerif.imaging.workers import work
-from nerif.measurement import Measurement
-from nerif.measurement_file import from_dataset
-from nerif.measurement_sequence import MeasurementSequence
 
 __all__ = ["RestingRecording", "frame_numbers", "instants_of", "measure_recording"]
 

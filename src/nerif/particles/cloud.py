@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume, describe
 from nerif.geometry import Box, Grid
-from nerif.volume import Volume, describe
 
 __all__ = ["DIAMETER", "Particles", "quality_factor", "spread"]
 

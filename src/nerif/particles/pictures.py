@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import AMBIENT_INDEX, InputError
+from nerif.data.measurement import Measurement, measurement_of
 from nerif.geometry import Camera
-from nerif.measurement import Measurement, measurement_of
 from nerif.particles.cloud import DIAMETER, QUANTITY, Particles, spread
 from nerif.techniques.registry import technique_of
 

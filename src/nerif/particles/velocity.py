@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
 from nerif.imaging.correlation import correlate
-from nerif.volume import Volume
 
 __all__ = ["Velocity", "velocity_between"]
 

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import QUANTITIES, Volume, quantities_of
 from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
-from nerif.volume import QUANTITIES, Volume, quantities_of
 
 if TYPE_CHECKING:
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
 
 __all__ = [
     "LINEAR", "NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "deviation",

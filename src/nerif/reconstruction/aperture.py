@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
 
 __all__ = ["APERTURES", "check_aperture", "lens_rays", "seen_through"]
 

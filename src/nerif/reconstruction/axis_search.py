@@ -19,9 +19,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.data.measurement import Measurement
 from nerif.geometry.axis import Axis
 from nerif.geometry.symmetry import Symmetry
-from nerif.measurement import Measurement
 from nerif.reconstruction.layout import Symmetric
 from nerif.reconstruction.levels import bins_of
 from nerif.reconstruction.problem import Penalty, Problem

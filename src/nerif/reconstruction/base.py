@@ -13,11 +13,11 @@ from typing import Any
 
 from torch import Tensor
 
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
 from nerif.geometry.axis import Axis
-from nerif.measurement import Measurement
-from nerif.volume import Volume, describe
 
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from nerif.common.conventions import InputError
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
 
 __all__ = ["check_bounds", "check_resumed", "field_bounds", "in_units"]
 

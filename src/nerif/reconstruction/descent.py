@@ -22,9 +22,9 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.geometry import Rays
-from nerif.measurement import Measurement
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds

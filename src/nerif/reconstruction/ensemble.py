@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume, describe
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
 from nerif.physics.quantities import LINEAR, GasSettings, derive, derive_all, deviation
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.repetition import Found, Member, other_seed
-from nerif.volume import Volume, describe
 
 __all__ = ["Ensemble", "Spread"]
 

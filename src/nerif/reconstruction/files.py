@@ -14,6 +14,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
+from nerif.data.volume import INDEX
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
@@ -21,7 +22,6 @@ from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
-from nerif.volume import INDEX
 
 __all__ = [
     "CHECKPOINT", "FIELD", "checkpoints", "read_field", "read_quantity", "read_state", "write_field", "write_state",

@@ -9,8 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
-from nerif.measurement import Measurement
 from nerif.techniques.registry import forward_model
 
 __all__ = ["check_fingerprint", "digest", "fingerprint"]

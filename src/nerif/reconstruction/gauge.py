@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Grid
-from nerif.measurement import Measurement
 
 __all__ = ["AmbientRegion", "ambient_faces", "check_gauge", "is_open", "visual_hull"]
 

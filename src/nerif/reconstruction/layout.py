@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.fields.symmetric import SymmetricVoxels
 from nerif.geometry import Box, Grid, Rays
 from nerif.geometry.symmetry import Symmetry
-from nerif.measurement import Measurement
 from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.symmetric_operator import SymmetricOperator

@@ -10,8 +10,8 @@ import torch.nn.functional as functional
 from jaxtyping import Bool
 from torch import Tensor
 
+from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
 
 __all__ = ["Level", "bins_at_last", "bins_of", "coarser", "levels", "pixels_in_a_voxel"]
 

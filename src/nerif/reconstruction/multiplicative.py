@@ -18,8 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.voxels import VoxelReconstructor

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.measurement import Measurement
 from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.training import Training

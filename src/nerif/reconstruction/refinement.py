@@ -25,9 +25,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.correction import GEOMETRY, Corrections
-from nerif.measurement import Measurement
 from nerif.reconstruction.refined_numbers import NAMES, REFINED, displaced, prior, refined_words
 from nerif.reconstruction.target import Part, Target
 

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.geometry import Rays
-from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.refinement import Refinement, drawn
 from nerif.reconstruction.sources import of_source

@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstruction, Reconstructor
-from nerif.volume import Volume, describe
 
 __all__ = ["VOXELS", "Found", "Maps", "Member", "Repetitions", "Taken", "certainty", "other_seed"]
 

@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
 from nerif.geometry import Grid, Rays
-from nerif.measurement import Measurement
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.gauge import ambient_faces
 from nerif.reconstruction.levels import bins_of

@@ -16,7 +16,7 @@ from nerif.reconstruction.sources import check_source
 from nerif.techniques.registry import AUTO, check_model
 
 if TYPE_CHECKING:
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
 
 __all__ = ["TrainingSettings"]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
 
 __all__ = ["hold_back", "some_pixels"]
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
 from nerif.observation import Observation
 
 __all__ = ["SOURCES", "Stage", "check_source", "chosen_source", "of_source", "stages"]

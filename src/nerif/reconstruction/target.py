@@ -11,8 +11,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
+from nerif.data.measurement import Measurement
 from nerif.geometry import Rays
-from nerif.measurement import Measurement
 from nerif.observation import Observation
 from nerif.reconstruction.bins import binned_rays, patches
 from nerif.techniques.base import ForwardModel

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
+from nerif.data.measurement import Measurement
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box
 from nerif.geometry.axis import Axis
-from nerif.measurement import Measurement
 from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.bins import coarsest_edge
 from nerif.reconstruction.bounds import field_bounds, in_units

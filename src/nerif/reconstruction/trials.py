@@ -30,13 +30,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume, describe
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera, Grid
-from nerif.measurement import Measurement
 from nerif.physics.quantities import GasSettings, derive, deviation
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.repetition import Found, Maps, Member, other_seed
-from nerif.volume import Volume, describe
 
 __all__ = ["KINDS", "Deviations", "Trials", "best_covered"]
 

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
 from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.descent import Descent

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.files import atomic
+from nerif.data.measurement import Measurement
 from nerif.drawing import draw_map
-from nerif.measurement import Measurement
 
 __all__ = ["save_displacements", "save_masks"]
 

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from nerif import __version__
 from nerif.common.files import atomic
+from nerif.data.meridian import Meridian
+from nerif.data.volume import name_of
 from nerif.drawing import drawn_of, map_colours
 from nerif.evaluation import rms_text
-from nerif.meridian import Meridian
 from nerif.notebook import number, picture
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
@@ -25,7 +26,6 @@ from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
 from nerif.techniques.registry import technique_of
-from nerif.volume import name_of
 
 if TYPE_CHECKING:
     import jinja2

@@ -13,10 +13,10 @@ import numpy as np
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.installation import install
+from nerif.data.volume import Volume, field_of
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
 from nerif.report.isosurface import default_level, filled
-from nerif.volume import Volume, field_of
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["STYLES", "Movie", "frames_there", "ranges_over_time"]
 

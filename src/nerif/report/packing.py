@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from nerif.data.volume import INDEX, Volume, quantities_of
 from nerif.geometry import Grid
 from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
-from nerif.volume import INDEX, Volume, quantities_of
 
 __all__ = ["COARSE", "FINE", "LARGEST", "MASKED", "coarsen", "pack", "relation"]
 

@@ -15,6 +15,8 @@ import torch
 from nerif.common.conventions import with_unit
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
+from nerif.data.reprojection import Reprojection
+from nerif.data.volume import INDEX, Volume
 from nerif.drawing import (
     DIVERGING,
     add_colour_bar,
@@ -34,9 +36,7 @@ from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_s
 from nerif.report.moves_figure import draw_moves
 from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import lattice_step
-from nerif.reprojection import Reprojection
 from nerif.result import Result
-from nerif.volume import INDEX, Volume
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import unit_shown
+from nerif.data.volume import INDEX, Volume, field_of, name_of, quantities_of
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, colour_range, drawn_of, shown
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive
@@ -18,8 +20,6 @@ from nerif.report.pages import error_of
 from nerif.report.rig_figure import picture_corners
 from nerif.report.view_images import colour_table
 from nerif.result import Result
-from nerif.volume import INDEX, Volume, field_of, name_of, quantities_of
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["scene_of", "scene_over_time"]
 

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.common.conventions import InputError, with_unit
+from nerif.data.volume import field_of
+from nerif.data.volume_sequence import ViewScores, VolumeSequence
 from nerif.notebook import number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import frames_there
 from nerif.report.scene import scene_over_time
 from nerif.report.summary import Statement
 from nerif.techniques.registry import technique, technique_of
-from nerif.volume import field_of
-from nerif.volume_sequence import ViewScores, VolumeSequence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import with_unit
+from nerif.data.volume import INDEX, field_of, name_of
 from nerif.drawing import LABELS, drawn_of, shown
 from nerif.evaluation import rms_text
 from nerif.notebook import number, percent, span
@@ -19,7 +20,6 @@ from nerif.residuals import CAUSES
 from nerif.result import METRICS, VOLUME, Result
 from nerif.techniques.registry import TECHNIQUES
 from nerif.verdict import verdict
-from nerif.volume import INDEX, field_of, name_of
 
 __all__ = ["Statement", "came_out", "headline", "looked", "measured", "repeated", "trust", "trust_figures"]
 

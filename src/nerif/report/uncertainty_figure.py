@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nerif.data.volume import Volume
 from nerif.drawing import COLOURS, drawn_of, label_of, shown
 from nerif.metrics import LEVELS
 from nerif.reconstruction.trials import TAILS
-from nerif.volume import Volume
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

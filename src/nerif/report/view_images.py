@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.common.conventions import unit_shown
+from nerif.data.measurement import Measurement
+from nerif.data.reprojection import Reprojection
 from nerif.drawing import map_colours, map_range
-from nerif.measurement import Measurement
 from nerif.observation import Observation
-from nerif.reprojection import Reprojection
 
 __all__ = ["Scale", "ViewImages", "colour_table", "lattice_step", "picture_address", "view_images"]
 

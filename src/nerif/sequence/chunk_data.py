@@ -17,11 +17,11 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
+from nerif.data.measurement import Measurement
 from nerif.fields.mlp import UNBOUNDED
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Rays
 from nerif.geometry.symmetry import NO_SYMMETRY
-from nerif.measurement import Measurement
 from nerif.reconstruction.bounds import in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import digest

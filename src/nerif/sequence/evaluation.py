@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
+from nerif.data.volume import INDEX
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.evaluation import check_inside
 from nerif.json_file import write_json
 from nerif.metrics import volume_errors
 from nerif.sequence.store import DONE, SequenceStore
 from nerif.techniques.registry import ASSUMED, technique
-from nerif.volume import INDEX
-from nerif.volume_sequence import VolumeSequence
 
 __all__ = ["evaluate_sequence"]
 

@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.fields.mlp import NeuralField
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.metrics import correlation
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.quantities import derive
@@ -31,7 +32,6 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
 from nerif.techniques.registry import forward_model
-from nerif.volume import Volume
 
 __all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame", "reconstruct_frames"]
 

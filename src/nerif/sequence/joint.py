@@ -16,8 +16,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.written_files import OwnFiles
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.space_time import SpaceTimeField
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step, compose
 from nerif.reconstruction.files import CHECKPOINT, checkpoints, read_state
 from nerif.reconstruction.training import Training

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
+from nerif.data.volume import QUANTITIES, quantities_of
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural import NeRIF
-from nerif.volume import QUANTITIES, quantities_of
 
 __all__ = ["Event", "SequencePlan", "SequenceSettings"]
 

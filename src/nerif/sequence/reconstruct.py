@@ -10,9 +10,9 @@ from pathlib import Path
 
 from nerif.common.conventions import InputError
 from nerif.common.interruption import Interrupted
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Grid
-from nerif.measurement import Measurement
-from nerif.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.neural import NeRIF

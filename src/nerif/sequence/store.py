@@ -21,15 +21,15 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
 from nerif.common.written_files import OwnFiles, remove_empty
+from nerif.data.measurement_sequence import MeasurementSequence, add_frames, check_store
+from nerif.data.volume import Volume
+from nerif.data.volume_sequence import FIELDS, VolumeSequence, score_names
 from nerif.fields.mlp import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
-from nerif.measurement_sequence import MeasurementSequence, add_frames, check_store
 from nerif.reconstruction.bounds import in_units
-from nerif.volume import Volume
-from nerif.volume_sequence import FIELDS, VolumeSequence, score_names
 
 __all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore", "chunk_tau"]
 

@@ -18,7 +18,7 @@ from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.commands.check import Check
 from nerif.consistency import Consistency, check_consistency
-from nerif.measurement import Measurement
+from nerif.data.measurement import Measurement
 
 __all__ = ["PAGE"]
 

@@ -18,8 +18,8 @@ from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
 from nerif.commands.displacement import Displacement
+from nerif.data.measurement import Measurement
 from nerif.imaging.measuring import measure_instant
-from nerif.measurement import Measurement
 
 __all__ = ["PAGE"]
 

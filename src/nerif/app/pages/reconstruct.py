@@ -20,7 +20,7 @@ from nerif.app.workspace import Workspace
 from nerif.commands.methods import RECORDS, Reconstruct
 from nerif.commands.sequence import Sequence
 from nerif.common.conventions import InputError
-from nerif.measurement_sequence import MeasurementSequence
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.trials import KINDS
 

@@ -23,7 +23,7 @@ from nerif.commands.export import Export
 from nerif.commands.figures import Figures
 from nerif.commands.movie import MovieCommand
 from nerif.common.installation import install
-from nerif.exports import FORMATS
+from nerif.data.exports import FORMATS
 from nerif.report.movie import STYLES
 from nerif.report.pages import JOURNALS
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from nerif.common.conventions import InputError, ambient_index
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
+from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
+from nerif.data.volume import Volume, describe, field_of, name_of
+from nerif.data.volume_file import REFERENCES
 from nerif.geometry import Box, Grid
-from nerif.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED, technique
-from nerif.volume import Volume, describe, field_of, name_of
-from nerif.volume_file import REFERENCES
 
 if TYPE_CHECKING:
     import numpy as np

@@ -18,8 +18,8 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.installation import install
 from nerif.common.netcdf import reading, values
-from nerif.measurement import Measurement
-from nerif.measurement_file import CONVENTIONS, PLAIN, known_conventions, map_names, variables
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_file import CONVENTIONS, PLAIN, known_conventions, map_names, variables
 from nerif.techniques.registry import TECHNIQUES
 
 if TYPE_CHECKING:

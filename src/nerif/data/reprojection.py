@@ -14,8 +14,8 @@ from torch import Tensor
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.files import atomic
 from nerif.common.netcdf import opened
-from nerif.measurement import Measurement
-from nerif.measurement_file import encoding, from_dataset, to_dataset
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_file import encoding, from_dataset, to_dataset
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import ASSUMED
 

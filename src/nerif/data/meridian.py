@@ -16,8 +16,8 @@ import torch
 
 from nerif.common.conventions import FACES
 from nerif.common.files import atomic
+from nerif.data.volume import Volume, describe
 from nerif.geometry.symmetry import Symmetry
-from nerif.volume import Volume, describe
 
 if TYPE_CHECKING:
     import xarray as xr

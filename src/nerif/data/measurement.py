@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif import measurement_file
 from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces
 from nerif.common.files import atomic
 from nerif.common.netcdf import opened
+from nerif.data import measurement_file
+from nerif.data.measurement_summary import as_html, summary
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_lattice
-from nerif.measurement_summary import as_html, summary
 from nerif.observation import Observation, arguments_of, cameras_of, check_maps, check_observations
 from nerif.techniques.base import ForwardModel
 from nerif.techniques.registry import TECHNIQUES

@@ -12,7 +12,7 @@ from nerif.observation import Observation
 from nerif.techniques.deflection import Deflection
 
 if TYPE_CHECKING:
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
 
 __all__ = ["as_html", "summary"]
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
 from nerif.common.files import atomic
 from nerif.common.netcdf import opened, values
+from nerif.data.volume import QUANTITIES, Volume, describe, field_of, name_of
+from nerif.data.vti import read_vti
 from nerif.geometry import Box, Grid
-from nerif.volume import QUANTITIES, Volume, describe, field_of, name_of
-from nerif.vti import read_vti
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -12,9 +12,9 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
-from nerif.volume import Volume
-from nerif.volume_file import write_netcdf
-from nerif.vti import write_vti
+from nerif.data.volume import Volume
+from nerif.data.volume_file import write_netcdf
+from nerif.data.vti import write_vti
 
 __all__ = ["FORMATS", "export", "write_csv", "write_mat", "write_npz"]
 

@@ -23,7 +23,7 @@ from nerif.techniques.registry import TECHNIQUES, technique
 if TYPE_CHECKING:
     import xarray as xr
 
-    from nerif.measurement import Measurement
+    from nerif.data.measurement import Measurement
 
 __all__ = [
     "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "known_conventions", "map_names", "to_dataset", "variables",
