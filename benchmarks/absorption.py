@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from bench import Table, add_write
 from nerif.evaluation import evaluate_volume
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import Simulation

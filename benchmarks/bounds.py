@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from bench import N_AMBIENT, Table, add_write
 from nerif.evaluation import evaluate_volume
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural import NeRIF

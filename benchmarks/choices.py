@@ -19,7 +19,7 @@ import torch
 from bench import N_AMBIENT, Table, add_write
 from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory

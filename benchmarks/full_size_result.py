@@ -21,7 +21,7 @@ from bench import Table, add_write, alone
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Reprojection
 from nerif.evaluation import evaluate_views
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.members import all_quantities

@@ -16,7 +16,7 @@ from dataclasses import replace
 import torch
 
 from bench import N_AMBIENT, Table, add_write
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
 from nerif.physics.path_integral import PathIntegral, project

@@ -85,7 +85,7 @@ def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_p
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
     from nerif.data.measurement_sequence import MeasurementSequence
     from nerif.data.volume_sequence import VolumeSequence
-    from nerif.fields.mlp import Network, NetworkShape, NeuralField
+    from nerif.fields.network import Network, NetworkShape, NeuralField
     from nerif.sequence.evaluation import evaluate_sequence
     from nerif.sequence.store import Frame, SequenceStore
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from nerif.cli import main
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.first_look import FEWEST, kept_out
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import Step

@@ -10,7 +10,7 @@ import torch
 from nerif import prediction
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Accuracy, Reprojection
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
 from nerif.physics.path_integral import PathIntegral

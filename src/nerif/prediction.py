@@ -17,7 +17,7 @@ from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.data.volume import name_of
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
-from nerif.fields.mlp import NeuralField
+from nerif.fields.network import NeuralField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, Projector, project

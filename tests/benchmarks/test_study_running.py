@@ -20,7 +20,7 @@ from benchmarks.study_records import record
 from nerif import __version__
 from nerif.common.conventions import InputError
 from nerif.fields.base import Field
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural import NeRIF

@@ -7,7 +7,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.fields.grid import Boundary, VoxelField
-from nerif.fields.mlp import NetworkShape, NeuralField
+from nerif.fields.network import NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry

@@ -24,7 +24,7 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.fields.grid import VoxelField
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Grid, Ring
 from nerif.imaging.cameras_file import CalibratedCamera, write_cameras

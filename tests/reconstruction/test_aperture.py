@@ -15,7 +15,7 @@ from nerif.consistency import check_consistency
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.evaluation import evaluate_views, evaluate_volume
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.physics.path_integral import PathIntegral, project

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.reconstruction import budget as module
 from nerif.reconstruction import training
 from nerif.reconstruction.budget import Budget

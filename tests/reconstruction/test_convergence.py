@@ -13,7 +13,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import measurement_of
 from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction import convergence, objective
 from nerif.reconstruction.base import Step

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.fields.mlp import Network, NetworkShape
+from nerif.fields.network import Network, NetworkShape
 from nerif.reconstruction.device import (
     autocast_dtype,
     float32_products,

@@ -9,7 +9,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.geometry import Box
 from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.fingerprint import fingerprint

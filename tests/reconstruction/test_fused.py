@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.fields.mlp import UNBOUNDED, Network, NetworkShape
+from nerif.fields.network import UNBOUNDED, Network, NetworkShape
 from nerif.fields.space_time import SpaceTimeNetwork
 from nerif.reconstruction import fused
 from nerif.reconstruction.precision import MixedPrecision

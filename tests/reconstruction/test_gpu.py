@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.geometry import Lens
 from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.presets import PRESETS

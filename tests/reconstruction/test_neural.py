@@ -13,7 +13,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
-from nerif.fields.mlp import Network, NetworkShape
+from nerif.fields.network import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction import bins, objective, training
@@ -366,7 +366,7 @@ def test_bf16_gives_way_to_float32_at_the_end(measurement, undisturbed):
 
 COMPILED = """
 import torch
-from nerif.fields.mlp import Network, NetworkShape
+from nerif.fields.network import Network, NetworkShape
 torch.manual_seed(0)
 net = Network(NetworkShape(depth=3, width=32, octaves=2, skip=2, head_width=8, gradient_head=True))
 fast = torch.compile(net.value_and_gradient, dynamic=True)

@@ -13,7 +13,7 @@ import torch
 
 from nerif.cli import main
 from nerif.data.measurement import Measurement
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.reconstruction.files import read_field
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.objective import Draw, Objective

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.geometry import Box, Rays
 from nerif.reconstruction.sampling import BINS, EVEN, SamplingDensity, sample_count, sample_rays
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.live import read_live
 from nerif.monitor import Monitor
 from nerif.reconstruction.base import Step

@@ -14,7 +14,7 @@ import torch
 
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Box, Grid
 from nerif.physics.path_integral import PathIntegral, project

@@ -15,7 +15,7 @@ from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence, add_frames
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.report import sequence_page

@@ -12,7 +12,7 @@ import torch
 
 from nerif.cli import main
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.fields.space_time import AtTimes, SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Box, Grid

@@ -19,7 +19,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.fields.mlp import Network, NeuralField
+from nerif.fields.network import Network, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, Ring
 from nerif.report.movie import Movie

@@ -17,7 +17,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Grid, Ring
 from nerif.prediction import predict, reproject

@@ -18,7 +18,7 @@ from nerif.data.measurement import Measurement, measurement_of
 from nerif.evaluation import evaluate_views
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls, Scaled
 from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Grid, Lens, Rays, Ring

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from nerif.common.conventions import Points
 from nerif.fields.encoding import encode, encode_pullback, encoded_width
-from nerif.fields.mlp import UNBOUNDED, Network, NetworkShape, NeuralField
+from nerif.fields.network import UNBOUNDED, Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 
 __all__ = ["AtTimes", "SpaceTimeField", "SpaceTimeNetwork", "with_time"]

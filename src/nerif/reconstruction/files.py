@@ -17,7 +17,7 @@ from nerif.common.written_files import OwnFiles
 from nerif.data.volume import INDEX
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry

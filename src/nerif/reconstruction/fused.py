@@ -23,7 +23,7 @@ from jaxtyping import Float
 from numba import njit, prange
 from torch import Tensor
 
-from nerif.fields.mlp import Network
+from nerif.fields.network import Network
 from nerif.reconstruction.threads import share_threads
 
 __all__ = ["value_and_gradient"]

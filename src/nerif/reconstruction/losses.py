@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.fields.mlp import NeuralField
+from nerif.fields.network import NeuralField
 from nerif.geometry import Rays
 from nerif.physics.path_integral import places
 from nerif.reconstruction.target import Part

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from nerif.fields.mlp import NeuralField
+from nerif.fields.network import NeuralField
 from nerif.fields.space_time import AtTimes, with_time
 from nerif.geometry import Rays
 from nerif.physics.path_integral import LENS_RAYS, PathIntegral, project

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.fields.mlp import Network
+from nerif.fields.network import Network
 from nerif.reconstruction.device import autocast_dtype, float32_products
 
 __all__ = ["MixedPrecision"]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.transfer import sent
-from nerif.fields.mlp import NeuralField
+from nerif.fields.network import NeuralField
 from nerif.geometry import Rays
 from nerif.reconstruction.losses import Evaluator
 

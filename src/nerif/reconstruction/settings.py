@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from nerif.common.conventions import InputError
-from nerif.fields.mlp import NetworkShape
+from nerif.fields.network import NetworkShape
 from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS

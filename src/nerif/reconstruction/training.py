@@ -21,7 +21,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.fields.base import Field
-from nerif.fields.mlp import UNBOUNDED
+from nerif.fields.network import UNBOUNDED
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import check_resumed
 from nerif.reconstruction.budget import Budget

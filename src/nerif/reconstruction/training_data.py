@@ -16,7 +16,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box
 from nerif.geometry.axis import Axis

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from nerif.fields.base import Field
-from nerif.fields.mlp import UNBOUNDED, NeuralField
+from nerif.fields.network import UNBOUNDED, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.reconstruction.adam import Adam
 from nerif.reconstruction.losses import Evaluator

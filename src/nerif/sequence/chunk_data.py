@@ -18,7 +18,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement
-from nerif.fields.mlp import UNBOUNDED
+from nerif.fields.network import UNBOUNDED
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.geometry import Rays
 from nerif.geometry.symmetry import NO_SYMMETRY

@@ -21,7 +21,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import Volume
 from nerif.fields.base import Field
-from nerif.fields.mlp import NeuralField
+from nerif.fields.network import NeuralField
 from nerif.geometry import Grid
 from nerif.metrics import correlation
 from nerif.physics.path_integral import PathIntegral, project

@@ -24,7 +24,7 @@ from nerif.common.written_files import OwnFiles, remove_empty
 from nerif.data.measurement_sequence import MeasurementSequence, add_frames, check_store
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import FIELDS, VolumeSequence, score_names
-from nerif.fields.mlp import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box, Grid
