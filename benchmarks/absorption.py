@@ -16,10 +16,10 @@ from dataclasses import replace
 from bench import Table, add_write
 from nerif.evaluation import evaluate_volume
 from nerif.fields.network import NetworkShape
+from nerif.forward.absorption import MODELS
 from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import Simulation
-from nerif.techniques.absorption import MODELS
 
 
 def main() -> None:

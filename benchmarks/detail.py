@@ -19,14 +19,14 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
+from nerif.forward.path_integral import PathIntegral
+from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
-from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import predict_view
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.simulation import simulate
-from nerif.techniques.registry import forward_model
 
 BOX = Box.cube(50.0)
 TRUTH = 100  # voxels along an edge

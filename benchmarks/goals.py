@@ -93,13 +93,13 @@ def run(case: Case, seed: int, data: Path, truth: Path) -> dict[str, Any]:
     from nerif.data.measurement import Measurement
     from nerif.data.volume_file import read_volume
     from nerif.evaluation import evaluate_volume
-    from nerif.physics.path_integral import PathIntegral, project
+    from nerif.forward.path_integral import PathIntegral, project
+    from nerif.forward.registry import forward_model
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.landweber import Landweber
     from nerif.reconstruction.neural import NeRIF
     from nerif.reconstruction.tikhonov import Tikhonov
     from nerif.reconstruction.total_variation import TotalVariation
-    from nerif.techniques.registry import forward_model
 
     keep_freed_memory()
     methods = {kind.__name__: kind for kind in (NeRIF, TotalVariation, Tikhonov, Landweber)}

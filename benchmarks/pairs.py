@@ -20,10 +20,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench import Table, add_write
+from nerif.forward.images import Pictures
 from nerif.imaging.displacement import DisplacementSettings, displacement
 from nerif.imaging.optical_flow import FLOWS
 from nerif.imaging.readers import open_frames
-from nerif.techniques.pictures import Pictures
 from nerif.techniques.warped import References
 
 MARGIN = 20

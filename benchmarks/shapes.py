@@ -18,8 +18,8 @@ import torch
 from bench import N_AMBIENT, Table, add_write
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import paper_rig
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import preset

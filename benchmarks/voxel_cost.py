@@ -18,12 +18,12 @@ import torch
 from bench import N_AMBIENT, Table, add_write, alone
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
+from nerif.forward.deflection import LeverArm
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory, peak_memory, resolve_device
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.simulation import simulate
-from nerif.techniques.deflection import LeverArm
 
 COLUMNS = (
     "grid", "basis", "samples [million]", "iterations", "seconds", "ns a sample and iteration", "of it operator",

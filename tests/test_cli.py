@@ -22,9 +22,9 @@ from nerif.cli import VERBS, main
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.evaluation import evaluate_views
+from nerif.forward.deflection import MODELS
 from nerif.prediction import reproject
 from nerif.reconstruction.files import read_field
-from nerif.techniques.deflection import MODELS
 
 TINY = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]
 QUICK = [

@@ -14,11 +14,11 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary, VoxelField
+from nerif.forward.deflection import MODELS
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.prediction import predict_view, reproject
 from nerif.result import METRICS, ResultDirectory
-from nerif.techniques.deflection import MODELS
 
 
 class Scaled(Field):

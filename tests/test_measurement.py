@@ -13,10 +13,10 @@ import xarray as xr
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import variables
+from nerif.forward.deflection import Deflection
+from nerif.forward.registry import TECHNIQUES
 from nerif.geometry import Lens, Ring
 from nerif.simulation import simulate
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.registry import TECHNIQUES
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls
+from nerif.forward.deflection import MODELS, Deflection
+from nerif.forward.path_integral import PathIntegral
 from nerif.geometry import Box, Ring
-from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import SampledViews, on_voxels, reproject
-from nerif.techniques.deflection import MODELS, Deflection
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 

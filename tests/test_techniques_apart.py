@@ -14,6 +14,8 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.evaluation import evaluate
 from nerif.fields.phantoms import GaussianBalls
+from nerif.forward.absorption import Absorption
+from nerif.forward.emission import Emission
 from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Ring
 from nerif.prediction import predict
@@ -22,8 +24,6 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.result import REPROJECTION, ResultDirectory
 from nerif.simulation import Simulation, simulate
 from nerif.symptoms import open_faces
-from nerif.techniques.absorption import Absorption
-from nerif.techniques.emission import Emission
 from nerif.workflow import Run, reconstruct_into
 
 RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)

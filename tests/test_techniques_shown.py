@@ -18,6 +18,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import INDEX, Volume, field_of
 from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.evaluation import score_lines
+from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid
 from nerif.mistakes import everywhere, of_one_view
 from nerif.physics.quantities import GasSettings
@@ -27,7 +28,6 @@ from nerif.report.view_images import view_images
 from nerif.result import ResultDirectory
 from nerif.sequence.plan import SequenceSettings
 from nerif.symptoms import looks
-from nerif.techniques.absorption import Absorption
 
 RIG = ["--image-size", "14", "17", "--pixel-pitch", "0.26", "--views", "3", "--steps", "20", "--truth-voxels", "8"]
 QUICK = ["--method", "tikhonov", "--voxels", "8", "--iterations", "5", "--regularisation", "1e-4"]

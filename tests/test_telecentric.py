@@ -16,11 +16,14 @@ from nerif.consistency import binned
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.volume import Volume
 from nerif.fields.grid import Boundary
+from nerif.forward.absorption import Absorption
+from nerif.forward.deflection import LeverArm
+from nerif.forward.path_integral import PathIntegral
+from nerif.forward.ray_tracing import background_points
+from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
 from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
-from nerif.physics.path_integral import PathIntegral
 from nerif.physics.quantities import GasSettings, derive
-from nerif.physics.ray_tracing import background_points
 from nerif.prediction import _interpolated, reproject
 from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.fingerprint import _parts, digest
@@ -31,9 +34,6 @@ from nerif.report.rig_figure import draw_rig, picture_corners
 from nerif.report.scene import scene_of
 from nerif.result import Result
 from nerif.simulation import simulate, view_displacement
-from nerif.techniques.absorption import Absorption
-from nerif.techniques.deflection import LeverArm
-from nerif.techniques.registry import TECHNIQUES, forward_model
 
 AMBIENT = 1.00027
 

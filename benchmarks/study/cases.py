@@ -11,6 +11,7 @@ from typing import Any
 
 from nerif import __version__
 from nerif.common.conventions import InputError
+from nerif.forward.deflection import MODELS
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device
@@ -20,7 +21,6 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.techniques.deflection import MODELS
 
 __all__ = [
     "BOX",

@@ -22,14 +22,14 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
+from nerif.forward.deflection import MODELS
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid
 from nerif.metrics import volume_errors
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.simulation import add_noise, simulate
-from nerif.techniques.deflection import MODELS
 from study.cases import BOX, N_AMBIENT, NOISE_SEED, Case
 from study.octahedron import pixels_per_unit, to_plain
 from study.records import read_record, write_record

@@ -21,6 +21,7 @@ from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
+from nerif.forward.registry import AUTO, forward_model
 from nerif.gains import gains_of, with_gains
 from nerif.geometry import Box
 from nerif.halves import kept_half
@@ -32,7 +33,6 @@ from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.refined_rig import with_corrections
 from nerif.residuals import leftover, white_noise
 from nerif.result import METRICS, VOLUME, ResultDirectory
-from nerif.techniques.registry import AUTO, forward_model
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")

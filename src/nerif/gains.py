@@ -15,9 +15,9 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
+from nerif.forward.registry import forward_model
 from nerif.geometry import Grid
 from nerif.reconstruction.operator import VoxelOperator
-from nerif.techniques.registry import forward_model
 
 __all__ = ["fit_gains", "gains_of", "with_gains"]
 

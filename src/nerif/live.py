@@ -25,16 +25,16 @@ from nerif.common.written_files import OwnFiles
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
+from nerif.forward.base import ForwardModel
+from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box, Grid
 from nerif.json_file import write_json
 from nerif.monitor import Monitor
 from nerif.observation import Observation
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
 from nerif.reconstruction.trials import best_covered
 from nerif.result import LIVE, LIVE_LOOK
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import AUTO, forward_model
 
 __all__ = ["Live", "Look", "read_live", "read_look"]
 

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError, unit_shown
+from nerif.forward.base import ForwardModel
+from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Camera
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import TECHNIQUES, forward_model
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement

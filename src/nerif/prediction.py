@@ -19,14 +19,14 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.network import NeuralField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
+from nerif.forward.base import ForwardModel
+from nerif.forward.path_integral import LENS_RAYS, PathIntegral, Projector, project
+from nerif.forward.ray_tracing import CurvedRays
+from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
 from nerif.geometry import Box, Camera, Grid, Rays
-from nerif.physics.path_integral import LENS_RAYS, PathIntegral, Projector, project
-from nerif.physics.ray_tracing import CurvedRays
 from nerif.reconstruction.operator import rays_through
 from nerif.reconstruction.symmetric_operator import seen_of
 from nerif.reconstruction.threads import on_free_cores
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame

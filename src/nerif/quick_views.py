@@ -11,10 +11,10 @@ from torch import Tensor
 
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.fields.base import Field
-from nerif.physics.path_integral import PathIntegral
+from nerif.forward.path_integral import PathIntegral
+from nerif.forward.registry import forward_model
 from nerif.prediction import predict_view
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.techniques.registry import forward_model
 
 __all__ = [
     "binned", "compare", "disagreement", "fit", "path_integral", "predicted_by_others", "values_of", "with_values",

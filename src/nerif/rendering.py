@@ -15,8 +15,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError, Points
 from nerif.fields.base import Field
+from nerif.forward.ray_tracing import trace
 from nerif.geometry import Box, Camera, Lens, Plane, Rays
-from nerif.physics.ray_tracing import trace
 from nerif.simulation import STEPS
 
 __all__ = ["Sensor", "Texture", "background_texture", "render"]

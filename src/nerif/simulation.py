@@ -24,11 +24,11 @@ from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Scaled, make_phantom
+from nerif.forward.base import ForwardModel
+from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.ray_tracing import background_points
+from nerif.forward.registry import ASSUMED, TECHNIQUES, check_simulated, forward_model, technique
 from nerif.geometry import Box, Camera, Grid, Rays
-from nerif.physics.path_integral import PathIntegral, project
-from nerif.physics.ray_tracing import background_points
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import ASSUMED, TECHNIQUES, check_simulated, forward_model, technique
 
 __all__ = ["Simulation", "add_noise", "add_quantum_noise", "simulate", "view_displacement"]
 

@@ -13,10 +13,10 @@ from nerif.common.conventions import FACES
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
+from nerif.forward.base import ForwardModel
 from nerif.prediction import predict_view
 from nerif.quick_views import path_integral, values_of
 from nerif.reconstruction.gauge import ambient_faces
-from nerif.techniques.base import ForwardModel
 
 __all__ = ["looks", "open_faces"]
 

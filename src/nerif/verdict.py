@@ -29,10 +29,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerif.data.volume import field_of
+from nerif.forward.registry import TECHNIQUES
 from nerif.halves import camera_of
 from nerif.residuals import CAUSES
 from nerif.result import Result
-from nerif.techniques.registry import TECHNIQUES
 
 __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 

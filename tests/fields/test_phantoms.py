@@ -9,9 +9,9 @@ from nerif.common.conventions import InputError
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import FLAME_INTERVAL, Flame, GaussianBalls, Octahedron, make_phantom
 from nerif.fields.turbulence import LONGEST, Fire, TurbulentPlume, inertial_scalar
+from nerif.forward.deflection import MODELS
+from nerif.forward.path_integral import PathIntegral
 from nerif.geometry import Box, Grid, Rays, paper_rig
-from nerif.physics.path_integral import PathIntegral
-from nerif.techniques.deflection import MODELS
 
 CUBE = Box.cube(50.0)
 SLAB = Box((-20.0, -25.0, -15.0), (24.0, 21.0, 33.0))

@@ -13,11 +13,11 @@ from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import Scaled, make_phantom
+from nerif.forward.emission import Emission
 from nerif.geometry import Box, Grid, Ring
 from nerif.imaging.masks import MaskSettings, drawn_masks, flow_mask, read_mask, with_flow_masks
 from nerif.reconstruction.gauge import visual_hull
 from nerif.simulation import simulate
-from nerif.techniques.emission import Emission
 
 SHAPE = (60, 90)
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))

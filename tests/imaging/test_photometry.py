@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from nerif.forward.images import Pictures
 from nerif.imaging.displacement import AtRest, DisplacementSettings, measure
 from nerif.imaging.photometry import CameraNoise, PicturePair
 from nerif.imaging.warping import warp
-from nerif.techniques.pictures import Pictures
 
 READ, ELECTRONS = 6.0, 3.0  # grey values; electrons a grey value
 

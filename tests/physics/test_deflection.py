@@ -12,10 +12,10 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
+from nerif.forward.deflection import MODELS
+from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.ray_tracing import CurvedRays, trace
 from nerif.geometry import Box, Camera, Plane, Rays, Ring
-from nerif.physics.path_integral import PathIntegral, project
-from nerif.physics.ray_tracing import CurvedRays, trace
-from nerif.techniques.deflection import MODELS
 
 N_AMBIENT = 1.0
 

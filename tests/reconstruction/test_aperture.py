@@ -17,8 +17,10 @@ from nerif.data.volume_file import read_volume
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
+from nerif.forward.images import Pictures
+from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.prediction import predict_view, reproject
 from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.losses import LossWeights
@@ -32,8 +34,6 @@ from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.training_data import FrameData
 from nerif.result import ResultDirectory
 from nerif.simulation import simulate, view_displacement
-from nerif.techniques.pictures import Pictures
-from nerif.techniques.registry import forward_model
 
 BOX = Box.cube(50.0)
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(14, 16), pixel_pitch=0.25)

@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerif.forward.deflection import MODELS
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Ring
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.bins import binned_rays, coarsest_edge
 from nerif.reconstruction.target import Target
 from nerif.simulation import simulate
-from nerif.techniques.deflection import MODELS
 
 EDGE = 3
 

@@ -14,6 +14,8 @@ from nerif.data.measurement import measurement_of
 from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.network import NetworkShape
+from nerif.forward.deflection import Deflection
+from nerif.forward.interferometry import Interferometry
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction import convergence, objective
 from nerif.reconstruction.base import Step
@@ -23,8 +25,6 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import add_noise
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.interferometry import Interferometry
 
 ENDLESS = NeRIF(
     network=NetworkShape(depth=2, width=32, octaves=2), samples=(12, 16), points_per_batch=512, first_cycle=40,

@@ -10,13 +10,13 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
+from nerif.forward.registry import technique
 from nerif.geometry import Box
 from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.simulation import simulate
-from nerif.techniques.registry import technique
 
 NETWORK = NeRIF(
     network=NetworkShape(depth=1, width=8, octaves=1), points_per_batch=256, max_steps=2, device="cpu",

@@ -12,14 +12,14 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from nerif.fields.network import NetworkShape
+from nerif.forward.deflection import LeverArm
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Lens
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.presets import PRESETS
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.training_data import FrameData
 from nerif.sequence.chunk_data import ChunkData
-from nerif.techniques.deflection import LeverArm
 
 pytestmark = pytest.mark.filterwarnings("ignore:User provided device_type of 'cuda'")
 

@@ -15,6 +15,7 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.network import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom
+from nerif.forward.base import Weights
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction import bins, objective, training
 from nerif.reconstruction.base import Reconstruction, Step
@@ -26,7 +27,6 @@ from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import simulate
-from nerif.techniques.base import Weights
 
 SMALL = NeRIF(
     network=NetworkShape(depth=2, width=32, octaves=2),

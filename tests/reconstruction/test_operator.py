@@ -11,9 +11,9 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.fields.grid import Boundary
+from nerif.forward.deflection import MODELS
 from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays, Ring
 from nerif.reconstruction.operator import VoxelOperator
-from nerif.techniques.deflection import MODELS
 
 GRID = (9, 11, 13)
 FACES = Boundary(("x-", "y+", "z-"))

@@ -15,10 +15,11 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
+from nerif.forward.absorption import Absorption
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.geometry.correction import GEOMETRY, Corrections
 from nerif.imaging.cameras_file import read_cameras
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.refined_numbers import NAMES, displaced
 from nerif.reconstruction.refined_rig import moved_lines, with_corrections
@@ -26,7 +27,6 @@ from nerif.reconstruction.refinement import Refinement
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import simulate
-from nerif.techniques.absorption import Absorption
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
 RING = Ring(views=5, arc=(0.0, 144.0), image_size=(24, 26), pixel_pitch=0.15)

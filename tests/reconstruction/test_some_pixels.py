@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from nerif.data.measurement import Measurement, measurement_of
+from nerif.forward.deflection import Deflection
+from nerif.forward.interferometry import Interferometry
 from nerif.geometry import paper_rig
 from nerif.reconstruction.some_pixels import some_pixels
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.interferometry import Interferometry
 
 
 @pytest.fixture(scope="module")

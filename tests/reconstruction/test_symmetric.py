@@ -12,9 +12,12 @@ import torch
 from nerif.common.conventions import InputError, Points
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
+from nerif.forward.base import midpoints
+from nerif.forward.emission import Emission
+from nerif.forward.path_integral import PathIntegral
+from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid, Lens, paper_rig
 from nerif.geometry.symmetry import Symmetry
-from nerif.physics.path_integral import PathIntegral
 from nerif.reconstruction.axis_search import find_axis
 from nerif.reconstruction.landweber import Landweber
 from nerif.reconstruction.layout import Symmetric
@@ -26,9 +29,6 @@ from nerif.reconstruction.symmetry import check_views, symmetry_asked
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.simulation import simulate
-from nerif.techniques.base import midpoints
-from nerif.techniques.emission import Emission
-from nerif.techniques.registry import forward_models
 
 SIDES = ("x-", "x+", "y-", "y+")
 

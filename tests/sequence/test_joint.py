@@ -15,6 +15,8 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.fields.space_time import AtTimes, SpaceTimeField, SpaceTimeNetwork
+from nerif.forward.deflection import Deflection
+from nerif.forward.interferometry import Interferometry
 from nerif.geometry import Box, Grid
 from nerif.reconstruction import files, training
 from nerif.reconstruction.base import State
@@ -29,8 +31,6 @@ from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
 from nerif.simulation import simulate
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.interferometry import Interferometry
 from sequence_films import QUICK, blank
 
 SHAPE = NetworkShape(depth=2, width=16, octaves=2)

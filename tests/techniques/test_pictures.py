@@ -19,6 +19,10 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
+from nerif.forward.deflection import LeverArm
+from nerif.forward.images import Pictures
+from nerif.forward.interferometry import Interferometry
+from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.neural import NeRIF
@@ -28,10 +32,6 @@ from nerif.reconstruction.target import Target
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.training_data import FrameData
-from nerif.techniques.deflection import LeverArm
-from nerif.techniques.interferometry import Interferometry
-from nerif.techniques.pictures import Pictures
-from nerif.techniques.registry import forward_model
 from nerif.techniques.warped import References
 
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))

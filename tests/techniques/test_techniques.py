@@ -20,9 +20,16 @@ from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls, Scaled
+from nerif.forward import registry
+from nerif.forward.absorption import Absorption, absorbance
+from nerif.forward.base import ForwardModel, Light, Weights, midpoints
+from nerif.forward.deflection import Deflection
+from nerif.forward.emission import Emission
+from nerif.forward.interferometry import Interferometry
+from nerif.forward.path_integral import PathIntegral
+from nerif.forward.registry import TECHNIQUES, forward_model, forward_models
 from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Grid, Lens, Rays, Ring
-from nerif.physics.path_integral import PathIntegral
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.files import read_state, write_state
@@ -37,13 +44,6 @@ from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.training_data import FrameData
 from nerif.simulation import Simulation, simulate
-from nerif.techniques import registry
-from nerif.techniques.absorption import Absorption, absorbance
-from nerif.techniques.base import ForwardModel, Light, Weights, midpoints
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.emission import Emission
-from nerif.techniques.interferometry import Interferometry
-from nerif.techniques.registry import TECHNIQUES, forward_model, forward_models
 
 PACKAGE = Path(registry.__file__).parents[1]
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))

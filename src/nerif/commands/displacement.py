@@ -15,6 +15,7 @@ from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.forward.deflection import Deflection
 from nerif.geometry import Box
 from nerif.imaging.assembly import Scene, Surroundings
 from nerif.imaging.displacement import DisplacementSettings
@@ -22,7 +23,6 @@ from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, measure_instant
 from nerif.imaging.over_time import frame_numbers, instants_of, measure_recording
 from nerif.imaging.views import find_views
-from nerif.techniques.deflection import Deflection
 
 __all__ = ["Displacement", "main", "run"]
 

@@ -20,9 +20,9 @@ from nerif.data.measurement_file import known_conventions
 from nerif.data.volume import INDEX, Volume, name_of
 from nerif.data.volume_file import read_volume
 from nerif.evaluation import rms_text
+from nerif.forward.registry import TECHNIQUES
 from nerif.notebook import number
 from nerif.result import METRICS, ResultDirectory
-from nerif.techniques.registry import TECHNIQUES
 
 __all__ = ["Info", "is_measurement", "main", "run"]
 

@@ -17,11 +17,11 @@ from nerif.common.files import atomic
 from nerif.common.netcdf import opened
 from nerif.data import measurement_file
 from nerif.data.measurement_summary import as_html, summary
+from nerif.forward.base import ForwardModel
+from nerif.forward.registry import TECHNIQUES
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_lattice
 from nerif.observation import Observation, arguments_of, cameras_of, check_maps, check_observations
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import TECHNIQUES
 
 if TYPE_CHECKING:
     import xarray as xr

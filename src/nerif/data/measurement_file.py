@@ -15,10 +15,10 @@ from torch import Tensor
 
 from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
 from nerif.common.netcdf import reading, values
+from nerif.forward.base import ForwardModel
+from nerif.forward.deflection import Deflection
+from nerif.forward.registry import TECHNIQUES, technique
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.registry import TECHNIQUES, technique
 
 if TYPE_CHECKING:
     import xarray as xr

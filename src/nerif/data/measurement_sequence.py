@@ -20,7 +20,7 @@ from nerif.common.installation import install
 from nerif.common.netcdf import reading, values
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import CONVENTIONS, PLAIN, known_conventions, map_names, variables
-from nerif.techniques.registry import TECHNIQUES
+from nerif.forward.registry import TECHNIQUES
 
 if TYPE_CHECKING:
     import numpy as np

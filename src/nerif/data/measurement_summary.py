@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from nerif.common.conventions import with_unit
+from nerif.forward.deflection import Deflection
 from nerif.notebook import PIXELS, number, panel, show_views
 from nerif.observation import Observation
-from nerif.techniques.deflection import Deflection
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement

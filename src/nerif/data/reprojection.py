@@ -16,8 +16,8 @@ from nerif.common.files import atomic
 from nerif.common.netcdf import opened
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import encoding, from_dataset, to_dataset
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import ASSUMED
+from nerif.forward.base import ForwardModel
+from nerif.forward.registry import ASSUMED
 
 __all__ = ["Accuracy", "Reprojection"]
 

@@ -14,9 +14,9 @@ from nerif.common.netcdf import reading
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
 from nerif.data.volume import Volume, describe, field_of, name_of
 from nerif.data.volume_file import REFERENCES
+from nerif.forward.base import ForwardModel
+from nerif.forward.registry import ASSUMED, technique
 from nerif.geometry import Box, Grid
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import ASSUMED, technique
 
 if TYPE_CHECKING:
     import numpy as np

@@ -22,9 +22,9 @@ from jaxtyping import Float, Int
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, measurement_of
+from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Camera
 from nerif.geometry.projection import TELECENTRIC
-from nerif.techniques.absorption import Absorption
 
 __all__ = ["LineScan", "Told"]
 

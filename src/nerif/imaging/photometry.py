@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from nerif.forward.images import LEAST, around, difference_variance, grey_variance
 from nerif.imaging.frames import as_float
 from nerif.imaging.warping import warp
-from nerif.techniques.pictures import LEAST, around, difference_variance, grey_variance
 
 __all__ = ["CameraNoise", "PicturePair"]
 

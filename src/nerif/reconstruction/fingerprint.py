@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
+from nerif.forward.registry import forward_model
 from nerif.geometry import Camera
-from nerif.techniques.registry import forward_model
 
 __all__ = ["check_fingerprint", "digest", "fingerprint"]
 

@@ -14,12 +14,12 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.fields.symmetric import SymmetricVoxels
+from nerif.forward.base import ForwardModel
 from nerif.geometry import Box, Grid, Rays
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.symmetric_operator import SymmetricOperator
-from nerif.techniques.base import ForwardModel
 
 __all__ = ["InSpace", "Layout", "Symmetric", "layout_of"]
 

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.fields.network import NeuralField
+from nerif.forward.base import Weights
+from nerif.forward.path_integral import places
 from nerif.geometry import Rays
-from nerif.physics.path_integral import places
 from nerif.reconstruction.target import Part
-from nerif.techniques.base import Weights
 
 __all__ = ["DATA", "Evaluator", "LossWeights", "loss_terms"]
 

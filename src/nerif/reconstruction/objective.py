@@ -12,8 +12,8 @@ from torch import Tensor
 
 from nerif.fields.network import NeuralField
 from nerif.fields.space_time import AtTimes, with_time
+from nerif.forward.path_integral import LENS_RAYS, PathIntegral, project
 from nerif.geometry import Rays
-from nerif.physics.path_integral import LENS_RAYS, PathIntegral, project
 from nerif.reconstruction.losses import DATA, Evaluator, loss_terms, reduce
 from nerif.reconstruction.order import shuffled
 from nerif.reconstruction.parallel import Ranks

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
+from nerif.forward.base import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.planes import Bundle
 from nerif.reconstruction.threads import share_threads
-from nerif.techniques.base import ForwardModel
 
 __all__ = ["STEPS", "VoxelOperator", "check_step", "made_of", "operator_norm", "rays_through"]
 

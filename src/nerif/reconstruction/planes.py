@@ -16,8 +16,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.fields.grid import spline_weights
+from nerif.forward.base import ForwardModel
 from nerif.geometry import Grid, Rays
-from nerif.techniques.base import ForwardModel
 
 __all__ = ["Bundle", "Planes", "is_even", "tabulated"]
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Rays
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.refinement import Refinement, drawn
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Part, Target

@@ -22,8 +22,8 @@ from torch import Tensor
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid, Rays
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.reconstruction.gauge import ambient_faces
 from nerif.reconstruction.levels import bins_of
 from nerif.reconstruction.operator import VoxelOperator

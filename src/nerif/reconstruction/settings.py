@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from nerif.common.conventions import InputError
 from nerif.fields.network import NetworkShape
+from nerif.forward.registry import AUTO, check_model
 from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.optimiser import OPTIMISERS
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
-from nerif.techniques.registry import AUTO, check_model
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.fields.symmetric import SymmetricVoxels
+from nerif.forward.base import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.operator import VoxelOperator, made_of
 from nerif.reconstruction.planes import is_even, tabulated
 from nerif.reconstruction.threads import share_threads
-from nerif.techniques.base import ForwardModel
 
 __all__ = ["SymmetricOperator", "seen_of"]
 

@@ -12,11 +12,11 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement
+from nerif.forward.base import ForwardModel
+from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Rays
 from nerif.observation import Observation
 from nerif.reconstruction.bins import binned_rays, patches
-from nerif.techniques.base import ForwardModel
-from nerif.techniques.registry import AUTO, forward_models
 
 __all__ = ["Part", "Target", "check_target"]
 

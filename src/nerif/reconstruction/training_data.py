@@ -18,6 +18,7 @@ from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
+from nerif.forward.base import ForwardModel
 from nerif.geometry import Box
 from nerif.geometry.axis import Axis
 from nerif.reconstruction.aperture import lens_rays, seen_through
@@ -34,7 +35,6 @@ from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.sources import chosen_source, of_source, stages
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
-from nerif.techniques.base import ForwardModel
 
 __all__ = ["FrameData", "TrainingData"]
 

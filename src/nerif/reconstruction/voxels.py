@@ -18,6 +18,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import DEGREES
+from nerif.forward.registry import AUTO, check_model
 from nerif.geometry import Grid
 from nerif.reconstruction import kernels_torch
 from nerif.reconstruction.base import OnStep, Reconstruction, State
@@ -27,7 +28,6 @@ from nerif.reconstruction.operator import VoxelOperator, check_step, rays_throug
 from nerif.reconstruction.problem import Iterate, Problem
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
-from nerif.techniques.registry import AUTO, check_model
 
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 

@@ -15,6 +15,7 @@ from nerif.data.meridian import Meridian
 from nerif.data.volume import name_of
 from nerif.drawing import drawn_of, map_colours
 from nerif.evaluation import rms_text
+from nerif.forward.registry import technique_of
 from nerif.notebook import number, picture
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
@@ -25,7 +26,6 @@ from nerif.report.summary import came_out, headline, looked, measured, repeated,
 from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import colour_table, view_images
 from nerif.result import Result
-from nerif.techniques.registry import technique_of
 
 if TYPE_CHECKING:
     import jinja2

@@ -12,12 +12,12 @@ import numpy as np
 from nerif.common.conventions import InputError, with_unit
 from nerif.data.volume import field_of
 from nerif.data.volume_sequence import ViewScores, VolumeSequence
+from nerif.forward.registry import technique, technique_of
 from nerif.notebook import number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import frames_there
 from nerif.report.scene import scene_over_time
 from nerif.report.summary import Statement
-from nerif.techniques.registry import technique, technique_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,6 +11,7 @@ from nerif.common.conventions import with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.drawing import LABELS, drawn_of, shown
 from nerif.evaluation import rms_text
+from nerif.forward.registry import TECHNIQUES
 from nerif.notebook import number, percent, span
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.reconstruction.files import FIELD
@@ -18,7 +19,6 @@ from nerif.reconstruction.refined_rig import moved_lines
 from nerif.report.packing import relation
 from nerif.residuals import CAUSES
 from nerif.result import METRICS, VOLUME, Result
-from nerif.techniques.registry import TECHNIQUES
 from nerif.verdict import verdict
 
 __all__ = ["Statement", "came_out", "headline", "looked", "measured", "repeated", "trust", "trust_figures"]

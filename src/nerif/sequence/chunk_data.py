@@ -20,6 +20,7 @@ from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement
 from nerif.fields.network import UNBOUNDED
 from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
+from nerif.forward.base import ForwardModel
 from nerif.geometry import Rays
 from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.bounds import in_units
@@ -29,7 +30,6 @@ from nerif.reconstruction.settings import TrainingSettings
 from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.training import LEVEL_POINTS
 from nerif.reconstruction.training_data import FrameData, TrainingData
-from nerif.techniques.base import ForwardModel
 
 __all__ = ["ChunkData"]
 

@@ -11,10 +11,10 @@ from nerif.common.conventions import InputError
 from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.evaluation import check_inside
+from nerif.forward.registry import ASSUMED, technique
 from nerif.json_file import write_json
 from nerif.metrics import volume_errors
 from nerif.sequence.store import DONE, SequenceStore
-from nerif.techniques.registry import ASSUMED, technique
 
 __all__ = ["evaluate_sequence"]
 

@@ -22,16 +22,16 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.fields.network import NeuralField
+from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.registry import forward_model
 from nerif.geometry import Grid
 from nerif.metrics import correlation
-from nerif.physics.path_integral import PathIntegral, project
 from nerif.physics.quantities import derive
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Step
 from nerif.reconstruction.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
-from nerif.techniques.registry import forward_model
 
 __all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame", "reconstruct_frames"]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from nerif.common.conventions import InputError
-from nerif.techniques import absorption, deflection
-from nerif.techniques.absorption import Absorption
-from nerif.techniques.base import ForwardModel, Light
-from nerif.techniques.deflection import Deflection
-from nerif.techniques.emission import Emission
-from nerif.techniques.interferometry import Interferometry
-from nerif.techniques.pictures import Pictures
+from nerif.forward import absorption, deflection
+from nerif.forward.absorption import Absorption
+from nerif.forward.base import ForwardModel, Light
+from nerif.forward.deflection import Deflection
+from nerif.forward.emission import Emission
+from nerif.forward.images import Pictures
+from nerif.forward.interferometry import Interferometry
 
 __all__ = [
     "AUTO", "MODELS", "TECHNIQUES", "check_model", "check_simulated", "forward_model", "forward_models", "model_of",

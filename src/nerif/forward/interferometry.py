@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.techniques.base import ForwardModel, Light
-from nerif.techniques.line_integral import LineIntegral
+from nerif.forward.base import ForwardModel, Light
+from nerif.forward.line_integral import LineIntegral
 
 __all__ = ["Interferometry"]
 

@@ -25,9 +25,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.forward.base import ForwardModel, Light, Weights
+from nerif.forward.deflection import LeverArm
 from nerif.geometry import Rays
-from nerif.techniques.base import ForwardModel, Light, Weights
-from nerif.techniques.deflection import LeverArm
 from nerif.techniques.warped import References
 
 __all__ = ["LEAST", "LinearPictures", "Pictures", "around", "difference_variance", "grey_variance"]

@@ -20,9 +20,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.forward.base import ForwardModel, Light
+from nerif.forward.line_integral import LineIntegral
 from nerif.geometry import Rays
-from nerif.techniques.base import ForwardModel, Light
-from nerif.techniques.line_integral import LineIntegral
 from nerif.techniques.plausible import IMPOSSIBLE, share_below
 
 __all__ = ["Absorption", "Intensity", "absorbance"]

@@ -14,8 +14,8 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.fields.base import Field
+from nerif.forward.base import ForwardModel, midpoints
 from nerif.geometry import Rays
-from nerif.techniques.base import ForwardModel, midpoints
 
 __all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]
 

@@ -22,8 +22,8 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.fields.base import Field
+from nerif.forward.path_integral import LENS_RAYS, Projector
 from nerif.geometry import Rays
-from nerif.physics.path_integral import LENS_RAYS, Projector
 
 __all__ = ["CurvedRays", "background_points", "trace"]
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.forward.base import ForwardModel, Weights
 from nerif.geometry import Rays
-from nerif.techniques.base import ForwardModel, Weights
 
 __all__ = ["LineIntegral"]
 

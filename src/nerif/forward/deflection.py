@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.forward.base import ForwardModel, Light, Weights
 from nerif.geometry import Rays
-from nerif.techniques.base import ForwardModel, Light, Weights
 
 __all__ = ["Curved", "Deflection", "LeverArm", "Paraxial"]
 
