@@ -20,7 +20,7 @@ import torch
 from bench import Table, add_write, alone
 from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
-from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.geometry.pose import GEOMETRY, Corrections
 
 SIZES = {"small": (0.2, 0.01), "large": (0.5, 0.03)}
 """Standard deviation of each camera's place along each axis, mm, and of its turns about them, degrees."""

@@ -19,7 +19,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring
-from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.simulation import simulate
 from random_flows import random_flow
 

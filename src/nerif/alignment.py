@@ -9,7 +9,7 @@ from torch import Tensor
 from nerif.common.conventions import Points, Values, Vectors
 from nerif.data.volume import Volume
 from nerif.fields.base import Field, in_chunks
-from nerif.geometry.correction import turned
+from nerif.geometry.pose import turned
 
 __all__ = ["Moved", "aligned"]
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Plane, Rays
-from nerif.geometry.correction import GEOMETRY, Corrections, turned
+from nerif.geometry.pose import GEOMETRY, Corrections, turned
 
 BOX = Box((-25.0,) * 3, (25.0,) * 3)
 

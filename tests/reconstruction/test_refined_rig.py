@@ -18,7 +18,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.reconstruction.refined_numbers import NAMES
 from nerif.reconstruction.refined_rig import UNTOLD, moved_lines, with_corrections
 from nerif.reconstruction.refinement import Refinement

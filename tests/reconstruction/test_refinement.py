@@ -18,7 +18,7 @@ from nerif.fields.phantoms import make_phantom
 from nerif.forward.absorption import Absorption
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid, Lens, Ring
-from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.imaging.cameras_file import read_cameras
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.refined_numbers import NAMES, displaced

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.geometry import Camera
-from nerif.geometry.correction import GEOMETRY
+from nerif.geometry.pose import GEOMETRY
 
 __all__ = ["NAMES", "PICTURE", "REFINED", "UNITS", "check_refined", "displaced", "prior", "refined_words"]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
-from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.reconstruction.refined_numbers import NAMES, UNITS, displaced
 
 if TYPE_CHECKING:

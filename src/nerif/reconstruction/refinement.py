@@ -27,7 +27,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera, Rays
-from nerif.geometry.correction import GEOMETRY, Corrections
+from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.reconstruction.refined_numbers import NAMES, REFINED, displaced, prior, refined_words
 from nerif.reconstruction.target import Part, Target
 
