@@ -20,7 +20,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
-from nerif.notebook import VIEWS, panel, show_views
+from nerif.plotting.notebook import VIEWS, panel, show_views
 from nerif.reconstruction.tikhonov import Tikhonov
 
 

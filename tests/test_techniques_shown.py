@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from nerif import drawing
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
@@ -22,6 +21,7 @@ from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid
 from nerif.mistakes import everywhere, of_one_view
 from nerif.physics.quantities import GasSettings
+from nerif.plotting import drawing
 from nerif.report import packing
 from nerif.report.pages import error_of, figures_of, residuals_over_sigma, view
 from nerif.report.view_images import view_images

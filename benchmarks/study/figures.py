@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from nerif.drawing import COLOURS
+from nerif.plotting.drawing import COLOURS
 from study.results import finite
 
 if TYPE_CHECKING:

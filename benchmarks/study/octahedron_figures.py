@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.drawing import COLOURS, colour_range
+from nerif.plotting.drawing import COLOURS, colour_range
 from study.resolution import SIZE, Resolution
 
 if TYPE_CHECKING:

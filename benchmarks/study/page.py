@@ -186,7 +186,7 @@ def _svg(spec: FigureSpec) -> bytes:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    from nerif.drawing import style
+    from nerif.plotting.drawing import style
 
     with style(size=10), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": spec.name}):
         figure = Figure(figsize=spec.size, layout="constrained")

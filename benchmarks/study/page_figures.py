@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nerif.drawing import COLOURS
+from nerif.plotting.drawing import COLOURS
 from nerif.report.resolution_figure import draw_mtf
 from study.cases import METHODS, NOISES, PHANTOMS, SECTIONS
 from study.figures import (

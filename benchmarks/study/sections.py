@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from nerif.notebook import number
+from nerif.plotting.notebook import number
 from study import tables
 from study.cases import METHODS, SECTIONS
 from study.claims_of_method import MARGIN, resolution_of, to_paper_error

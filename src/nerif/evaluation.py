@@ -26,8 +26,8 @@ from nerif.gains import gains_of, with_gains
 from nerif.geometry import Box
 from nerif.halves import kept_half
 from nerif.metrics import coverage, slice_metrics, view_metrics, volume_metrics
-from nerif.notebook import number
 from nerif.observation import Observation
+from nerif.plotting.notebook import number
 from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.refined_rig import with_corrections

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.study_records import ABOUT, MADE, page, pairs, results
-from nerif.drawing import style
+from nerif.plotting.drawing import style
 from study.cases import QUICK, SECTIONS, Case, cases
 from study.page import markdown, write_page
 from study.page_figures import page_figures

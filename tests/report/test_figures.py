@@ -10,12 +10,12 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from nerif import drawing
 from nerif.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid, Ring
+from nerif.plotting import drawing
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
 from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, view

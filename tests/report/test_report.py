@@ -17,8 +17,8 @@ from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views
 from nerif.geometry import Box, Grid
-from nerif.notebook import number
 from nerif.physics.quantities import GasSettings, derive
+from nerif.plotting.notebook import number
 from nerif.report import html, packing
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of

@@ -19,7 +19,7 @@ from nerif.app.surface_view import Surface, SurfaceView
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError, unit_shown
 from nerif.data.volume import Volume, describe
-from nerif.drawing import DIVERGING, LABELS, map_range
+from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_pictures import colours_of
 from nerif.resampling import common_grid, difference, resampled
 from nerif.result import VOLUME

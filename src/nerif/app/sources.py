@@ -11,7 +11,7 @@ from nerif.common.conventions import STATISTICS, InputError
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.drawing import colour_range, shown
+from nerif.plotting.drawing import colour_range, shown
 from nerif.report.isosurface import default_level
 from nerif.report.movie import frames_there, ranges_over_time
 from nerif.report.packing import coarsen

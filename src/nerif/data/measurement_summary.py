@@ -8,8 +8,8 @@ import torch
 
 from nerif.common.conventions import with_unit
 from nerif.forward.deflection import Deflection
-from nerif.notebook import PIXELS, number, panel, show_views
 from nerif.observation import Observation
+from nerif.plotting.notebook import PIXELS, number, panel, show_views
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement

@@ -116,8 +116,8 @@ class Volume:
 
     def summary(self) -> list[tuple[str, str]]:
         """Return what it holds as names and values with units."""
-        from nerif.drawing import LABELS, shown
-        from nerif.notebook import span
+        from nerif.plotting.drawing import LABELS, shown
+        from nerif.plotting.notebook import span
 
         shape = " × ".join(str(n) for n in self.grid.shape[::-1])
         edges = " × ".join(f"{e:g}" for e in self.grid.box.edges)
@@ -130,7 +130,7 @@ class Volume:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the three middle slices, and the summary."""
-        from nerif.notebook import panel, show_slices
+        from nerif.plotting.notebook import panel, show_slices
 
         title = describe(self.quantity)[1].capitalize()
         return panel(title, self.summary(), (show_slices(self), f"{title} in the three middle slices"))

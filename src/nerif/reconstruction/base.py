@@ -152,7 +152,7 @@ class Reconstruction:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the three middle slices, why it stopped, how long it took, and the misfit."""
-        from nerif.notebook import number, panel, show_slices
+        from nerif.plotting.notebook import number, panel, show_slices
 
         volume = self.volume(Grid.of_resolution(self.box, SHOWN_VOXELS))
         rows = [("Outcome", f"{self.outcome.reason.replace('_', ' ')}: {self.outcome.message}")]

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
-from nerif.drawing import draw_map
+from nerif.plotting.drawing import draw_map
 
 __all__ = ["save_displacements", "save_masks"]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerif.drawing import COLOURS
+from nerif.plotting.drawing import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

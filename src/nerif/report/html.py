@@ -13,10 +13,10 @@ from nerif import __version__
 from nerif.common.files import atomic
 from nerif.data.meridian import Meridian
 from nerif.data.volume import name_of
-from nerif.drawing import drawn_of, map_colours
 from nerif.evaluation import rms_text
 from nerif.forward.registry import technique_of
-from nerif.notebook import number, picture
+from nerif.plotting.drawing import drawn_of, map_colours
+from nerif.plotting.notebook import number, picture
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.moves_figure import draw_moved_rig, draw_moves

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.data.volume import Volume
-from nerif.drawing import colour_range, shown
+from nerif.plotting.drawing import colour_range, shown
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.data.meridian import Meridian
-from nerif.drawing import COLOURS, add_colour_bar, colour_range, label_of, map_colours
+from nerif.plotting.drawing import COLOURS, add_colour_bar, colour_range, label_of, map_colours
 from nerif.reconstruction.trials import TAILS
 
 if TYPE_CHECKING:

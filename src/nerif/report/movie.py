@@ -15,7 +15,7 @@ from nerif.common.files import atomic
 from nerif.common.installation import install
 from nerif.data.volume import Volume, field_of
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
+from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
 from nerif.report.isosurface import default_level, filled
 
 __all__ = ["STYLES", "Movie", "frames_there", "ranges_over_time"]

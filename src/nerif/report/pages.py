@@ -17,7 +17,8 @@ from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
-from nerif.drawing import (
+from nerif.observation import Observation
+from nerif.plotting.drawing import (
     DIVERGING,
     add_colour_bar,
     colour_range,
@@ -29,7 +30,6 @@ from nerif.drawing import (
     shown,
     style,
 )
-from nerif.observation import Observation
 from nerif.report.figures import draw_history, draw_line, draw_residuals, draw_slice_scores, draw_view_scores
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section

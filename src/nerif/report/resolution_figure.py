@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from nerif.drawing import COLOURS
+from nerif.plotting.drawing import COLOURS
 from nerif.resolution import MTF, THRESHOLD
 
 if TYPE_CHECKING:

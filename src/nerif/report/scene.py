@@ -11,9 +11,9 @@ import torch
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import INDEX, Volume, field_of, name_of, quantities_of
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, colour_range, drawn_of, shown
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive
+from nerif.plotting.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, colour_range, drawn_of, shown
 from nerif.report import packing
 from nerif.report.isosurface import default_level
 from nerif.report.pages import error_of

@@ -13,7 +13,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.data.volume import field_of
 from nerif.data.volume_sequence import ViewScores, VolumeSequence
 from nerif.forward.registry import technique, technique_of
-from nerif.notebook import number
+from nerif.plotting.notebook import number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import frames_there
 from nerif.report.scene import scene_over_time

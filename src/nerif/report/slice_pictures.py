@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerif.data.volume import Volume
-from nerif.drawing import COLOUR_MAPS, PLANES, SEQUENTIAL
+from nerif.plotting.drawing import COLOUR_MAPS, PLANES, SEQUENTIAL
 from nerif.report.view_images import picture_address
 
 __all__ = ["bar_picture", "colours_of", "slice_aspect", "slice_picture"]

@@ -9,11 +9,11 @@ import numpy as np
 
 from nerif.common.conventions import with_unit
 from nerif.data.volume import INDEX, field_of, name_of
-from nerif.drawing import LABELS, drawn_of, shown
 from nerif.evaluation import rms_text
 from nerif.forward.registry import TECHNIQUES
-from nerif.notebook import number, percent, span
 from nerif.physics.quantities import TEMPERATURE_RANGE
+from nerif.plotting.drawing import LABELS, drawn_of, shown
+from nerif.plotting.notebook import number, percent, span
 from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.refined_rig import moved_lines
 from nerif.report.packing import relation

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerif.data.volume import Volume
-from nerif.drawing import COLOURS, drawn_of, label_of, shown
 from nerif.metrics import LEVELS
+from nerif.plotting.drawing import COLOURS, drawn_of, label_of, shown
 from nerif.reconstruction.trials import TAILS
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.common.conventions import with_unit
-from nerif.drawing import (
+from nerif.plotting.drawing import (
     Drawable,
     add_colour_bar,
     colour_range,
