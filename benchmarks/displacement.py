@@ -20,9 +20,9 @@ from nerif.common.conventions import Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
-from nerif.imaging.background import KINDS, Background
-from nerif.imaging.displacement import DisplacementSettings, measure
-from nerif.imaging.optical_flow import FLOWS
+from nerif.imaging.displacement.displacement import DisplacementSettings, measure
+from nerif.imaging.displacement.optical_flow import FLOWS
+from nerif.imaging.patterns import KINDS, Background
 from nerif.rendering import Sensor, background_texture, pattern_size, render
 from nerif.simulation import view_displacement
 

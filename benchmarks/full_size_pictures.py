@@ -26,7 +26,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from bench import Table, add_write
 from nerif.geometry import Camera, Ring
-from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 
 COLUMNS = ("command", "seconds", "largest process [GiB]", "all processes together [GiB]", "exit code")
 LARGEST = 3.0  # px

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from bench import Table, add_write
 from nerif.forward.images import Pictures
-from nerif.imaging.displacement import DisplacementSettings, displacement
-from nerif.imaging.optical_flow import FLOWS
-from nerif.imaging.readers import open_frames
+from nerif.imaging.displacement.displacement import DisplacementSettings, displacement
+from nerif.imaging.displacement.optical_flow import FLOWS
+from nerif.imaging.readers.open import open_frames
 from nerif.techniques.warped import References
 
 MARGIN = 20

@@ -27,8 +27,8 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.imaging.assembly import Scene, Surroundings, join_views
-from nerif.imaging.background import Background
-from nerif.imaging.displacement import DisplacementSettings, measure
+from nerif.imaging.displacement.displacement import DisplacementSettings, measure
+from nerif.imaging.patterns import Background
 from nerif.prediction import predict
 from nerif.rendering import Sensor, background_texture, pattern_size, render
 

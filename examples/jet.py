@@ -21,10 +21,10 @@ from scipy.optimize import least_squares
 
 from nerif.data.measurement import Measurement
 from nerif.imaging.assembly import Scene, Surroundings
-from nerif.imaging.importers import ImportSettings
+from nerif.imaging.calibration.importers.importers import ImportSettings
+from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
 from nerif.imaging.measuring import Recording, measure_instant
-from nerif.imaging.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
-from nerif.imaging.views import find_views
+from nerif.imaging.readers.views import find_views
 from nerif.monitor import Monitor
 from nerif.plotting.drawing import style
 from nerif.reconstruction.neural import NeRIF

@@ -9,8 +9,8 @@ import torch
 
 from nerif.experiment import background_poses, target_poses
 from nerif.geometry import Camera
-from nerif.imaging.bundle import Pose
-from nerif.imaging.targets import CalibrationTarget, Detection, ViewPictures
+from nerif.imaging.calibration.bundle import Pose
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewPictures
 
 
 def detection(

@@ -9,7 +9,7 @@ import torch
 from nerif.cli import main
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box
-from nerif.imaging.cameras_file import read_box, read_cameras
+from nerif.imaging.calibration.cameras_file import read_box, read_cameras
 
 DISTANCES = ("--simple", "--distance", "700", "--background-distance", "300")
 LENS = ("--focal-length", "50", "--pixel-pitch-um", "50")

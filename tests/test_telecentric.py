@@ -22,7 +22,7 @@ from nerif.forward.path_integral import PathIntegral
 from nerif.forward.ray_tracing import background_points
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
-from nerif.imaging.cameras_file import CalibratedCamera, read_cameras, write_cameras
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.physics.quantities import GasSettings, derive
 from nerif.prediction import _interpolated, reproject
 from nerif.reconstruction.bins import binned_rays

@@ -20,10 +20,10 @@ from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
 from nerif.fields.base import Field
 from nerif.geometry import Box, Camera, Grid
-from nerif.imaging.background import Background
-from nerif.imaging.bundle import Pose
-from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
-from nerif.imaging.targets import CalibrationTarget
+from nerif.imaging.calibration.bundle import Pose
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
+from nerif.imaging.calibration.targets import CalibrationTarget
+from nerif.imaging.patterns import Background
 from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
 from nerif.toml import write_toml
 

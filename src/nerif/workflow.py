@@ -20,7 +20,7 @@ from nerif.fields.base import Field
 from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
 from nerif.gains import fit_gains, with_gains
 from nerif.halves import departure_sentence, departures, halved
-from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.live import Live
 from nerif.members import Members, all_quantities
 from nerif.monitor import QUIET, Monitor

@@ -15,9 +15,9 @@ from calibration_pictures import target_pictures
 from nerif.app.pages.calibration import form_of
 from nerif.cli import main
 from nerif.geometry import Ring
-from nerif.imaging.calibration import calibrate
-from nerif.imaging.cameras_file import read_cameras
-from nerif.imaging.targets import CalibrationTarget
+from nerif.imaging.calibration.calibrate import calibrate
+from nerif.imaging.calibration.cameras_file import read_cameras
+from nerif.imaging.calibration.targets import CalibrationTarget
 from report.browsing import errors, needs_browser, wait_for
 
 TARGET = CalibrationTarget("chessboard", 8, 5, pitch=12.0)

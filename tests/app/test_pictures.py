@@ -13,8 +13,8 @@ from app.serving import Served, opened
 from nerif.app.crop_edits import CropEdits
 from nerif.app.picture_files import PictureFiles
 from nerif.app.project import Project
-from nerif.imaging.crop import Crop
-from nerif.imaging.views import find_views
+from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.views import find_views
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
 HEIGHT, WIDTH = 48, 64

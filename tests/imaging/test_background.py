@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from nerif.cli import main
 from nerif.common.conventions import InputError
-from nerif.imaging.background import KINDS, Background
+from nerif.imaging.calibration.targets import CalibrationTarget
+from nerif.imaging.patterns import KINDS, Background
 from nerif.imaging.printing import MARGIN, paper_for, print_pattern
-from nerif.imaging.targets import CalibrationTarget
 
 
 @pytest.mark.parametrize("kind", KINDS)

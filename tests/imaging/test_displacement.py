@@ -9,12 +9,12 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.common.conventions import InputError
-from nerif.imaging.background import Background
-from nerif.imaging.correlation import normalised_median_outliers, window_correlation
-from nerif.imaging.displacement import DisplacementSettings, displacement, measure
-from nerif.imaging.optical_flow import FLOWS
-from nerif.imaging.shake import border, remove_shake
-from nerif.imaging.warping import warp
+from nerif.imaging.displacement.correlation import normalised_median_outliers, window_correlation
+from nerif.imaging.displacement.displacement import DisplacementSettings, displacement, measure
+from nerif.imaging.displacement.optical_flow import FLOWS
+from nerif.imaging.displacement.shake import border, remove_shake
+from nerif.imaging.displacement.warping import warp
+from nerif.imaging.patterns import Background
 
 SHAPE = (90, 120)
 FULL = 4095.0

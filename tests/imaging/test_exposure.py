@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from imaging_files import packed, write_photron
-from nerif.imaging.exposure import check_exposure, effective_bits, full_scale, saturated
-from nerif.imaging.readers import open_frames
+from nerif.imaging.displacement.exposure import check_exposure, effective_bits, full_scale, saturated
+from nerif.imaging.readers.open import open_frames
 
 SHAPE = (60, 80)
 

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from nerif.commands import calibrate
 from nerif.common.conventions import InputError
 from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
-from nerif.imaging.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
-from nerif.imaging.importers import ImportSettings, import_cameras, is_calibration
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
+from nerif.imaging.calibration.importers.importers import ImportSettings, import_cameras, is_calibration
 
 PLANE = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -900.0)
 

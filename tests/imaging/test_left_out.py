@@ -11,10 +11,10 @@ import pytest
 from calibration_pictures import target_pictures
 from nerif.common.conventions import InputError
 from nerif.geometry import Ring
-from nerif.imaging.calibration import calibrate, calibrate_views
-from nerif.imaging.calibration_result import read_errors, rms_of
-from nerif.imaging.targets import CalibrationTarget
-from nerif.imaging.views import find_views
+from nerif.imaging.calibration.calibrate import calibrate, calibrate_views
+from nerif.imaging.calibration.result import read_errors, rms_of
+from nerif.imaging.calibration.targets import CalibrationTarget
+from nerif.imaging.readers.views import find_views
 
 TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)
 

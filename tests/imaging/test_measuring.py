@@ -16,13 +16,13 @@ from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
 from nerif.imaging.assembly import Scene
-from nerif.imaging.cameras_file import CalibratedCamera
-from nerif.imaging.crop import Crop
-from nerif.imaging.displacement import DisplacementSettings
+from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, RestingView, camera_of, measure_instant
 from nerif.imaging.over_time import RestingRecording, measure_recording
-from nerif.imaging.views import View, find_views
+from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.views import View, find_views
 
 SHAPE = (60, 72)
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))

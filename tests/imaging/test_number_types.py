@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from nerif.imaging.corners import eight_bit, saddle_points
-from nerif.imaging.correlation import correlate, normalised_median_outliers
-from nerif.imaging.displacement import AtRest, DisplacementSettings, displacement, measure
-from nerif.imaging.exposure import check_exposure, saturated
+from nerif.imaging.calibration.corners import eight_bit, saddle_points
+from nerif.imaging.displacement.correlation import correlate, normalised_median_outliers
+from nerif.imaging.displacement.displacement import AtRest, DisplacementSettings, displacement, measure
+from nerif.imaging.displacement.exposure import check_exposure, saturated
+from nerif.imaging.displacement.noise import local_correlation, smoothed_away, structure_variance
+from nerif.imaging.displacement.photometry import CameraNoise, PicturePair
+from nerif.imaging.displacement.shake import border, remove_shake
+from nerif.imaging.displacement.warping import warp
 from nerif.imaging.masks import MaskSettings, flow_mask
-from nerif.imaging.noise import local_correlation, smoothed_away, structure_variance
-from nerif.imaging.photometry import CameraNoise, PicturePair
 from nerif.imaging.picture_looks import reduced
-from nerif.imaging.shake import border, remove_shake
-from nerif.imaging.warping import warp
 
 SHAPE = 32, 36
 ALL = np.ones(SHAPE, dtype=bool)

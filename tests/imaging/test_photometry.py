@@ -8,9 +8,9 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from nerif.forward.images import Pictures
-from nerif.imaging.displacement import AtRest, DisplacementSettings, measure
-from nerif.imaging.photometry import CameraNoise, PicturePair
-from nerif.imaging.warping import warp
+from nerif.imaging.displacement.displacement import AtRest, DisplacementSettings, measure
+from nerif.imaging.displacement.photometry import CameraNoise, PicturePair
+from nerif.imaging.displacement.warping import warp
 
 READ, ELECTRONS = 6.0, 3.0  # grey values; electrons a grey value
 
@@ -41,7 +41,7 @@ def test_repeats_tell_the_noise_of_a_flickering_lamp(repeats):
 @pytest.mark.parametrize("references", [6, 12, 40])
 def test_the_noise_does_not_change_with_the_number_of_references(references, monkeypatch):
     """Of many only some are compared with the mean of all."""
-    monkeypatch.setattr("nerif.imaging.displacement._repeat_sigma", lambda *_: None)  # which takes its time
+    monkeypatch.setattr("nerif.imaging.displacement.displacement._repeat_sigma", lambda *_: None)  # which takes its time
     light, draw = scene(), np.random.default_rng(0)
     pictures = [light + np.sqrt(variance(light)) * draw.standard_normal(light.shape) for _ in range(references)]
     noise = AtRest.of(pictures, DisplacementSettings()).camera

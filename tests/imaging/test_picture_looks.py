@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from nerif.common.conventions import InputError
-from nerif.imaging.crop import Crop
 from nerif.imaging.picture_looks import address_of, look_at, reduced
-from nerif.imaging.views import find_views
-from nerif.imaging.views_file import BEFORE, write_crops
+from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.views import find_views
+from nerif.imaging.readers.views_file import BEFORE, write_crops
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ import pytest
 
 from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
 from nerif.common.conventions import InputError
-from nerif.imaging.crop import Crop
-from nerif.imaging.frames import Frames, read_each
-from nerif.imaging.readers import open_frames
-from nerif.imaging.views import View
+from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.frames import Frames, read_each
+from nerif.imaging.readers.open import open_frames
+from nerif.imaging.readers.views import View
 
 N, H, W = 4, 7, 10
 
@@ -464,7 +464,7 @@ def test_frames_are_a_sequence(tmp_path, stack8):
 
 
 def test_files_are_read_when_asked_for(tmp_path, rng, monkeypatch):
-    from nerif.imaging import image_files
+    from nerif.imaging.readers import image_files
 
     write_images(tmp_path / "cam1", rng.integers(0, 256, (30, H, W)).astype(np.uint8))
     read = []

@@ -14,9 +14,9 @@ from imaging_files import write_images
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Lens
-from nerif.imaging.cameras_file import read_box, read_cameras, write_cameras
-from nerif.imaging.importers import ImportSettings, import_box, import_cameras
-from nerif.imaging.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
+from nerif.imaging.calibration.cameras_file import read_box, read_cameras, write_cameras
+from nerif.imaging.calibration.importers.importers import ImportSettings, import_box, import_cameras
+from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
 
 SIZE = (320, 240)
 BEHIND = ImportSettings(background_distance=300.0)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from nerif.common.conventions import InputError
 from nerif.experiment import place
 from nerif.geometry import Camera, Plane
-from nerif.imaging.bundle import Pose
-from nerif.imaging.targets import CalibrationTarget
+from nerif.imaging.calibration.bundle import Pose
+from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.rendering import Sensor, render
 
 TARGETS = {

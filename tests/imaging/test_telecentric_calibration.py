@@ -13,11 +13,11 @@ from calibration_pictures import target_pictures
 from nerif.common.conventions import InputError
 from nerif.experiment import side_of_one, world_axes
 from nerif.geometry import TELECENTRIC, Camera, Ring
-from nerif.imaging.bundle import _Layout
-from nerif.imaging.calibration import CalibrationSettings, _on_the_right_side, calibrate
-from nerif.imaging.calibration_result import Calibration
-from nerif.imaging.first_guess import first_guess
-from nerif.imaging.targets import CalibrationTarget, Detection
+from nerif.imaging.calibration.bundle import _Layout
+from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_the_right_side, calibrate
+from nerif.imaging.calibration.first_guess import first_guess
+from nerif.imaging.calibration.result import Calibration
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.imaging.telecentric_guess import mirrored
 
 TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)

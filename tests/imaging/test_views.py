@@ -7,8 +7,8 @@ import pytest
 import tifffile
 
 from nerif.common.conventions import InputError
-from nerif.imaging.targets import CalibrationTarget
-from nerif.imaging.views import _pose_keys, find_targets, find_views, good_pictures
+from nerif.imaging.calibration.targets import CalibrationTarget
+from nerif.imaging.readers.views import _pose_keys, find_targets, find_views, good_pictures
 
 
 def save(path, image):

@@ -27,8 +27,8 @@ from nerif.fields.grid import VoxelField
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Grid, Ring
-from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
-from nerif.imaging.importers import import_cameras
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
+from nerif.imaging.calibration.importers.importers import import_cameras
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.sequence.store import Frame, SequenceStore

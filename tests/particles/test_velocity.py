@@ -11,7 +11,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
-from nerif.imaging.correlation import normalised_median_outliers
+from nerif.imaging.displacement.correlation import normalised_median_outliers
 from nerif.particles.cloud import Particles
 from nerif.particles.ring import VortexRing
 from nerif.particles.velocity import velocity_between

@@ -19,7 +19,7 @@ from nerif.forward.absorption import Absorption
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.imaging.cameras_file import read_cameras
+from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.refined_numbers import NAMES, displaced
 from nerif.reconstruction.refined_rig import moved_lines, with_corrections

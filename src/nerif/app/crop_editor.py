@@ -10,7 +10,7 @@ from typing import Any
 from nicegui import ui
 
 from nerif.app.pieces import refusals
-from nerif.imaging.crop import Crop
+from nerif.imaging.readers.crop import Crop
 
 __all__ = ["CropEditor"]
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from nerif.imaging.crop import Crop
+from nerif.imaging.readers.crop import Crop
 
 __all__ = ["CropEdits"]
 

@@ -10,10 +10,10 @@ from typing import Any
 
 from nerif.app.project import Project
 from nerif.common.conventions import InputError
-from nerif.imaging.crop import Crop
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.imaging.picture_looks import SourceLook, address_of, look_at
-from nerif.imaging.targets import CalibrationTarget, Detection
-from nerif.imaging.views import View
+from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.views import View
 
 __all__ = ["PictureFiles"]
 

@@ -13,8 +13,8 @@ from nicegui import ui
 
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
-from nerif.imaging.calibration_result import ImageError, read_errors, rms_of
-from nerif.imaging.importers import import_box, import_cameras
+from nerif.imaging.calibration.importers.importers import import_box, import_cameras
+from nerif.imaging.calibration.result import ImageError, read_errors, rms_of
 from nerif.report.rig_figure import COLOURS, picture_corners
 
 __all__ = ["Rig", "read_rig", "show_rig"]

@@ -10,9 +10,9 @@ from nicegui import ui
 from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration_result import ImageError
-from nerif.imaging.targets import CalibrationTarget, Detection
-from nerif.imaging.views import View, pose_names
+from nerif.imaging.calibration.result import ImageError
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection
+from nerif.imaging.readers.views import View, pose_names
 
 __all__ = ["TargetPictures"]
 

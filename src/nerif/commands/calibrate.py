@@ -16,13 +16,13 @@ from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
-from nerif.imaging.calibration import CalibrationSettings, calibrate_views, target_pictures
-from nerif.imaging.calibration_result import MOUNT, Calibration
-from nerif.imaging.cameras_file import CalibratedCamera, write_cameras
-from nerif.imaging.importers import ImportSettings, import_box, import_cameras, is_calibration
-from nerif.imaging.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
-from nerif.imaging.targets import CalibrationTarget
-from nerif.imaging.views import find_views
+from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views, target_pictures
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
+from nerif.imaging.calibration.importers.importers import ImportSettings, import_box, import_cameras, is_calibration
+from nerif.imaging.calibration.result import MOUNT, Calibration
+from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
+from nerif.imaging.calibration.targets import CalibrationTarget
+from nerif.imaging.readers.views import find_views
 
 __all__ = ["Calibrate", "main", "run"]
 

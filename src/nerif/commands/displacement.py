@@ -18,11 +18,11 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.forward.deflection import Deflection
 from nerif.geometry import Box
 from nerif.imaging.assembly import Scene, Surroundings
-from nerif.imaging.displacement import DisplacementSettings
+from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.measuring import Recording, measure_instant
 from nerif.imaging.over_time import frame_numbers, instants_of, measure_recording
-from nerif.imaging.views import find_views
+from nerif.imaging.readers.views import find_views
 
 __all__ = ["Displacement", "main", "run"]
 
@@ -69,7 +69,7 @@ class Displacement(Settings):
 
     def recording(self) -> Recording:
         """Find the pictures, the cameras and the box."""
-        from nerif.imaging.importers import import_box, import_cameras
+        from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 
         box = Box.between(self.lower, self.upper) or import_box(self.calibration)
         if box is None:

@@ -11,10 +11,11 @@ import tyro
 from nerif.commands.output import check_file, say
 from nerif.commands.settings import Flat, Settings, read_settings, value_given
 from nerif.common.conventions import InputError
-from nerif.imaging import background, targets
-from nerif.imaging.background import Background
+from nerif.imaging import patterns as background
+from nerif.imaging.calibration import targets
+from nerif.imaging.calibration.targets import CalibrationTarget
+from nerif.imaging.patterns import Background
 from nerif.imaging.printing import paper_for, print_pattern
-from nerif.imaging.targets import CalibrationTarget
 
 __all__ = ["PrintBackground", "PrintTarget", "main", "run"]
 

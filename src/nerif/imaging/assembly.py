@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
-from nerif.imaging.displacement import DisplacementMap
+from nerif.imaging.displacement.displacement import DisplacementMap
 
 __all__ = ["Scene", "Surroundings", "join_views"]
 

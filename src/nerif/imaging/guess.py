@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.common.conventions import InputError
-from nerif.imaging.bundle import Pose
-from nerif.imaging.targets import ViewPictures
+from nerif.imaging.calibration.bundle import Pose
+from nerif.imaging.calibration.targets import ViewPictures
 
 __all__ = ["DISAGREE", "Guess", "angles", "contradiction", "enough", "next_camera"]
 

@@ -16,11 +16,11 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
 from nerif.imaging.assembly import Scene, join_views
-from nerif.imaging.cameras_file import CalibratedCamera
-from nerif.imaging.displacement import AtRest, DisplacementMap, DisplacementSettings, measure_against
-from nerif.imaging.exposure import check_exposure
+from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.imaging.displacement.displacement import AtRest, DisplacementMap, DisplacementSettings, measure_against
+from nerif.imaging.displacement.exposure import check_exposure
 from nerif.imaging.masks import MaskSettings, flow_mask
-from nerif.imaging.views import View, good_pictures
+from nerif.imaging.readers.views import View, good_pictures
 from nerif.imaging.workers import cores, work
 
 __all__ = ["Recording", "RestingView", "camera_of", "measure_instant"]

@@ -18,7 +18,7 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Camera, Lens
 from nerif.imaging.assembly import Scene, join_views
 from nerif.imaging.measuring import Recording, RestingView
-from nerif.imaging.views import View
+from nerif.imaging.readers.views import View
 from nerif.imaging.workers import work
 
 __all__ = ["RestingRecording", "frame_numbers", "instants_of", "measure_recording"]

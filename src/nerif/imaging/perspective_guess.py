@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.bundle import Pose
+from nerif.imaging.calibration.bundle import Pose
+from nerif.imaging.calibration.targets import ViewPictures
 from nerif.imaging.guess import DISAGREE, Guess, angles, contradiction, enough, next_camera
-from nerif.imaging.targets import ViewPictures
 
 __all__ = ["guess_perspective"]
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.common.conventions import InputError
-from nerif.imaging.exposure import check_exposure, full_scale, saturated
-from nerif.imaging.frames import as_float, read_each
-from nerif.imaging.views import View
+from nerif.imaging.displacement.exposure import check_exposure, full_scale, saturated
+from nerif.imaging.readers.frames import as_float, read_each
+from nerif.imaging.readers.views import View
 
 __all__ = ["SourceLook", "address_of", "look_at", "reduced"]
 

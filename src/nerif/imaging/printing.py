@@ -9,8 +9,8 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
-from nerif.imaging.background import Background
-from nerif.imaging.targets import CalibrationTarget
+from nerif.imaging.calibration.targets import CalibrationTarget
+from nerif.imaging.patterns import Background
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.common.conventions import InputError
-from nerif.imaging.bundle import Bundle, Pose
+from nerif.imaging.calibration.bundle import Bundle, Pose
+from nerif.imaging.calibration.targets import Detection, ViewPictures
 from nerif.imaging.guess import DISAGREE, Guess, angles, contradiction, enough, next_camera
-from nerif.imaging.targets import Detection, ViewPictures
 
 __all__ = ["guess_telecentric", "mirrored"]
 

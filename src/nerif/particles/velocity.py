@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
-from nerif.imaging.correlation import correlate
+from nerif.imaging.displacement.correlation import correlate
 
 __all__ = ["Velocity", "velocity_between"]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.common.files import atomic
-from nerif.imaging.calibration_result import Calibration
+from nerif.imaging.calibration.result import Calibration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,10 +21,10 @@ from nerif.app.workspace import Workspace
 from nerif.commands.calibrate import Calibrate
 from nerif.commands.settings import merge
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration_result import ImageError
-from nerif.imaging.simple_rig import SimpleRig
-from nerif.imaging.targets import KINDS, CalibrationTarget
-from nerif.imaging.views import View
+from nerif.imaging.calibration.result import ImageError
+from nerif.imaging.calibration.simple_rig import SimpleRig
+from nerif.imaging.calibration.targets import KINDS, CalibrationTarget
+from nerif.imaging.readers.views import View
 from nerif.toml import read_toml
 
 __all__ = ["PAGE"]

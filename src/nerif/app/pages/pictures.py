@@ -16,10 +16,10 @@ from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
-from nerif.imaging.crop import Crop
 from nerif.imaging.picture_looks import SourceLook
-from nerif.imaging.views import View
-from nerif.imaging.views_file import write_crops
+from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.views import View
+from nerif.imaging.readers.views_file import write_crops
 
 __all__ = ["PAGE"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from nerif.imaging.frames import Frames, as_float
+from nerif.imaging.readers.frames import Frames, as_float
 
 __all__ = ["check_exposure", "effective_bits", "full_scale", "saturated"]
 

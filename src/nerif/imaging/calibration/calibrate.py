@@ -16,12 +16,12 @@ from jaxtyping import Float
 
 from nerif.common.conventions import FACES, InputError
 from nerif.geometry import Projection, projection_named
-from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
-from nerif.imaging.calibration_result import Calibration
-from nerif.imaging.first_guess import first_guess
-from nerif.imaging.targets import CalibrationTarget, ViewPictures
+from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
+from nerif.imaging.calibration.first_guess import first_guess
+from nerif.imaging.calibration.result import Calibration
+from nerif.imaging.calibration.targets import CalibrationTarget, ViewPictures
+from nerif.imaging.readers.views import View, find_targets, pose_names
 from nerif.imaging.telecentric_guess import mirrored
-from nerif.imaging.views import View, find_targets, pose_names
 from nerif.toml import check_known
 
 __all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_pictures"]

@@ -16,7 +16,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
-from nerif.imaging.frames import Frames
+from nerif.imaging.readers.frames import Frames
 
 __all__ = ["FileFrames"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from nerif.imaging.frames import as_float
+from nerif.imaging.readers.frames import as_float
 
 __all__ = ["FLOOR", "local_correlation", "smoothed_away", "structure_variance"]
 

@@ -11,7 +11,14 @@ from typing import Any
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.imaging.cameras_file import CalibratedCamera, check_distortion, check_model, five, image_size, numbers
+from nerif.imaging.calibration.cameras_file import (
+    CalibratedCamera,
+    check_distortion,
+    check_model,
+    five,
+    image_size,
+    numbers,
+)
 
 __all__ = ["read_transforms"]
 

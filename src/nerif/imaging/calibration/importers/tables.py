@@ -11,7 +11,16 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, projection_named
-from nerif.imaging.cameras_file import FORMAT, CalibratedCamera, five, image_size, numbers, plane, read_cameras, upright
+from nerif.imaging.calibration.cameras_file import (
+    FORMAT,
+    CalibratedCamera,
+    five,
+    image_size,
+    numbers,
+    plane,
+    read_cameras,
+    upright,
+)
 from nerif.toml import check_known, read_toml
 
 __all__ = ["read_csv", "read_tables"]

@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from nerif.forward.images import LEAST, around, difference_variance, grey_variance
-from nerif.imaging.frames import as_float
-from nerif.imaging.warping import warp
+from nerif.imaging.displacement.warping import warp
+from nerif.imaging.readers.frames import as_float
 
 __all__ = ["CameraNoise", "PicturePair"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.frames import Frames
+from nerif.imaging.readers.frames import Frames
 
 __all__ = ["ArrayFrames", "Hdf5Frames"]
 

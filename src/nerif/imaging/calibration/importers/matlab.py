@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.imaging.cameras_file import (
+from nerif.imaging.calibration.cameras_file import (
     CalibratedCamera,
     check_distortion,
     check_model,

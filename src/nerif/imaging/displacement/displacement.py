@@ -18,13 +18,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from nerif.common.conventions import InputError
-from nerif.imaging.exposure import saturated
-from nerif.imaging.frames import as_float
-from nerif.imaging.noise import FLOOR, local_correlation, smoothed_away, structure_variance
-from nerif.imaging.optical_flow import FLOWS
-from nerif.imaging.photometry import CameraNoise, PicturePair
-from nerif.imaging.shake import border, remove_shake
-from nerif.imaging.warping import warp
+from nerif.imaging.displacement.exposure import saturated
+from nerif.imaging.displacement.noise import FLOOR, local_correlation, smoothed_away, structure_variance
+from nerif.imaging.displacement.optical_flow import FLOWS
+from nerif.imaging.displacement.photometry import CameraNoise, PicturePair
+from nerif.imaging.displacement.shake import border, remove_shake
+from nerif.imaging.displacement.warping import warp
+from nerif.imaging.readers.frames import as_float
 
 __all__ = [
     "AtRest",

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 
 from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
-from nerif.imaging.bundle import COEFFICIENTS, Bundle, Observation
+from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation
+from nerif.imaging.calibration.targets import ViewPictures
 from nerif.imaging.guess import Guess
 from nerif.imaging.perspective_guess import guess_perspective
-from nerif.imaging.targets import ViewPictures
 from nerif.imaging.telecentric_guess import guess_telecentric
 
 __all__ = ["first_guess"]

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nerif.imaging.crop import Crop
-from nerif.imaging.views import find_views
+from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.views import find_views
 from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = ["BEFORE", "write_crops"]

@@ -16,12 +16,12 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
-from nerif.imaging.cameras_file import CalibratedCamera, check_names, checked, read_box
-from nerif.imaging.matlab import read_matlab
-from nerif.imaging.nerfstudio import read_transforms
-from nerif.imaging.opencv import ENDINGS as OPENCV
-from nerif.imaging.opencv import read_opencv, read_opencv_folder
-from nerif.imaging.tables import read_csv, read_tables
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_names, checked, read_box
+from nerif.imaging.calibration.importers.matlab import read_matlab
+from nerif.imaging.calibration.importers.nerfstudio import read_transforms
+from nerif.imaging.calibration.importers.opencv import ENDINGS as OPENCV
+from nerif.imaging.calibration.importers.opencv import read_opencv, read_opencv_folder
+from nerif.imaging.calibration.importers.tables import read_csv, read_tables
 
 __all__ = ["ImportSettings", "import_box", "import_cameras", "is_calibration"]
 

@@ -10,7 +10,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nerif.common.conventions import InputError
-from nerif.imaging.corners import eight_bit, first_at_a_black_square, first_at_the_upper_left, saddle_points, spacing
+from nerif.imaging.calibration.corners import (
+    eight_bit,
+    first_at_a_black_square,
+    first_at_the_upper_left,
+    saddle_points,
+    spacing,
+)
 
 __all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewPictures"]
 

@@ -12,10 +12,10 @@ import re
 from pathlib import Path
 
 from nerif.common.conventions import InputError
-from nerif.imaging.array_files import ArrayFrames, Hdf5Frames
-from nerif.imaging.frames import Frames, SelectedFrames
-from nerif.imaging.image_files import FileFrames
-from nerif.imaging.photron import PhotronFrames
+from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
+from nerif.imaging.readers.frames import Frames, SelectedFrames
+from nerif.imaging.readers.image_files import FileFrames
+from nerif.imaging.readers.photron import PhotronFrames
 
 __all__ = ["open_frames"]
 

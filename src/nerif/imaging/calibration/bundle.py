@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from nerif.geometry import PERSPECTIVE, Projection
 from nerif.geometry.distortion import POWERS, distort
-from nerif.imaging.targets import Detection
+from nerif.imaging.calibration.targets import Detection
 
 __all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust", "crossing"]
 

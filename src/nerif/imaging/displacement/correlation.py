@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.frames import as_float
-from nerif.imaging.warping import warp
+from nerif.imaging.displacement.warping import warp
+from nerif.imaging.readers.frames import as_float
 
 __all__ = ["Vectors", "correlate", "normalised_median_outliers", "window_correlation"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.frames import size_in_words
+from nerif.imaging.readers.frames import size_in_words
 
 __all__ = ["Crop"]
 

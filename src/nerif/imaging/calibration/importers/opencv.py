@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.cameras_file import (
+from nerif.imaging.calibration.cameras_file import (
     CalibratedCamera,
     check_distortion,
     check_model,

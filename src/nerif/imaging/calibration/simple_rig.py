@@ -20,10 +20,10 @@ from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane
-from nerif.imaging.cameras_file import CalibratedCamera, checked
-from nerif.imaging.importers import ImportSettings
-from nerif.imaging.readers import open_frames
-from nerif.imaging.views import find_views
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, checked
+from nerif.imaging.calibration.importers.importers import ImportSettings
+from nerif.imaging.readers.open import open_frames
+from nerif.imaging.readers.views import find_views
 
 __all__ = ["RULER", "SimpleRig", "box_about_axis", "find_picture", "simple_camera"]
 

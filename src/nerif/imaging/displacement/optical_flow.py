@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nerif.imaging.correlation import window_correlation
+from nerif.imaging.displacement.correlation import window_correlation
 
 __all__ = ["FLOWS"]
 
