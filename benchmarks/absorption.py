@@ -19,7 +19,7 @@ from nerif.fields.network import NetworkShape
 from nerif.forward.absorption import MODELS
 from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 
 LOWEST = -2.7e-4
 """Index excess of what is so hot that nothing is left of the index of air."""

@@ -74,7 +74,7 @@ def main() -> None:
         return
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import paper_rig
-    from nerif.simulation import simulate
+    from nerif.simulation.simulate import simulate
 
     more = f"; nine views of {asked.pixels} x {asked.pixels} px, {asked.seconds:g} s a run, medians of {asked.turns}"
     columns = ("beside", "steps before", "steps now", "now / before")

@@ -21,10 +21,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bench import Table, add_write
-from nerif.experiment import Experiment, background_scale, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate
 from nerif.imaging.readers.views import find_targets, find_views
+from nerif.simulation.experiment import Experiment, background_scale, world_axes
 
 COLUMNS = ("camera", "pictures", "rms [px]", "rotation [deg]", "stated", "translation [mm]", "stated", "position [mm]",
            "plane [mm]", "plane, rms [mm]")  # fmt: skip

@@ -26,7 +26,7 @@ from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.fused import value_and_gradient
 from nerif.reconstruction.losses import LossWeights
 from nerif.reconstruction.neural import NeRIF
-from nerif.simulation import add_noise, simulate
+from nerif.simulation.simulate import add_noise, simulate
 
 
 def rate(work: Callable[[], object], points: int) -> float:

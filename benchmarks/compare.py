@@ -122,7 +122,7 @@ def main() -> None:
         return
     from nerif.fields.phantoms import Flame
     from nerif.geometry import paper_rig
-    from nerif.simulation import add_noise, simulate
+    from nerif.simulation.simulate import add_noise, simulate
 
     versions = {name: _commit(path) for name, path in (("before", asked.before), ("now", HERE))}
     columns = ("work", "ms before", "ms now", "now / before", "quartiles")

@@ -26,7 +26,7 @@ from nerif.prediction import predict_view
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 BOX = Box.cube(50.0)
 TRUTH = 100  # voxels along an edge

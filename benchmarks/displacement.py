@@ -23,8 +23,8 @@ from nerif.geometry import paper_rig
 from nerif.imaging.displacement.displacement import DisplacementSettings, measure
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.patterns import KINDS, Background
-from nerif.rendering import Sensor, background_texture, pattern_size, render
-from nerif.simulation import view_displacement
+from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
+from nerif.simulation.simulate import view_displacement
 
 LARGEST = 3.0  # px
 REFERENCES = 5

@@ -20,7 +20,7 @@ from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.multiplicative import MLEM
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 
 
 def methods(asked: argparse.Namespace) -> dict[str, Callable[[int], Reconstructor]]:

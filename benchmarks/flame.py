@@ -23,7 +23,7 @@ from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import PRESETS, preset
-from nerif.simulation import add_noise, simulate
+from nerif.simulation.simulate import add_noise, simulate
 
 COLUMNS = (
     "preset", "noise", "L2", "L2 of variation", "CC", "SSIM", "steps", "epochs", "seconds", "memory [GiB]", "outcome",

@@ -28,7 +28,7 @@ from nerif.reconstruction import bins
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
-from nerif.simulation import add_noise
+from nerif.simulation.simulate import add_noise
 
 COLUMNS = (
     "pixels", "edge of the bins [px]", "steps", "passes", "seconds", "memory [GiB]", "L2", "L2 of variation", "outcome",

@@ -72,7 +72,7 @@ def simulated(case: Case, seed: int, folder: Path) -> tuple[Path, Path]:
     from nerif.data.volume_file import write_netcdf
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import Grid, paper_rig
-    from nerif.simulation import add_noise, simulate
+    from nerif.simulation.simulate import add_noise, simulate
 
     name = f"{case.phantom}-{case.pixels}-{case.noise:g}-{seed}"
     data, truth = folder / f"{name}.nc", folder / f"{name}.truth.nc"

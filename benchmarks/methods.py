@@ -28,7 +28,7 @@ from nerif.reconstruction.presets import preset
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.voxels import VoxelReconstructor
-from nerif.simulation import add_noise, simulate
+from nerif.simulation.simulate import add_noise, simulate
 
 COLUMNS = (
     "phantom", "noise", "method", "grid", "L2", "L2 of variation", "CC", "SSIM", "seconds", "memory [GiB]",

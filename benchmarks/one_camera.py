@@ -36,7 +36,7 @@ from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.simulation import add_noise, simulate
+from nerif.simulation.simulate import add_noise, simulate
 
 BOX = Box.cube(50.0)
 EVALUATED = Box((-25.0, -25.0, -20.0), (25.0, 25.0, 20.0))

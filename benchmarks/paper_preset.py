@@ -28,7 +28,7 @@ from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.losses import DATA
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import preset
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 METHODS = ("paper", "fast, equal steps", "fast, equal seconds")
 WHAT = ("steps", "CPU seconds", "L2 of variation", "CC")

@@ -15,14 +15,14 @@ from dataclasses import replace
 from bench import Table, add_write
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
-from nerif.particles.cloud import Particles, quality_factor
-from nerif.particles.pictures import pictures
-from nerif.particles.rig import four_cameras
-from nerif.particles.ring import VortexRing
-from nerif.particles.velocity import velocity_between
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.multiplicative import MART, MLEM
 from nerif.reconstruction.presets import preset
+from nerif.simulation.particles.cloud import Particles, quality_factor
+from nerif.simulation.particles.pictures import pictures
+from nerif.simulation.particles.rig import four_cameras
+from nerif.simulation.particles.ring import VortexRing
+from nerif.simulation.particles.velocity import velocity_between
 
 SECONDS, VOXEL = 1e-3, 0.1
 METHODS = ("MART", "MLEM", "NeRIF")

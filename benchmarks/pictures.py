@@ -30,7 +30,7 @@ from nerif.imaging.assembly import Scene, Surroundings, join_views
 from nerif.imaging.displacement.displacement import DisplacementSettings, measure
 from nerif.imaging.patterns import Background
 from nerif.prediction import predict
-from nerif.rendering import Sensor, background_texture, pattern_size, render
+from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
 
 REFERENCES = 5
 CHECKER = "checker"

@@ -16,7 +16,7 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.turbulence import inertial_scalar
 from nerif.geometry import Box, Ring
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 __all__ = ["Bodies", "RandomFlow", "random_flow"]
 

@@ -36,7 +36,7 @@ from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.store import DONE, Frame, SequenceStore
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 
 COLUMNS = (
     "views", "s between frames", "change", "how", "steps a frame", "seconds a frame", "L2", "L2 of variation", "CC",

@@ -24,7 +24,7 @@ from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import preset
 from nerif.reconstruction.target import Target
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 COLUMNS = ("octaves", "width", "depth", "loss / that of the empty field", "taken back", "seconds", "outcome")
 

@@ -20,7 +20,7 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from random_flows import random_flow
 
 __all__ = ["SPOILED", "Case", "case"]

@@ -62,7 +62,7 @@ def case(
     from nerif.geometry import Box, Grid, Ring
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.result import ResultDirectory
-    from nerif.simulation import simulate
+    from nerif.simulation.simulate import simulate
     from nerif.workflow import reconstruct_into
 
     keep_freed_memory()

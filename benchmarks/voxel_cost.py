@@ -23,7 +23,7 @@ from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory, peak_memory, resolve_device
 from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 COLUMNS = (
     "grid", "basis", "samples [million]", "iterations", "seconds", "ns a sample and iteration", "of it operator",

@@ -21,7 +21,7 @@ from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.presets import preset
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.simulation import add_noise, simulate
+from nerif.simulation.simulate import add_noise, simulate
 
 COLUMNS = (
     "start", "fit steps", "rate after it", "seconds of the start", "seconds in all", "L2", "L2 of variation", "CC",

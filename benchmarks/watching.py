@@ -39,7 +39,7 @@ def simulated(path: Path, pixels: int) -> None:
     """Write what all turns reconstruct."""
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import paper_rig
-    from nerif.simulation import simulate
+    from nerif.simulation.simulate import simulate
 
     cameras, box = paper_rig(pixels)
     simulate(make_phantom("gaussians", box, 0), cameras, box, N_AMBIENT).write(path)

@@ -12,7 +12,7 @@ from nerif.geometry import Camera, paper_rig
 from nerif.prediction import predict
 from nerif.reconstruction.refinement import Refinement
 from nerif.reconstruction.rig_posterior import covariance
-from nerif.simulation import add_noise
+from nerif.simulation.simulate import add_noise
 
 BLUE, ORANGE, INK, PALE = "#0072B2", "#E69F00", "#222222", "#DDDDDD"
 VOXELS = 10  # along the box, on which the field follows

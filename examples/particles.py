@@ -15,12 +15,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from nerif.geometry import Grid
-from nerif.particles.cloud import Particles, quality_factor
-from nerif.particles.pictures import pictures
-from nerif.particles.rig import four_cameras
-from nerif.particles.ring import VortexRing
-from nerif.particles.velocity import velocity_between
 from nerif.reconstruction.multiplicative import MART
+from nerif.simulation.particles.cloud import Particles, quality_factor
+from nerif.simulation.particles.pictures import pictures
+from nerif.simulation.particles.rig import four_cameras
+from nerif.simulation.particles.ring import VortexRing
+from nerif.simulation.particles.velocity import velocity_between
 
 parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
 parser.add_argument("out", type=Path, nargs="?", default=Path("out/particles"), help="directory for the results")

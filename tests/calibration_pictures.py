@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from nerif.experiment import background_poses, target_poses
 from nerif.geometry import Camera
 from nerif.imaging.calibration.bundle import Pose
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewPictures
+from nerif.simulation.experiment import background_poses, target_poses
 
 
 def detection(

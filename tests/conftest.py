@@ -52,7 +52,7 @@ from nerif.geometry import Box, Camera, Ring
 from nerif.reconstruction import budget
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.voxels import VoxelReconstructor
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 torch.set_num_threads(1)  # tests run side by side
 

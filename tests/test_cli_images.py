@@ -18,7 +18,7 @@ from nerif.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.imaging.calibration.cameras_file import read_cameras
-from nerif.simulation import view_displacement
+from nerif.simulation.simulate import view_displacement
 
 BOX = ["--lower", "-25", "-25", "-25", "--upper", "25", "25", "25"]
 VIEWS = 4

@@ -14,7 +14,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring, paper_rig
 from nerif.quick_views import binned, fit, without_spikes
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from nerif.symptoms import open_faces
 
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))

@@ -20,7 +20,7 @@ from nerif.halves import Reflection, departures, halved, kept_half, left_of_axis
 from nerif.monitor import Monitor
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.result import ResultDirectory
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from nerif.verdict import WORDS
 from nerif.workflow import Run, reconstruct_into
 

@@ -188,7 +188,7 @@ def loaded_by(statement: str, after: str = "") -> set[str]:
 
 
 def test_core_imports_torch_and_numpy_only():
-    core = "import nerif.geometry, nerif.fields.phantoms, nerif.fields.network, nerif.fields.grid, nerif.simulation\n"
+    core = "import nerif.geometry, nerif.fields.phantoms, nerif.fields.network, nerif.fields.grid, nerif.simulation.simulate\n"
     core += "import nerif.physics.gas_optics, nerif.forward.ray_tracing, nerif.reconstruction.presets\n"
     core += "import nerif.reconstruction.operator, nerif.reconstruction.total_variation\n"
     core += "from nerif.fields.network import Network, NetworkShape as Shape\n"

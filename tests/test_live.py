@@ -14,7 +14,7 @@ from nerif.monitor import QUIET
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 from nerif.workflow import Run, reconstruct_into
 
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(12, 18), pixel_pitch=0.22)

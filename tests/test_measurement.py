@@ -16,7 +16,7 @@ from nerif.data.measurement_file import variables
 from nerif.forward.deflection import Deflection
 from nerif.forward.registry import TECHNIQUES
 from nerif.geometry import Lens, Ring
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from nerif.geometry import Box, Grid, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles
 from nerif.result import ResultDirectory
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 
 def test_it_is_the_field_around_the_axis():

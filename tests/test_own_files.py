@@ -189,9 +189,9 @@ def test_the_demo_keeps_a_measurement_that_is_not_its_own(tmp_path, monkeypatch)
 
 
 def test_pictures_that_were_not_rendered_are_not_rendered_over(tmp_path):
-    from nerif.experiment import Experiment
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import Box, Ring
+    from nerif.simulation.experiment import Experiment
 
     box = Box.around_origin((50.0, 50.0, 50.0))
     cameras = Ring(views=2).cameras(0.0)

@@ -13,8 +13,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Ring
-from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
-from nerif.simulation import view_displacement
+from nerif.simulation.rendering import Sensor, Texture, background_texture, pattern_size, render
+from nerif.simulation.simulate import view_displacement
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 

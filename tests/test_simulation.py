@@ -11,7 +11,7 @@ from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.geometry import Ring, paper_rig
-from nerif.simulation import STEPS, add_noise, simulate, view_displacement
+from nerif.simulation.simulate import STEPS, add_noise, simulate, view_displacement
 
 
 def test_noise_is_a_share_of_the_rms_over_crossing_rays(ball, cameras, box):

@@ -22,7 +22,7 @@ from nerif.prediction import predict
 from nerif.quick_views import binned
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.result import REPROJECTION, ResultDirectory
-from nerif.simulation import Simulation, simulate
+from nerif.simulation.simulate import Simulation, simulate
 from nerif.symptoms import open_faces
 from nerif.workflow import Run, reconstruct_into
 

@@ -33,7 +33,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.report.rig_figure import draw_rig, picture_corners
 from nerif.report.scene import scene_of
 from nerif.result import Result
-from nerif.simulation import simulate, view_displacement
+from nerif.simulation.simulate import simulate, view_displacement
 
 AMBIENT = 1.00027
 

@@ -16,7 +16,7 @@ from nerif.geometry import Box, Camera, Ring
 from nerif.mistakes import Change, Correction, of_one_view, orders
 from nerif.quick_views import compare, predicted_by_others
 from nerif.residuals import CAUSES
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from nerif.unrelated import repeatable, unrelated, unrelated_finding
 
 BOX = Box.cube(50.0)

@@ -15,7 +15,7 @@ from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.report.summary import headline
 from nerif.result import Missing, Result, ResultDirectory
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from nerif.verdict import ONE_CAMERA, WORDS, Estimate, verdict
 from nerif.workflow import Run, reconstruct_into
 

@@ -33,9 +33,9 @@ from .reconstruction.total_variation import TotalVariation as TotalVariation
 from .result import ResultDirectory as ResultDirectory
 from .sequence.plan import SequenceSettings as SequenceSettings
 from .sequence.reconstruct import reconstruct_sequence as reconstruct_sequence
-from .simulation import Simulation as Simulation
-from .simulation import add_noise as add_noise
-from .simulation import simulate as simulate
+from .simulation.simulate import Simulation as Simulation
+from .simulation.simulate import add_noise as add_noise
+from .simulation.simulate import simulate as simulate
 from .workflow import Run as Run
 from .workflow import reconstruct_into as reconstruct_into
 from .workflow import write_report as write_report

@@ -21,7 +21,7 @@ from app.test_results import result
 from nerif.app.pages import PAGES, Page
 from nerif.geometry import Ring
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 from report.browsing import errors, needs_browser, requests, wait_for
 
 pytestmark = needs_browser

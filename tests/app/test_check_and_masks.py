@@ -15,7 +15,7 @@ from app.test_pages import put
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from report.browsing import errors, needs_browser, text, wait_for
 
 pytestmark = needs_browser

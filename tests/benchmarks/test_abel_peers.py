@@ -14,7 +14,7 @@ from nerif.common.conventions import InputError
 from nerif.fields.jets import GaussianJet
 from nerif.geometry import Box, Grid, Ring
 from nerif.metrics import volume_errors
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from one_camera import BOX, EVALUATED, camera_of
 
 JET = GaussianJet(BOX)

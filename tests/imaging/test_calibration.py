@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from calibration_pictures import detection, target_pictures
 from nerif.common.conventions import InputError
-from nerif.experiment import target_poses, world_axes
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.calibration.bundle import Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate
 from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewPictures
+from nerif.simulation.experiment import target_poses, world_axes
 
 TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)
 

@@ -17,7 +17,7 @@ from nerif.forward.emission import Emission
 from nerif.geometry import Box, Grid, Ring
 from nerif.imaging.masks import MaskSettings, drawn_masks, flow_mask, read_mask, with_flow_masks
 from nerif.reconstruction.gauge import visual_hull
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 SHAPE = (60, 90)
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))

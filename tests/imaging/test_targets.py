@@ -8,11 +8,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerif.common.conventions import InputError
-from nerif.experiment import place
 from nerif.geometry import Camera, Plane
 from nerif.imaging.calibration.bundle import Pose
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.rendering import Sensor, render
+from nerif.simulation.experiment import place
+from nerif.simulation.rendering import Sensor, render
 
 TARGETS = {
     "chessboard": CalibrationTarget("chessboard", 10, 7, pitch=6.0),

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from calibration_pictures import target_pictures
 from nerif.common.conventions import InputError
-from nerif.experiment import side_of_one, world_axes
 from nerif.geometry import TELECENTRIC, Camera, Ring
 from nerif.imaging.calibration.bundle import _Layout
 from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_the_right_side, calibrate
@@ -19,6 +18,7 @@ from nerif.imaging.calibration.first_guess import first_guess
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.imaging.telecentric_guess import mirrored
+from nerif.simulation.experiment import side_of_one, world_axes
 
 TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)
 

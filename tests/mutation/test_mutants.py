@@ -32,7 +32,7 @@ from nerif.imaging.calibration.importers.importers import import_cameras
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.sequence.store import Frame, SequenceStore
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 

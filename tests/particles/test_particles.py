@@ -9,10 +9,10 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Grid
-from nerif.particles.cloud import Particles, quality_factor, spread
-from nerif.particles.pictures import picture, pictures
-from nerif.particles.rig import four_cameras
 from nerif.reconstruction.multiplicative import MART, MLEM
+from nerif.simulation.particles.cloud import Particles, quality_factor, spread
+from nerif.simulation.particles.pictures import picture, pictures
+from nerif.simulation.particles.rig import four_cameras
 
 BOX = Box((-1.0, -2.0, -1.5), (1.0, 2.0, 1.5))
 GRID = Grid(BOX, (30, 40, 20))

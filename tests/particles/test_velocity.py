@@ -12,9 +12,9 @@ from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.imaging.displacement.correlation import normalised_median_outliers
-from nerif.particles.cloud import Particles
-from nerif.particles.ring import VortexRing
-from nerif.particles.velocity import velocity_between
+from nerif.simulation.particles.cloud import Particles
+from nerif.simulation.particles.ring import VortexRing
+from nerif.simulation.particles.velocity import velocity_between
 
 RING = VortexRing(radius=4.0, core=1.2, circulation=300.0, centre=(0.5, -1.0, 2.0))
 BOX = Box((-1.6, -2.4, -2.0), (1.6, 2.4, 2.0))

@@ -13,8 +13,8 @@ from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
-from nerif.physics.design import DesignSettings, expect
-from nerif.simulation import view_displacement
+from nerif.simulation.design import DesignSettings, expect
+from nerif.simulation.simulate import view_displacement
 
 RING = Ring(views=5, image_size=(160, 200))
 PARALLEL = replace(RING, projection="telecentric", magnification=0.08)

@@ -33,7 +33,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.training_data import FrameData
 from nerif.result import ResultDirectory
-from nerif.simulation import simulate, view_displacement
+from nerif.simulation.simulate import simulate, view_displacement
 
 BOX = Box.cube(50.0)
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(14, 16), pixel_pitch=0.25)

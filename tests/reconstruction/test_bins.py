@@ -12,7 +12,7 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Ring
 from nerif.reconstruction.bins import binned_rays, coarsest_edge
 from nerif.reconstruction.target import Target
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 EDGE = 3
 

@@ -24,7 +24,7 @@ from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.some_pixels import hold_back
 from nerif.reconstruction.training_data import FrameData
-from nerif.simulation import add_noise
+from nerif.simulation.simulate import add_noise
 
 ENDLESS = NeRIF(
     network=NetworkShape(depth=2, width=32, octaves=2), samples=(12, 16), points_per_batch=512, first_cycle=40,

@@ -16,7 +16,7 @@ from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 NETWORK = NeRIF(
     network=NetworkShape(depth=1, width=8, octaves=1), points_per_batch=256, max_steps=2, device="cpu",

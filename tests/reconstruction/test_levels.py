@@ -18,7 +18,7 @@ from nerif.reconstruction.levels import Level, levels, pixels_in_a_voxel
 from nerif.reconstruction.problem import Iterate
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.weight import choose_weight
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="module")

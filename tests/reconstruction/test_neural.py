@@ -26,7 +26,7 @@ from nerif.reconstruction.neural import NeRIF
 from nerif.reconstruction.presets import PRESETS, preset
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 SMALL = NeRIF(
     network=NetworkShape(depth=2, width=32, octaves=2),

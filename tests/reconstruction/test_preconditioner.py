@@ -15,7 +15,7 @@ from nerif.reconstruction.operator import VoxelOperator
 from nerif.reconstruction.preconditioner import filtered, response, spectrum_of_differences
 from nerif.reconstruction.problem import Penalty, Problem, conjugate_gradients
 from nerif.reconstruction.target import Target
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 SHAPE = (6, 8, 9)
 

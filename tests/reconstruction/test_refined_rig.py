@@ -28,7 +28,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.report.moves_figure import draw_moves
 from nerif.rig_check import check_rig
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
 RING = Ring(views=7, arc=(0.0, 154.0), image_size=(26, 28), pixel_pitch=0.15)

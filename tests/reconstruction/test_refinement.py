@@ -26,7 +26,7 @@ from nerif.reconstruction.refined_rig import moved_lines, with_corrections
 from nerif.reconstruction.refinement import Refinement
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.training_data import FrameData
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
 RING = Ring(views=5, arc=(0.0, 144.0), image_size=(24, 26), pixel_pitch=0.15)

@@ -28,7 +28,7 @@ from nerif.reconstruction.symmetric_operator import SymmetricOperator
 from nerif.reconstruction.symmetry import check_views, symmetry_asked
 from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 
 SIDES = ("x-", "x+", "y-", "y+")
 

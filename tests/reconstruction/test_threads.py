@@ -18,7 +18,7 @@ from nerif.prediction import predict, reproject
 from nerif.reconstruction import threads
 from nerif.reconstruction.threads import Cores, Used, free_threads
 from nerif.rig_check import check_rig
-from nerif.simulation import view_displacement
+from nerif.simulation.simulate import view_displacement
 
 NUMBA_STARTS = """
 import torch

@@ -30,7 +30,7 @@ from nerif.sequence.chunk_data import ChunkData
 from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
-from nerif.simulation import simulate
+from nerif.simulation.simulate import simulate
 from sequence_films import QUICK, blank
 
 SHAPE = NetworkShape(depth=2, width=16, octaves=2)

@@ -29,7 +29,7 @@ from nerif.sequence.frames import finished_frame
 from nerif.sequence.plan import SequencePlan, SequenceSettings
 from nerif.sequence.run import outcome_table
 from nerif.sequence.store import SequenceStore
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 from sequence_films import COLD, RIG, blank
 
 

@@ -43,7 +43,7 @@ from nerif.reconstruction.tikhonov import Tikhonov
 from nerif.reconstruction.total_variation import TotalVariation
 from nerif.reconstruction.training import Training
 from nerif.reconstruction.training_data import FrameData
-from nerif.simulation import Simulation, simulate
+from nerif.simulation.simulate import Simulation, simulate
 
 PACKAGE = Path(registry.__file__).parents[1]
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))

@@ -17,7 +17,7 @@ from nerif.common.installation import install
 from nerif.geometry import Ring
 from nerif.reconstruction.neural import NeRIF
 from nerif.result import ResultDirectory
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 from nerif.workflow import Run, write_report
 
 __all__ = ["Demo", "main", "run"]

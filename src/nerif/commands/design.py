@@ -12,7 +12,7 @@ from nerif.commands.output import check_file, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.geometry import Ring
-from nerif.physics.design import DesignSettings, Expectation, expect
+from nerif.simulation.design import DesignSettings, Expectation, expect
 
 __all__ = ["Design", "main", "run"]
 

@@ -13,10 +13,10 @@ from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import AMBIENT_INDEX
 from nerif.common.interruption import if_interrupted
-from nerif.experiment import Experiment
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.result import ResultDirectory
+from nerif.simulation.experiment import Experiment
 
 __all__ = ["Render", "main", "run"]
 

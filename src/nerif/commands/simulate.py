@@ -14,7 +14,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
 from nerif.data.volume_file import write_netcdf
 from nerif.geometry import Ring
-from nerif.simulation import Simulation
+from nerif.simulation.simulate import Simulation
 
 __all__ = ["Simulate", "main", "run"]
 

@@ -14,7 +14,7 @@ from nerif.app.pieces import CommandLine, card, figures
 from nerif.app.rig_drawing import rig_drawing
 from nerif.app.workspace import Workspace
 from nerif.commands.design import Design
-from nerif.physics.design import Expectation, expect
+from nerif.simulation.design import Expectation, expect
 
 __all__ = ["PAGE"]
 

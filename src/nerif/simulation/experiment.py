@@ -24,7 +24,7 @@ from nerif.imaging.calibration.bundle import Pose
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.patterns import Background
-from nerif.rendering import Sensor, Texture, background_texture, pattern_size, render
+from nerif.simulation.rendering import Sensor, Texture, background_texture, pattern_size, render
 from nerif.toml import write_toml
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "side_of_one", "target_poses", "world_axes"]

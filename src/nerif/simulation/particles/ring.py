@@ -21,7 +21,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.geometry import Box
-from nerif.particles.cloud import Particles
+from nerif.simulation.particles.cloud import Particles
 
 __all__ = ["VortexRing"]
 

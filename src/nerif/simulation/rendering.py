@@ -17,7 +17,7 @@ from nerif.common.conventions import InputError, Points
 from nerif.fields.base import Field
 from nerif.forward.ray_tracing import trace
 from nerif.geometry import Box, Camera, Lens, Plane, Rays
-from nerif.simulation import STEPS
+from nerif.simulation.simulate import STEPS
 
 __all__ = ["Sensor", "Texture", "background_texture", "render"]
 

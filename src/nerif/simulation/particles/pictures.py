@@ -18,7 +18,7 @@ from nerif.common.conventions import AMBIENT_INDEX, InputError
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.forward.registry import technique_of
 from nerif.geometry import Camera
-from nerif.particles.cloud import DIAMETER, QUANTITY, Particles, spread
+from nerif.simulation.particles.cloud import DIAMETER, QUANTITY, Particles, spread
 
 __all__ = ["picture", "pictures"]
 
