@@ -18,7 +18,7 @@ from nerif.evaluation import evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.forward.absorption import MODELS
 from nerif.geometry import Ring
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.simulation.simulate import Simulation
 
 

@@ -18,8 +18,8 @@ from nerif.evaluation import evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import Simulation
 
 LOWEST = -2.7e-4

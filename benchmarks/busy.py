@@ -32,7 +32,7 @@ def train(path: Path, seconds: float) -> int:
     """Return the steps of a run of so many seconds in this process."""
     from nerif.data.measurement import Measurement
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
+    from nerif.reconstruction.neural.neural import NeRIF
 
     keep_freed_memory()
     result = NeRIF(epochs=0, time_limit=seconds, seed=0, device="cpu")(Measurement.read(path))

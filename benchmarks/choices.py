@@ -23,9 +23,9 @@ from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.fused import value_and_gradient
-from nerif.reconstruction.losses import LossWeights
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.fused import value_and_gradient
+from nerif.reconstruction.neural.losses import LossWeights
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.simulation.simulate import add_noise, simulate
 
 

@@ -40,8 +40,8 @@ def take_turns(work: str, data: Path) -> None:
     from nerif.data.measurement import Measurement
     from nerif.reconstruction.base import Reconstructor
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.tikhonov import Tikhonov
+    from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
     keep_freed_memory()
     network = NeRIF(max_steps=10**7, epochs=1e9, device="cpu")

@@ -24,8 +24,8 @@ from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
 from nerif.prediction import predict_view
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.simulation.simulate import simulate
 
 BOX = Box.cube(50.0)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from bench import Table, add_write
 from nerif.common.files import atomic
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.trials import LOST, Deviations
+from nerif.reconstruction.uncertainty.bootstrap import LOST, Deviations
 from nerif.result import ResultDirectory
 from random_flows import random_flow
 
@@ -56,9 +56,9 @@ def _reconstructed(number: int) -> dict[str, float | str]:
     from nerif.physics.quantities import GasSettings
     from nerif.prediction import reproject
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.repetition import VOXELS, Found
-    from nerif.reconstruction.trials import Trials
+    from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.uncertainty.bootstrap import Trials
+    from nerif.reconstruction.uncertainty.repetition import VOXELS, Found
     from nerif.workflow import Run, reconstruct_into
 
     torch.set_num_threads(1)

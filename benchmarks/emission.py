@@ -17,9 +17,9 @@ from bench import Table, add_write
 from nerif.evaluation import evaluate_volume
 from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.multiplicative import MLEM
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.multiplicative import MLEM
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import Simulation
 
 

@@ -23,7 +23,7 @@ from nerif.evaluation import evaluate_volume
 from nerif.fields.encoding import DIRECTIONS
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.simulation.simulate import add_noise, simulate
 
 PHANTOMS = ("1", "2", "3", "4", "5", "6", "7", "octahedron", "fire", "turbulence")

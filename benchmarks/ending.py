@@ -24,7 +24,7 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.geometry import Grid
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural.presets import preset
 
 LONGER = 4
 

@@ -21,8 +21,8 @@ def run(path: Path, truth: Path, method: str, limit: float, hold_out: str) -> tu
     from nerif.evaluation import evaluate
     from nerif.reconstruction.base import Reconstructor
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.total_variation import TotalVariation
+    from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.voxels.total_variation import TotalVariation
     from nerif.result import ResultDirectory
     from nerif.workflow import Run, reconstruct_into
 

@@ -22,7 +22,7 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.presets import PRESETS, preset
+from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.simulation.simulate import add_noise, simulate
 
 COLUMNS = (

@@ -24,10 +24,10 @@ from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, paper_rig
 from nerif.prediction import predict
-from nerif.reconstruction import bins
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural import bins
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.presets import preset
 from nerif.simulation.simulate import add_noise
 
 COLUMNS = (

@@ -28,8 +28,8 @@ from nerif.members import all_quantities
 from nerif.physics.quantities import GasSettings
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.precision import MixedPrecision
-from nerif.reconstruction.warm_start import fit_network
+from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.warm_start import fit_network
 from nerif.result import ResultDirectory
 from nerif.workflow import write_report
 

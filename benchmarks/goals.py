@@ -96,10 +96,10 @@ def run(case: Case, seed: int, data: Path, truth: Path) -> dict[str, Any]:
     from nerif.forward.path_integral import PathIntegral, project
     from nerif.forward.registry import forward_model
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.landweber import Landweber
-    from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.tikhonov import Tikhonov
-    from nerif.reconstruction.total_variation import TotalVariation
+    from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.voxels.landweber import Landweber
+    from nerif.reconstruction.voxels.tikhonov import Tikhonov
+    from nerif.reconstruction.voxels.total_variation import TotalVariation
 
     keep_freed_memory()
     methods = {kind.__name__: kind for kind in (NeRIF, TotalVariation, Tikhonov, Landweber)}

@@ -23,11 +23,11 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.presets import preset
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
-from nerif.reconstruction.voxels import VoxelReconstructor
+from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import add_noise, simulate
 
 COLUMNS = (

@@ -33,9 +33,9 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Grid, Ring
 from nerif.metrics import volume_errors
 from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import add_noise, simulate
 
 BOX = Box.cube(50.0)

@@ -22,12 +22,12 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.reconstruction import budget
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.losses import DATA
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural import schedule as budget
+from nerif.reconstruction.neural.losses import DATA
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.presets import preset
 from nerif.simulation.simulate import simulate
 
 METHODS = ("paper", "fast, equal steps", "fast, equal seconds")

@@ -16,8 +16,8 @@ from bench import Table, add_write
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.multiplicative import MART, MLEM
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.simulation.particles.cloud import Particles, quality_factor
 from nerif.simulation.particles.pictures import pictures
 from nerif.simulation.particles.rig import four_cameras

@@ -136,8 +136,8 @@ def reconstruct(folder: Path, method: str, flow: str, source: str, seconds: floa
     """Reconstruct, and compare with the truth."""
     from nerif.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.total_variation import TotalVariation
+    from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.voxels.total_variation import TotalVariation
 
     keep_freed_memory()
     measurement = Measurement.read(folder / f"{flow}.nc")

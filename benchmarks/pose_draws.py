@@ -78,7 +78,7 @@ def run(folder: Path, views: int, size: str, seed: int, refine: bool, steps: int
     from nerif.data.volume_file import read_volume
     from nerif.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
+    from nerif.reconstruction.neural.neural import NeRIF
 
     keep_freed_memory()
     mm, degrees = SIZES[size]

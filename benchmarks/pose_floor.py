@@ -30,8 +30,8 @@ from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera
-from nerif.reconstruction.refinement import Refinement
-from nerif.reconstruction.refit import refit
+from nerif.reconstruction.rig.refinement import Refinement
+from nerif.reconstruction.rig.refit import refit
 
 RIGS = ("pose_small", "pose_large")
 PIXELS, ROUNDS = 3000, 10  # of a view, and steps, to fit cameras to the truth
@@ -71,7 +71,7 @@ def run(path: Path, cameras: tuple[Camera, ...], steps: int, seed: int) -> tuple
     from nerif.alignment import aligned
     from nerif.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
+    from nerif.reconstruction.neural.neural import NeRIF
 
     keep_freed_memory()
     measurement, truth = Measurement.read(path), read_volume(path.with_name("truth.nc"))

@@ -64,10 +64,10 @@ def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[st
     from nerif.prediction import reproject
     from nerif.reconstruction.aperture import seen_through
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.refined_rig import with_corrections
+    from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.rig.refined import with_corrections
     from nerif.reconstruction.sources import of_source
-    from nerif.reconstruction.total_variation import TotalVariation
+    from nerif.reconstruction.voxels.total_variation import TotalVariation
 
     keep_freed_memory()
     measurement = Measurement.read(path)

@@ -30,8 +30,8 @@ from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Ring
 from nerif.metrics import volume_errors
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.presets import PRESETS, preset
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.sequence.frames import reconstruct_frames
 from nerif.sequence.joint import reconstruct_jointly
 from nerif.sequence.plan import SequencePlan, SequenceSettings

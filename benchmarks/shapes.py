@@ -22,7 +22,7 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import paper_rig
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural.presets import preset
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
 

@@ -23,8 +23,8 @@ from skimage.transform import iradon_sart, radon
 
 from bench import Table, add_write
 from nerif.imaging.line_scans import LineScan
-from nerif.reconstruction.multiplicative import MLEM
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.multiplicative import MLEM
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 example = importlib.import_module("spray")

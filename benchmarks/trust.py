@@ -24,8 +24,8 @@ import numpy as np
 from bench import N_AMBIENT, Table, add_write, alone
 from nerif.common.conventions import InputError
 from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.workflow import Run
 
 PHANTOMS = ("gaussians", "flame", "octahedron", "fire")

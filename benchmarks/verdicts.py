@@ -78,8 +78,8 @@ def _reconstructed(number: int, method: str, steps: int, pixels: int) -> dict[st
     from nerif.geometry import Grid
     from nerif.reconstruction.base import Reconstructor
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.neural import NeRIF
-    from nerif.reconstruction.total_variation import TotalVariation
+    from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.voxels.total_variation import TotalVariation
     from nerif.result import ResultDirectory
     from nerif.workflow import Run, reconstruct_into
 

@@ -21,8 +21,8 @@ from nerif.fields.phantoms import make_phantom
 from nerif.forward.deflection import LeverArm
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory, peak_memory, resolve_device
-from nerif.reconstruction.operator import VoxelOperator
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.simulation.simulate import simulate
 
 COLUMNS = (

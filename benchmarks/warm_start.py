@@ -19,8 +19,8 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.presets import preset
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import add_noise, simulate
 
 COLUMNS = (

@@ -51,10 +51,10 @@ def steps_of(way: str, path: Path, preset_name: str, seconds: float, device: str
 
     from nerif.data.measurement import Measurement
     from nerif.live import Live
-    from nerif.monitor import QUIET
     from nerif.reconstruction.base import Step
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.reconstruction.presets import preset
+    from nerif.reconstruction.neural.presets import preset
+    from nerif.reconstruction.progress import QUIET
 
     keep_freed_memory()
     measurement = Measurement.read(path)

@@ -25,9 +25,9 @@ from nerif.imaging.calibration.importers.importers import ImportSettings
 from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
 from nerif.imaging.measuring import Recording, measure_instant
 from nerif.imaging.readers.views import find_views
-from nerif.monitor import Monitor
 from nerif.plotting.drawing import style
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.progress import Monitor
 from nerif.report.meridian_figure import draw_centre_line, draw_section
 from nerif.result import ResultDirectory
 from nerif.workflow import Run, reconstruct_into

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from nerif.geometry import Grid
-from nerif.reconstruction.multiplicative import MART
+from nerif.reconstruction.voxels.multiplicative import MART
 from nerif.simulation.particles.cloud import Particles, quality_factor
 from nerif.simulation.particles.pictures import pictures
 from nerif.simulation.particles.rig import four_cameras

@@ -49,9 +49,9 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
-from nerif.reconstruction import budget
-from nerif.reconstruction.training import Training
-from nerif.reconstruction.voxels import VoxelReconstructor
+from nerif.reconstruction.neural import schedule as budget
+from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.simulation.simulate import simulate
 
 torch.set_num_threads(1)  # tests run side by side

@@ -105,7 +105,7 @@ def test_members_of_other_settings_are_done_again(measured, tmp_path):
 
 def test_a_member_that_diverged_is_left_out_and_told(measured, tmp_path, capsys, monkeypatch):
     from nerif.reconstruction.base import Outcome
-    from nerif.reconstruction.tikhonov import Tikhonov
+    from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
     calls, plain = [], Tikhonov.__call__
 

@@ -14,9 +14,9 @@ import xarray as xr
 
 from nerif.cli import main
 from nerif.data.volume_file import read_volumes
-from nerif.monitor import Monitor
 from nerif.reconstruction.base import Outcome
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.pages import slices
 from nerif.workflow import Run, reconstruct_into
 

@@ -14,11 +14,11 @@ import torch
 from nerif.cli import main
 from nerif.fields.network import NetworkShape
 from nerif.first_look import FEWEST, kept_out
-from nerif.monitor import Monitor
 from nerif.reconstruction.base import Step
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.trials import best_covered
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.uncertainty.bootstrap import best_covered
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import trust, trust_figures
 from nerif.result import ResultDirectory
 from nerif.workflow import Run, reconstruct_into

@@ -17,8 +17,8 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.halves import Reflection, departures, halved, kept_half, left_of_axis
-from nerif.monitor import Monitor
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.result import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.verdict import WORDS

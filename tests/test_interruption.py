@@ -14,9 +14,9 @@ from nerif.commands import info, output, simulate
 from nerif.commands.output import MONITOR, counting_bar
 from nerif.common.files import atomic, written
 from nerif.common.interruption import Interrupted, if_interrupted
-from nerif.monitor import Monitor
 from nerif.reconstruction.base import Step
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.result import ResultDirectory
 from nerif.workflow import Run, reconstruct_into
 

@@ -189,10 +189,10 @@ def loaded_by(statement: str, after: str = "") -> set[str]:
 
 def test_core_imports_torch_and_numpy_only():
     core = "import nerif.geometry, nerif.fields.phantoms, nerif.fields.network, nerif.fields.grid, nerif.simulation.simulate\n"
-    core += "import nerif.physics.gas_optics, nerif.forward.ray_tracing, nerif.reconstruction.presets\n"
-    core += "import nerif.reconstruction.operator, nerif.reconstruction.total_variation\n"
+    core += "import nerif.physics.gas_optics, nerif.forward.ray_tracing, nerif.reconstruction.neural.presets\n"
+    core += "import nerif.reconstruction.voxels.operator, nerif.reconstruction.voxels.total_variation\n"
     core += "from nerif.fields.network import Network, NetworkShape as Shape\n"
-    core += "from nerif.reconstruction.optimiser import NetworkOptimiser as Optimiser\n"
+    core += "from nerif.reconstruction.neural.optimiser import NetworkOptimiser as Optimiser\n"
     core += "Optimiser('muon', Network(Shape(depth=2, width=8)), (0.9, 0.99), 0.9).zero_grad()"
     # scipy and sympy come in through torch itself, if at all: what torch loads is not ours to hold
     assert not loaded_by(core, after="import torch, jaxtyping") & {*HEAVY, "torch._dynamo"}

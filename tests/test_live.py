@@ -10,10 +10,10 @@ import pytest
 import nerif.live
 from nerif.geometry import Ring
 from nerif.live import Live, read_live, read_look
-from nerif.monitor import QUIET
 from nerif.reconstruction.base import Step
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.progress import QUIET
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.simulation.simulate import Simulation
 from nerif.workflow import Run, reconstruct_into
 

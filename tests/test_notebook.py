@@ -21,7 +21,7 @@ from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
 from nerif.plotting.notebook import VIEWS, panel, show_views
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 
 @pytest.mark.parametrize("name", nerif.__all__)

@@ -20,7 +20,7 @@ from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Ring
 from nerif.prediction import predict
 from nerif.quick_views import binned
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.result import REPROJECTION, ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
 from nerif.symptoms import open_faces

@@ -25,11 +25,11 @@ from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.physics.quantities import GasSettings, derive
 from nerif.prediction import _interpolated, reproject
-from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.fingerprint import _parts, digest
 from nerif.reconstruction.gauge import visual_hull
-from nerif.reconstruction.operator import VoxelOperator
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.neural.bins import binned_rays
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import draw_rig, picture_corners
 from nerif.report.scene import scene_of
 from nerif.result import Result

@@ -12,7 +12,7 @@ import torch
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import headline
 from nerif.result import Missing, Result, ResultDirectory
 from nerif.simulation.simulate import simulate

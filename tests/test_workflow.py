@@ -12,10 +12,10 @@ from nerif import workflow
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN
-from nerif.monitor import Monitor
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstruction
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import picture_corners
 from nerif.result import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
 from nerif.workflow import Run, reconstruct_into

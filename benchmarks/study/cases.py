@@ -15,12 +15,12 @@ from nerif.forward.deflection import MODELS
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device
-from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.losses import LossWeights
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.presets import PRESETS, preset
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.neural.losses import LossWeights
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 
 __all__ = [
     "BOX",

@@ -12,7 +12,7 @@ from typing import Any
 
 from nerif.common.conventions import InputError
 from nerif.reconstruction.device import resolve_device
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural.presets import preset
 from study.cases import FULL, QUICK, SECTIONS, Case, Scale, cases, check_sections
 from study.page import write_page
 from study.progress import progress_of_cases

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
 from study.cases import NOISES, PHANTOMS, SECTIONS, Case
 
 __all__ = ["NoResult", "Record", "Results", "finite", "first_at", "metric", "score", "typical"]

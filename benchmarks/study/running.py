@@ -28,7 +28,7 @@ from nerif.geometry import Grid
 from nerif.metrics import volume_errors
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.simulation.simulate import add_noise, simulate
 from study.cases import BOX, N_AMBIENT, NOISE_SEED, Case
 from study.octahedron import pixels_per_unit, to_plain
@@ -44,9 +44,9 @@ SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 PRELOADED = [
     # of the study's own modules forkserver knows no path before Python 3.12.8; they are small
-    *("nerif.evaluation", "nerif.resolution", "nerif.simulation.simulate", "nerif.reconstruction.neural"),
-    *("nerif.reconstruction.landweber", "nerif.reconstruction.tikhonov", "nerif.reconstruction.total_variation"),
-    *("xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.kernels_numba"),
+    *("nerif.evaluation", "nerif.resolution", "nerif.simulation.simulate", "nerif.reconstruction.neural.neural"),
+    *("nerif.reconstruction.voxels.landweber", "nerif.reconstruction.voxels.tikhonov", "nerif.reconstruction.voxels.total_variation"),
+    *("xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.voxels.kernels_numba"),
     # every optimiser imports it; with CUDA a process must not inherit what the import found out of the GPU
     *(() if torch.backends.cuda.is_built() else ("torch._dynamo",)),
 ]

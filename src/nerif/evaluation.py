@@ -30,7 +30,7 @@ from nerif.observation import Observation
 from nerif.plotting.notebook import number
 from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
-from nerif.reconstruction.refined_rig import with_corrections
+from nerif.reconstruction.rig.refined import with_corrections
 from nerif.residuals import leftover, white_noise
 from nerif.result import METRICS, VOLUME, ResultDirectory
 

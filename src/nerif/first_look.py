@@ -14,12 +14,12 @@ from nerif.evaluation import evaluate_views, rms_text
 from nerif.halves import HALVES, kept_half
 from nerif.json_file import write_json
 from nerif.kept_run import KeptRun
-from nerif.monitor import QUIET, Monitor
 from nerif.prediction import reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
+from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
-from nerif.reconstruction.trials import best_covered
+from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.result import ResultDirectory
 
 __all__ = ["AUTO", "FEWEST", "NONE", "FirstLook", "kept_apart", "kept_out"]

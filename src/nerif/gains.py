@@ -17,7 +17,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.forward.registry import forward_model
 from nerif.geometry import Grid
-from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.voxels.operator import VoxelOperator
 
 __all__ = ["fit_gains", "gains_of", "with_gains"]
 

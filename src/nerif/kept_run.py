@@ -11,10 +11,10 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.monitor import QUIET, Monitor
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step, compose
 from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, write_state
 from nerif.reconstruction.fingerprint import fingerprint
+from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.result import ResultDirectory
 
 __all__ = ["KeptRun"]

@@ -30,10 +30,10 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box, Grid
 from nerif.json_file import write_json
-from nerif.monitor import Monitor
 from nerif.observation import Observation
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
-from nerif.reconstruction.trials import best_covered
+from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.result import LIVE, LIVE_LOOK
 
 __all__ = ["Live", "Look", "read_live", "read_look"]

@@ -17,11 +17,11 @@ from nerif.evaluation import evaluate_views, rms_text
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 from nerif.kept_run import KeptRun
-from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Reconstruction, Reconstructor
-from nerif.reconstruction.repetition import Found, Maps, Repetitions, certainty
+from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.uncertainty.repetition import Found, Maps, Repetitions, certainty
 from nerif.result import ResultDirectory
 
 __all__ = ["Members", "all_quantities"]

@@ -24,9 +24,9 @@ from nerif.forward.path_integral import LENS_RAYS, PathIntegral, Projector, proj
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
 from nerif.geometry import Box, Camera, Grid, Rays
-from nerif.reconstruction.operator import rays_through
-from nerif.reconstruction.symmetric_operator import seen_of
 from nerif.reconstruction.threads import on_free_cores
+from nerif.reconstruction.voxels.operator import rays_through
+from nerif.reconstruction.voxels.symmetric_operator import seen_of
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame

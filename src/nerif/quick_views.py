@@ -14,7 +14,7 @@ from nerif.fields.base import Field
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
 from nerif.prediction import predict_view
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 __all__ = [
     "binned", "compare", "disagreement", "fit", "path_integral", "predicted_by_others", "values_of", "with_values",

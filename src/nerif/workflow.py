@@ -23,30 +23,30 @@ from nerif.halves import departure_sentence, departures, halved
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.live import Live
 from nerif.members import Members, all_quantities
-from nerif.monitor import QUIET, Monitor
 from nerif.physics.quantities import NOT_UNIFORM, GasSettings, masked_lines
 from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
-from nerif.reconstruction.ensemble import Ensemble
 from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints
-from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.multiplicative import MART, MLEM
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.parallel import Ranks
-from nerif.reconstruction.refined_rig import moved_lines, with_corrections
-from nerif.reconstruction.refit import refit
-from nerif.reconstruction.repetition import Repetitions
-from nerif.reconstruction.rig_posterior import with_posterior
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.parallel import Ranks
+from nerif.reconstruction.neural.slow_run import SlowRun
+from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.rig.posterior import with_posterior
+from nerif.reconstruction.rig.refined import moved_lines, with_corrections
+from nerif.reconstruction.rig.refit import refit
 from nerif.reconstruction.shared_settings import SharedSettings
-from nerif.reconstruction.slow_run import SlowRun
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.threads import Cores
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
-from nerif.reconstruction.trials import Trials
-from nerif.reconstruction.voxels import VoxelReconstructor
+from nerif.reconstruction.uncertainty.bootstrap import Trials
+from nerif.reconstruction.uncertainty.ensemble import Ensemble
+from nerif.reconstruction.uncertainty.repetition import Repetitions
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.multiplicative import MART, MLEM
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.result import CALIBRATION, REPORT, ResultDirectory, versions

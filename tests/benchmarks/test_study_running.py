@@ -23,8 +23,8 @@ from nerif.fields.base import Field
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from study.cases import FULL, METHODS, NOISES, PHANTOMS, QUICK, SECTIONS, Case, cases
 from study.command import main, parser
 from study.records import of_other_versions, read_record, write_record

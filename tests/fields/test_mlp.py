@@ -16,7 +16,7 @@ from nerif.fields.network import ACTIVATIONS, Network, NetworkShape, NeuralField
 from nerif.geometry import Box
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.files import FIELD, read_field, write_field
-from nerif.reconstruction.presets import PRESETS
+from nerif.reconstruction.neural.presets import PRESETS
 
 BASE = NetworkShape(depth=3, width=11, octaves=2, skip=2, head_width=5, gradient_head=True)
 SHAPES = {

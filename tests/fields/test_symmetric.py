@@ -13,7 +13,7 @@ from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.files import read_field, write_field
-from nerif.reconstruction.fused import value_and_gradient
+from nerif.reconstruction.neural.fused import value_and_gradient
 
 BOX = Box.cube(40.0)
 KINDS = ["axis", "planar", "axis+2"]

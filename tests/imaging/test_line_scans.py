@@ -9,7 +9,7 @@ import pytest
 
 from nerif.common.conventions import InputError
 from nerif.imaging.line_scans import LineScan
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 ANGLES = np.radians(np.arange(0, 180, 12.0))
 POSITIONS = -6 + 0.25 * np.arange(47)  # not about the axis

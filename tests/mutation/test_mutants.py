@@ -29,8 +29,8 @@ from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Grid, Ring
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.calibration.importers.importers import import_cameras
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.sequence.store import Frame, SequenceStore
 from nerif.simulation.simulate import simulate
 

@@ -9,7 +9,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.multiplicative import MART, MLEM
+from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.simulation.particles.cloud import Particles, quality_factor, spread
 from nerif.simulation.particles.pictures import picture, pictures
 from nerif.simulation.particles.rig import four_cameras

@@ -23,15 +23,15 @@ from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.prediction import predict_view, reproject
 from nerif.reconstruction.aperture import lens_rays, seen_through
-from nerif.reconstruction.losses import LossWeights
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.objective import Draw, Objective
-from nerif.reconstruction.operator import VoxelOperator, rays_through
-from nerif.reconstruction.parallel import Ranks
-from nerif.reconstruction.precision import MixedPrecision
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
-from nerif.reconstruction.training_data import FrameData
+from nerif.reconstruction.neural.losses import LossWeights
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.objective import Draw, Objective
+from nerif.reconstruction.neural.parallel import Ranks
+from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.voxels.operator import VoxelOperator, rays_through
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.result import ResultDirectory
 from nerif.simulation.simulate import simulate, view_displacement
 

@@ -10,7 +10,7 @@ import torch
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Ring
-from nerif.reconstruction.bins import binned_rays, coarsest_edge
+from nerif.reconstruction.neural.bins import binned_rays, coarsest_edge
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
 

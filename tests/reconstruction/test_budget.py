@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from nerif.fields.network import NetworkShape
-from nerif.reconstruction import budget as module
-from nerif.reconstruction import training
-from nerif.reconstruction.budget import Budget
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.parallel import Ranks
+from nerif.reconstruction.neural import schedule as module
+from nerif.reconstruction.neural import training
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.parallel import Ranks
+from nerif.reconstruction.neural.schedule import Budget
 
 
 def test_the_time_limit_is_of_training_alone(measurement, monkeypatch):

@@ -17,13 +17,13 @@ from nerif.fields.network import NetworkShape
 from nerif.forward.deflection import Deflection
 from nerif.forward.interferometry import Interferometry
 from nerif.geometry import Grid, paper_rig
-from nerif.reconstruction import convergence, objective
 from nerif.reconstruction.base import Step
-from nerif.reconstruction.convergence import Cycles
 from nerif.reconstruction.files import read_state, write_state
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.some_pixels import hold_back
-from nerif.reconstruction.training_data import FrameData
+from nerif.reconstruction.neural import convergence, objective
+from nerif.reconstruction.neural.convergence import Cycles
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.some_pixels import hold_back
+from nerif.reconstruction.neural.training_data import FrameData
 from nerif.simulation.simulate import add_noise
 
 ENDLESS = NeRIF(
@@ -137,7 +137,7 @@ def test_more_time_goes_on_with_the_next_cycle(measurement):
 def test_the_best_cycle_is_kept_with_the_rig_it_had(measurement, monkeypatch):
     errors, rigs = itertools.chain([2.0], itertools.repeat(3.0)), []
     monkeypatch.setattr(objective.Objective, "held_back", lambda self: next(errors))
-    monkeypatch.setattr("nerif.reconstruction.refinement.SIGN", -1.0)  # the rig is taken to be off
+    monkeypatch.setattr("nerif.reconstruction.rig.refinement.SIGN", -1.0)  # the rig is taken to be off
 
     def watch(step: Step) -> bool:
         if step.step == 6:

@@ -16,8 +16,8 @@ from nerif.reconstruction.device import (
     peak_memory,
     resolve_device,
 )
-from nerif.reconstruction.precision import MixedPrecision
-from nerif.reconstruction.presets import PRESETS, preset
+from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.presets import PRESETS, preset
 
 
 def test_auto_takes_the_gpu_where_there_is_one(monkeypatch):

@@ -13,10 +13,10 @@ from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.ensemble import Ensemble, Spread
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.repetition import Found, Member
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.uncertainty.ensemble import Ensemble, Spread
+from nerif.reconstruction.uncertainty.repetition import Found, Member
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
 

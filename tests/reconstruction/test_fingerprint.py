@@ -14,8 +14,8 @@ from nerif.forward.registry import technique
 from nerif.geometry import Box
 from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.fingerprint import fingerprint
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.simulation.simulate import simulate
 
 NETWORK = NeRIF(

@@ -7,8 +7,8 @@ import torch
 
 from nerif.fields.network import UNBOUNDED, Network, NetworkShape
 from nerif.fields.space_time import SpaceTimeNetwork
-from nerif.reconstruction import fused
-from nerif.reconstruction.precision import MixedPrecision
+from nerif.reconstruction.neural import fused
+from nerif.reconstruction.neural.precision import MixedPrecision
 
 CPU = torch.device("cpu")
 

@@ -15,10 +15,10 @@ from nerif.fields.network import NetworkShape
 from nerif.forward.deflection import LeverArm
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Lens
-from nerif.reconstruction.presets import PRESETS
-from nerif.reconstruction.total_variation import TotalVariation
-from nerif.reconstruction.training import Training
-from nerif.reconstruction.training_data import FrameData
+from nerif.reconstruction.neural.presets import PRESETS
+from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.sequence.chunk_data import ChunkData
 
 pytestmark = pytest.mark.filterwarnings("ignore:User provided device_type of 'cuda'")

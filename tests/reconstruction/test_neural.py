@@ -17,15 +17,15 @@ from nerif.fields.network import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.base import Weights
 from nerif.geometry import Grid, paper_rig
-from nerif.reconstruction import bins, objective, training
 from nerif.reconstruction.base import Reconstruction, Step
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.gauge import AmbientRegion
-from nerif.reconstruction.losses import LossWeights, by_differences
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.presets import PRESETS, preset
+from nerif.reconstruction.neural import bins, objective, training
+from nerif.reconstruction.neural.losses import LossWeights, by_differences
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.training_data import FrameData
 from nerif.simulation.simulate import simulate
 
 SMALL = NeRIF(

@@ -13,7 +13,7 @@ from nerif.common.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.forward.deflection import MODELS
 from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays, Ring
-from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.voxels.operator import VoxelOperator
 
 GRID = (9, 11, 13)
 FACES = Boundary(("x-", "y+", "z-"))

@@ -7,7 +7,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.fields.network import Network, NetworkShape
-from nerif.reconstruction.optimiser import REFERENCE, NetworkOptimiser
+from nerif.reconstruction.neural.optimiser import REFERENCE, NetworkOptimiser
 
 SHAPE = NetworkShape(depth=2, width=16, octaves=2, directions=3)
 

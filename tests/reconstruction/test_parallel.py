@@ -15,12 +15,12 @@ from nerif.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.files import read_field
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.objective import Draw, Objective
-from nerif.reconstruction.parallel import Ranks
-from nerif.reconstruction.precision import MixedPrecision
-from nerif.reconstruction.settings import LossWeights
-from nerif.reconstruction.training_data import FrameData
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.objective import Draw, Objective
+from nerif.reconstruction.neural.parallel import Ranks
+from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.settings import LossWeights
+from nerif.reconstruction.neural.training_data import FrameData
 
 SMALL = [
     "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "30",

@@ -10,11 +10,11 @@ import torch
 from nerif.fields.grid import Boundary
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.reconstruction import problem as problem_module
-from nerif.reconstruction.operator import VoxelOperator
-from nerif.reconstruction.preconditioner import filtered, response, spectrum_of_differences
-from nerif.reconstruction.problem import Penalty, Problem, conjugate_gradients
 from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels import problem as problem_module
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.preconditioner import filtered, response, spectrum_of_differences
+from nerif.reconstruction.voxels.problem import Penalty, Problem, conjugate_gradients
 from nerif.simulation.simulate import simulate
 
 SHAPE = (6, 8, 9)

@@ -12,12 +12,12 @@ import torch
 
 from nerif.fields.grid import Boundary
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.operator import VoxelOperator
-from nerif.reconstruction.problem import Differences, Penalty, Problem, conjugate_gradients
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation, at_faces, gradient_square
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.problem import Differences, Penalty, Problem, conjugate_gradients
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation, at_faces, gradient_square
 
 SHAPE = (4, 5, 6)
 COUNT = math.prod(SHAPE)

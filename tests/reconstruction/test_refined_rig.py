@@ -19,13 +19,13 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.reconstruction.refined_numbers import NAMES
-from nerif.reconstruction.refined_rig import UNTOLD, moved_lines, with_corrections
-from nerif.reconstruction.refinement import Refinement
-from nerif.reconstruction.refit import refit
-from nerif.reconstruction.rig_posterior import with_posterior
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.rig.numbers import NAMES
+from nerif.reconstruction.rig.posterior import with_posterior
+from nerif.reconstruction.rig.refined import UNTOLD, moved_lines, with_corrections
+from nerif.reconstruction.rig.refinement import Refinement
+from nerif.reconstruction.rig.refit import refit
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report.moves_figure import draw_moves
 from nerif.rig_check import check_rig
 from nerif.simulation.simulate import simulate
@@ -56,7 +56,7 @@ def simulated(field: Field, ring: Ring = RING, noise: float = 0.02) -> Measureme
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch):
     """How well a rig is known hardly depends on the grid, its time does."""
-    monkeypatch.setattr("nerif.reconstruction.rig_posterior.VOXELS", 8)
+    monkeypatch.setattr("nerif.reconstruction.rig.posterior.VOXELS", 8)
 
 
 @pytest.fixture(scope="module")

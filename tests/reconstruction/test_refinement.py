@@ -20,12 +20,12 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.imaging.calibration.cameras_file import read_cameras
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.refined_numbers import NAMES, displaced
-from nerif.reconstruction.refined_rig import moved_lines, with_corrections
-from nerif.reconstruction.refinement import Refinement
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.rig.numbers import NAMES, displaced
+from nerif.reconstruction.rig.refined import moved_lines, with_corrections
+from nerif.reconstruction.rig.refinement import Refinement
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.training_data import FrameData
 from nerif.simulation.simulate import simulate
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
@@ -300,7 +300,7 @@ def test_a_view_that_moved_far_is_named():
 
 @pytest.mark.slow
 def test_the_command_line_refines_writes_and_evaluates(measured, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("nerif.reconstruction.rig_posterior.VOXELS", 6)
+    monkeypatch.setattr("nerif.reconstruction.rig.posterior.VOXELS", 6)
     wrong, _ = spoiled(measured)
     grid = Grid.of_resolution(BOX, 24)
     truth = Volume.of(BALLS.sample(grid), grid, "index_excess", 1.00027)

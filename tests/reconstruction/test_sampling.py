@@ -7,7 +7,7 @@ import torch
 
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.geometry import Box, Rays
-from nerif.reconstruction.sampling import BINS, EVEN, SamplingDensity, sample_count, sample_rays
+from nerif.reconstruction.neural.sampling import BINS, EVEN, SamplingDensity, sample_count, sample_rays
 
 BOX = Box((-10.0, -10.0, -10.0), (10.0, 10.0, 10.0))
 

@@ -11,7 +11,7 @@ from nerif.data.measurement import Measurement, measurement_of
 from nerif.forward.deflection import Deflection
 from nerif.forward.interferometry import Interferometry
 from nerif.geometry import paper_rig
-from nerif.reconstruction.some_pixels import some_pixels
+from nerif.reconstruction.neural.some_pixels import some_pixels
 
 
 @pytest.fixture(scope="module")

@@ -19,15 +19,15 @@ from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid, Lens, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.axis_search import find_axis
-from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.layout import Symmetric
-from nerif.reconstruction.multiplicative import MLEM
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.operator import rays_through
-from nerif.reconstruction.symmetric_operator import SymmetricOperator
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.symmetry import check_views, symmetry_asked
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.layout import Symmetric
+from nerif.reconstruction.voxels.multiplicative import MLEM
+from nerif.reconstruction.voxels.operator import rays_through
+from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import simulate
 
 SIDES = ("x-", "x+", "y-", "y+")

@@ -15,16 +15,16 @@ from nerif.geometry import Box, Grid, Ring
 from nerif.physics.quantities import GasSettings
 from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.repetition import VOXELS, Found, Member
-from nerif.reconstruction.trials import BLOCK, LOST, WIDTH, Deviations, Trials, best_covered
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.uncertainty.bootstrap import BLOCK, LOST, WIDTH, Deviations, Trials, best_covered
+from nerif.reconstruction.uncertainty.repetition import VOXELS, Found, Member
 
 AMBIENT = 1.00027
 
 
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch):
-    monkeypatch.setattr("nerif.reconstruction.repetition.VOXELS", 16)
+    monkeypatch.setattr("nerif.reconstruction.uncertainty.repetition.VOXELS", 16)
 
 
 def hot(box: Box, wide: float = 0.2, at: float = 0.0) -> VoxelField:

@@ -14,15 +14,15 @@ from nerif.data.volume import Volume
 from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
-from nerif.reconstruction import descent, kernels_numba, kernels_torch
-from nerif.reconstruction import voxels as voxels_module
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.files import CHECKPOINT, read_field, read_state, write_field, write_state
-from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.operator import VoxelOperator
-from nerif.reconstruction.problem import Iterate
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.voxels import descent, kernels_numba, kernels_torch
+from nerif.reconstruction.voxels import settings as voxels_module
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.problem import Iterate
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 
 METHODS = [
     Tikhonov(voxels=24, device="cpu"),

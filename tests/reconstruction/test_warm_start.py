@@ -19,10 +19,10 @@ from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.precision import MixedPrecision
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.warm_start import adopt, fit_network
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.warm_start import adopt, fit_network
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 BOX = Box((-3.0, -2.0, -1.0), (3.0, 2.0, 1.0))
 SHAPE = NetworkShape(depth=2, width=8, octaves=1)

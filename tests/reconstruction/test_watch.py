@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nerif.reconstruction.watch import LEAST, PATIENCE, RATE, Watch
+from nerif.reconstruction.neural.watch import LEAST, PATIENCE, RATE, Watch
 
 
 def followed(values: list[float], noise: float = 0.0, rate: float = RATE) -> Watch:

@@ -8,8 +8,8 @@ import math
 import pytest
 import torch
 
-from nerif.reconstruction.problem import Iterate
-from nerif.reconstruction.weight import HIGHEST, LOWEST, choose_weight, sharpest_corner
+from nerif.reconstruction.voxels.problem import Iterate
+from nerif.reconstruction.voxels.weight import HIGHEST, LOWEST, choose_weight, sharpest_corner
 
 SINGULAR = torch.logspace(0, -4, 200, dtype=torch.float64)
 TRUTH = SINGULAR**0.5  # a smooth field: what the operator sees least is least

@@ -18,13 +18,14 @@ from nerif.fields.space_time import AtTimes, SpaceTimeField, SpaceTimeNetwork
 from nerif.forward.deflection import Deflection
 from nerif.forward.interferometry import Interferometry
 from nerif.geometry import Box, Grid
-from nerif.reconstruction import files, training
+from nerif.reconstruction import files
 from nerif.reconstruction.base import State
-from nerif.reconstruction.losses import LossWeights
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.precision import MixedPrecision
+from nerif.reconstruction.neural import training
+from nerif.reconstruction.neural.losses import LossWeights
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.training_data import FrameData
 from nerif.sequence import joint
 from nerif.sequence.chunk_data import ChunkData
 from nerif.sequence.joint import reconstruct_jointly

@@ -25,13 +25,13 @@ from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
 from nerif.prediction import predict, reproject
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.operator import VoxelOperator
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.training import Training
-from nerif.reconstruction.training_data import FrameData
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.techniques.warped import References
 
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))

@@ -33,16 +33,16 @@ from nerif.geometry import Box, Grid, Lens, Rays, Ring
 from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.files import read_state, write_state
-from nerif.reconstruction.losses import LossWeights, loss_terms
-from nerif.reconstruction.multiplicative import MART, MLEM
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.operator import VoxelOperator
-from nerif.reconstruction.problem import Problem
+from nerif.reconstruction.neural.losses import LossWeights, loss_terms
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
-from nerif.reconstruction.training import Training
-from nerif.reconstruction.training_data import FrameData
+from nerif.reconstruction.voxels.multiplicative import MART, MLEM
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.problem import Problem
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import Simulation, simulate
 
 PACKAGE = Path(registry.__file__).parents[1]

@@ -10,11 +10,11 @@ import tyro
 
 from nerif.commands.settings import Flat, Settings
 from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.landweber import Landweber
-from nerif.reconstruction.multiplicative import MART, MLEM
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.tikhonov import Tikhonov
-from nerif.reconstruction.total_variation import TotalVariation
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.multiplicative import MART, MLEM
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.workflow import Run
 
 __all__ = ["RECORDS", "Reconstruct", "ReconstructNeRIF"]

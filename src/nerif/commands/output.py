@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerif.common.conventions import InputError
-from nerif.monitor import Monitor
 from nerif.reconstruction.base import OnStep, Step, compose
+from nerif.reconstruction.progress import Monitor
 
 __all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say", "silence"]
 

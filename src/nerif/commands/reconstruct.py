@@ -15,7 +15,7 @@ from nerif.commands.settings import flag_value, read_settings, value_given
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Step
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural.presets import preset
 from nerif.result import RUN
 from nerif.workflow import reconstruct_into
 

@@ -10,8 +10,8 @@ import tyro
 
 from nerif.commands.output import MONITOR, figures_bar
 from nerif.commands.settings import Flat, Settings, read_settings, value_given
-from nerif.reconstruction.neural import NeRIF
-from nerif.reconstruction.presets import preset
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.presets import preset
 from nerif.sequence.plan import SequenceSettings
 from nerif.sequence.reconstruct import reconstruct_sequence
 from nerif.sequence.run import Progress

@@ -22,11 +22,11 @@ from torch import Tensor
 from nerif.data.measurement import Measurement
 from nerif.geometry.axis import Axis
 from nerif.geometry.symmetry import Symmetry
-from nerif.reconstruction.layout import Symmetric
-from nerif.reconstruction.levels import bins_of
-from nerif.reconstruction.problem import Penalty, Problem
-from nerif.reconstruction.symmetric_operator import SymmetricOperator
 from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels.layout import Symmetric
+from nerif.reconstruction.voxels.levels import bins_of
+from nerif.reconstruction.voxels.problem import Penalty, Problem
+from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
 __all__ = ["find_axis"]
 

@@ -16,7 +16,7 @@ from nerif.forward.base import ForwardModel
 from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Rays
 from nerif.observation import Observation
-from nerif.reconstruction.bins import binned_rays, patches
+from nerif.reconstruction.neural.bins import binned_rays, patches
 
 __all__ = ["Part", "Target", "check_target"]
 

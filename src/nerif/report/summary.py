@@ -15,7 +15,7 @@ from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.plotting.drawing import LABELS, drawn_of, shown
 from nerif.plotting.notebook import number, percent, span
 from nerif.reconstruction.files import FIELD
-from nerif.reconstruction.refined_rig import moved_lines
+from nerif.reconstruction.rig.refined import moved_lines
 from nerif.report.packing import relation
 from nerif.residuals import CAUSES
 from nerif.result import METRICS, VOLUME, Result

@@ -10,7 +10,7 @@ import numpy as np
 from nerif.data.volume import Volume
 from nerif.metrics import LEVELS
 from nerif.plotting.drawing import COLOURS, drawn_of, label_of, shown
-from nerif.reconstruction.trials import TAILS
+from nerif.reconstruction.uncertainty.bootstrap import TAILS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

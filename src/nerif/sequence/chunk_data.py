@@ -26,10 +26,10 @@ from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.bounds import in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.fingerprint import digest
-from nerif.reconstruction.settings import TrainingSettings
+from nerif.reconstruction.neural.settings import TrainingSettings
+from nerif.reconstruction.neural.training import LEVEL_POINTS
+from nerif.reconstruction.neural.training_data import FrameData, TrainingData
 from nerif.reconstruction.target import Part, Target
-from nerif.reconstruction.training import LEVEL_POINTS
-from nerif.reconstruction.training_data import FrameData, TrainingData
 
 __all__ = ["ChunkData"]
 

@@ -29,7 +29,7 @@ from nerif.metrics import correlation
 from nerif.physics.quantities import derive
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Step
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.sequence.plan import Event, SequencePlan
 from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
 

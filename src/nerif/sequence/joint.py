@@ -20,8 +20,8 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.space_time import SpaceTimeField
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step, compose
 from nerif.reconstruction.files import CHECKPOINT, checkpoints, read_state
-from nerif.reconstruction.training import Training
-from nerif.reconstruction.training_data import FrameData
+from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.training_data import FrameData
 from nerif.sequence.chunk_data import ChunkData
 from nerif.sequence.frames import ATTEMPTS, FAILURES, FrameError, end_without, finished_frame
 from nerif.sequence.plan import Event, SequencePlan

@@ -12,7 +12,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import QUANTITIES, quantities_of
 from nerif.physics.quantities import GasSettings
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
 
 __all__ = ["Event", "SequencePlan", "SequenceSettings"]
 

@@ -15,7 +15,7 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Grid
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.bounds import field_bounds
-from nerif.reconstruction.neural import NeRIF
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.symmetry import axis_of, symmetry_asked, with_axis
 from nerif.sequence.cluster import check_workers, open_cluster
 from nerif.sequence.plan import SequencePlan, SequenceSettings

@@ -21,8 +21,8 @@ from nerif.commands.methods import RECORDS, Reconstruct
 from nerif.commands.sequence import Sequence
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.reconstruction.presets import PRESETS, preset
-from nerif.reconstruction.trials import KINDS
+from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.uncertainty.bootstrap import KINDS
 
 __all__ = ["PAGE"]
 

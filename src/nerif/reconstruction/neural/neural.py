@@ -1,0 +1,28 @@
+"""NeRIF: a coordinate network trained until what it predicts is what was measured (paper, Alg. 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nerif.data.measurement import Measurement
+from nerif.fields.base import Field
+from nerif.reconstruction.base import OnStep, Reconstruction, State
+from nerif.reconstruction.neural.settings import TrainingSettings
+from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.training_data import FrameData
+
+__all__ = ["NeRIF"]
+
+
+@dataclass(frozen=True)
+class NeRIF(TrainingSettings):
+    """Neural refractive index field."""
+
+    def __call__(
+        self,
+        measurement: Measurement,
+        on_step: OnStep | None = None,
+        resume: State | None = None,
+        start: Field | None = None,
+    ) -> Reconstruction:
+        return Training(self, FrameData(self, measurement, judged=not self.limited), resume, start).run(on_step)

@@ -1,0 +1,278 @@
+"""What a network is trained on: rays with what they measured, and points where the index is known to be ambient.
+
+A frame is one measurement at one instant. Data of several frames (sequence/chunk_data.py) tell the instant of each ray
+and of each point as well: tau in [-1, 1].
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from contextlib import suppress
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerif.common.conventions import InputError
+from nerif.common.transfer import sent
+from nerif.data.measurement import Measurement
+from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.symmetric import SymmetricNetwork
+from nerif.forward.base import ForwardModel
+from nerif.geometry import Box
+from nerif.geometry.axis import Axis
+from nerif.reconstruction.aperture import lens_rays, seen_through
+from nerif.reconstruction.bounds import field_bounds, in_units
+from nerif.reconstruction.device import resolve_device
+from nerif.reconstruction.fingerprint import fingerprint
+from nerif.reconstruction.gauge import AmbientRegion, is_open
+from nerif.reconstruction.neural.bins import coarsest_edge
+from nerif.reconstruction.neural.settings import TrainingSettings
+from nerif.reconstruction.neural.some_pixels import hold_back
+from nerif.reconstruction.rig.numbers import refined_words
+from nerif.reconstruction.rig.refined import kept_of, take_up
+from nerif.reconstruction.rig.refinement import Refinement, drawn
+from nerif.reconstruction.sources import chosen_source, of_source, stages
+from nerif.reconstruction.symmetry import axis_of
+from nerif.reconstruction.target import Part, Target, check_target
+
+__all__ = ["FrameData", "TrainingData"]
+
+
+class TrainingData(ABC):
+    """Rays and ambient points, at one instant or at several.
+
+    Parameters
+    ----------
+    device : where batches are given
+    box : Box, mm
+    n_ambient : refractive index that the excess is counted from
+    fingerprint : a digest of each part of the data, by its name
+    open : whether the data leave a constant of the field open
+    quantity : what the field is
+    """
+
+    bounds: tuple[float, float]
+    """Lowest and highest value of the field."""
+
+    def __init__(
+        self, device: torch.device, box: Box, n_ambient: float, fingerprint: dict[str, str], open: bool, quantity: str
+    ) -> None:
+        self.device, self.box, self.n_ambient, self.fingerprint = device, box, n_ambient, fingerprint
+        self.open, self.quantity = open, quantity
+
+    coarsest: int = 1
+    """Edge of the largest bins that the data can be given in, px."""
+    noise: float = 0.0
+    """Mean square of the noise over that of what was measured; 0 where it is not known."""
+
+    shape: NetworkShape
+    """Of the network: without the waves that pixels cannot tell from longer ones."""
+    samples: tuple[int, int]
+    """Of a ray at the start and at the end of a run."""
+    lens_rays: int = 1
+    """Rays through the lens of a pixel at the end of a run; 1 for a thin one."""
+
+    held_back: Target | None = None
+    """Rays that are in no batch, to judge by them; None where there are none."""
+
+    stage: int = 0
+    """Part of the run that the data are given for."""
+
+    met: str = "what was measured"
+    """What the loss is of in this part."""
+
+    axis: Axis | None = None
+    """Of a symmetric flow."""
+    refinement: Refinement | None = None
+    """Of the rig, or None where it is as calibrated."""
+    sigma_known: bool = False
+
+    def refined_by(self, seed: int) -> list[Part]:
+        """Draw pixels that the rig is refined by, with their calibrated rays, residuals in units of sigma."""
+        raise NotImplementedError("these data refine no rig")
+
+    def refined(self, part: Part, held_back: bool = False) -> Part:
+        """Return a part, of the rays held back or of the others, as the refined rig has it."""
+        return part
+
+    def advance(self, progress: float) -> bool:
+        """Give what is to be met at that share of a run, or of its first cycle; return whether a new part began."""
+        return False
+
+    @property
+    def unsettled(self) -> list[Part]:
+        """Some rays of whatever has to be fitted beside the field (ForwardModel.settle)."""
+        return []
+
+    def kept(self) -> dict[str, Tensor]:
+        """Return what has been fitted beside the field, as a checkpoint keeps it."""
+        return {}
+
+    def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
+        """Go on in that part of a run with what was fitted beside the field."""
+        assert stage == 0, "these data have one part only"
+
+    def judge_alike(self) -> None:
+        """Let rays that are held back be judged by what was fitted beside the field."""
+        return
+
+    def refine(self, edge: int) -> None:
+        """Give bins of another edge, px, from now on."""
+        assert edge == 1, "these data are pixels always"
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Rays of all instants."""
+
+    @abstractmethod
+    def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
+        """Return the rays of those numbers with what they measured, technique by technique, and their instants."""
+
+    @abstractmethod
+    def ambient_points(
+        self, count: int, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"] | None] | None:
+        """Draw about `count` points at which the field is ambient, mm, and their instants; None if none is known."""
+
+    @property
+    @abstractmethod
+    def instants(self) -> list[Float[Tensor, " 1"] | None]:
+        """A few instants that stand for all."""
+
+    @abstractmethod
+    def untrained(self) -> NeuralField:
+        """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
+
+
+SETTLED_BY = 1024  # pixels a view
+
+
+class FrameData(TrainingData):
+    """One measurement.
+
+    Parameters
+    ----------
+    settings : TrainingSettings
+    measurement : Measurement
+    coarsest : edge of the bins to begin with, px; None for what a picture of its size can do with
+    judged : whether some of the rays are held back
+    """
+
+    def __init__(
+        self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, judged: bool = False
+    ) -> None:
+        measurement = seen_through(measurement, settings.aperture)
+        preferred = "displacements" if "shift" in refined_words(settings.refine) else "pictures"  # these tell no shift
+        source = chosen_source(measurement, settings.source, preferred)
+        final = of_source(measurement, source)
+        check_target(final, settings.model)
+        super().__init__(
+            resolve_device(settings.device), measurement.box, measurement.n_ambient,
+            fingerprint(final, settings.open_faces), is_open(measurement), measurement.quantity,
+        )  # fmt: skip
+        settings = settings.resolved_by(measurement)
+        self.shape, self.samples = settings.network, settings.samples
+        self.settings, self.measurement = settings, measurement
+        self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
+        self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
+        self.bounds = field_bounds(measurement, settings.lower, settings.upper)
+        self.axis = axis_of(settings, measurement)
+        self.lens_rays = lens_rays(measurement, settings.lens_rays)
+        if settings.refine:
+            self.refinement = Refinement.asked(
+                final, settings.refine, settings.pose_sigma_mm, settings.pose_sigma_deg, settings.shift_sigma_px
+            )
+        if judged:
+            rest, held = hold_back(measurement, self.coarsest)
+            with suppress(InputError):  # all that would be held back crosses an open face
+                if held is not None:
+                    judges = of_source(held, source)
+                    self.judging = judges.names
+                    self.held_back = Target.of(
+                        judges, settings.open_faces, model=settings.model, single=True
+                    ).without_outliers().to(self.device)
+                    self.measurement = rest
+        self.stages, self.edge = stages(self.measurement, source), self.coarsest
+        self.refine(self.coarsest)
+
+    def refine(self, edge: int) -> None:
+        settings, self.edge = self.settings, edge
+        seen, self.met = self.stages[self.stage].measurement(), self.stages[self.stage].words
+        self.target = Target.of(seen, settings.open_faces, edge, settings.model).to(self.device)
+        self.names = seen.names
+        self.noise = self.target.noise or 0.0
+        self.sigma_known = self.target.sigma_known
+
+    def advance(self, progress: float) -> bool:
+        reached = max(i for i, stage in enumerate(self.stages) if stage.begin <= progress)
+        if reached <= self.stage:
+            return False
+        other = self.stages[reached].measurement is not self.stages[self.stage].measurement
+        self.stage = reached
+        if other:
+            self.refine(self.edge)
+        return True
+
+    @property
+    def unsettled(self) -> list[Part]:
+        generator = torch.Generator().manual_seed(self.stage)
+        parts = [part for part in self.target.parts if part.model.settles]
+        some = [torch.randperm(len(part), generator=generator)[: SETTLED_BY * len(self.names)] for part in parts]
+        return [self.refined(part[index.to(self.device)]) for part, index in zip(parts, some, strict=True)]
+
+    def kept(self) -> dict[str, Tensor]:
+        kept = {str(i): model.settled.clone() for i, model in enumerate(_settling(self.target))}
+        return kept | kept_of(self.refinement)
+
+    def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
+        if stage != self.stage:
+            self.stage = stage
+            self.refine(self.edge)
+        for i, model in enumerate(_settling(self.target)):
+            model.adopt(kept[str(i)])
+        take_up(self.refinement, kept)
+
+    def judge_alike(self) -> None:
+        """Let the pictures that are held back be as bright as those that are not."""
+        if self.held_back is not None:
+            for model, judge in zip(_settling(self.target), _settling(self.held_back), strict=False):
+                judge.adopt(model.settled[[self.names.index(name) for name in self.judging]])
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
+        return [(self.refined(part), None) for part in self.target[index].parts if len(part)]
+
+    def refined(self, part: Part, held_back: bool = False) -> Part:
+        if self.refinement is None:
+            return part
+        names = self.judging if held_back else self.names
+        return self.refinement.of(part, [self.refinement.names.index(name) for name in names])
+
+    def refined_by(self, seed: int) -> list[Part]:
+        if self.refinement is None or self.names != self.refinement.names:
+            return []  # a part of the run that has not all views
+        return drawn(self.target, len(self.names), seed)
+
+    def ambient_points(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], None] | None:
+        return None if self.ambient is None else (sent(self.ambient.sample(count, generator), self.device), None)
+
+    @property
+    def instants(self) -> list[Float[Tensor, " 1"] | None]:
+        return [None]
+
+    def untrained(self) -> NeuralField:
+        bounds = in_units(self.bounds, self.target.scale)
+        if self.axis is None:
+            network = Network(self.shape, bounds=bounds)
+        else:
+            own = self.axis.symmetry.in_units(self.box.centre, max(self.box.edges) / 2)
+            network = SymmetricNetwork(self.shape, own, bounds)
+        return NeuralField(network.to(self.device), self.box, self.target.scale)
+
+
+def _settling(target: Target) -> list[ForwardModel]:
+    """The models with something to fit beside the field."""
+    return [part.model for part in target.parts if part.model.settles]

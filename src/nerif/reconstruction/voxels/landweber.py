@@ -1,0 +1,61 @@
+"""Landweber iteration: gradient descent on the misfit, stopped before it fits the noise.
+
+x <- x + omega F^T (b - F x),       0 < omega < 2 / |F|^2
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from nerif.common.conventions import InputError
+from nerif.reconstruction.voxels.operator import operator_norm
+from nerif.reconstruction.voxels.problem import Iterate, Problem
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
+
+__all__ = ["Landweber"]
+
+
+@dataclass(frozen=True)
+class Landweber(VoxelReconstructor):
+    """Voxels by Landweber iteration; the number of iterations is what regularises.
+
+    It stops at the noise where sigma is known (discrepancy principle), else when an iteration gains less than the
+    tolerance, or after the given iterations.
+
+    Source: Landweber, Am. J. Math. 73 (1951); momentum: Nesterov, Soviet Math. Dokl. 27 (1983), with the restart of
+    O'Donoghue & Candes, Found. Comput. Math. 15 (2015).
+    """
+
+    momentum: bool = True
+    """Nesterov's momentum: as good in far fewer iterations."""
+    relaxation: float = 1.0
+    """Step omega in units of 1 / |F|^2; below 2 (1 with momentum)."""
+    iterations: int = 200
+    """Most iterations on each grid."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (0 < self.relaxation < 2) or (self.momentum and self.relaxation > 1):
+            raise InputError(
+                f"relaxation: expected above 0 and below 2 (with momentum at most 1), got {self.relaxation}"
+            )
+
+    def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
+        x = problem.clip(x)
+        # the estimate comes from below, and a step too long diverges
+        norm = operator_norm(problem.forward, problem.adjoint, problem.random(), tolerance=1e-2)
+        step = self.relaxation / (1.05 * norm) ** 2
+        ahead, k, last = x, 0, float("inf")
+        r = problem.data - problem.forward(ahead)
+        while True:
+            x_last, x, k = x, problem.clip(ahead + step * problem.adjoint(r)), k + 1
+            ahead = problem.clip(x + (k / (k + 3)) * (x - x_last)) if self.momentum else x
+            r = problem.data - problem.forward(ahead)
+            if self.momentum and float(r.square().sum()) > last:  # it carries uphill: begin anew from here
+                ahead, k = x, 0
+                r = problem.data - problem.forward(ahead)
+            last = float(r.square().sum())
+            yield Iterate(ahead, last, 0.0)

@@ -1,0 +1,184 @@
+"""Where the coefficients of a classical method lie: on voxels in space, or on those of (r, h) of a symmetric flow."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.data.measurement import Measurement
+from nerif.fields.base import Field
+from nerif.fields.grid import DEGREES, Boundary, VoxelField
+from nerif.fields.symmetric import SymmetricVoxels
+from nerif.forward.base import ForwardModel
+from nerif.geometry import Box, Grid, Rays
+from nerif.geometry.symmetry import Symmetry
+from nerif.reconstruction.gauge import visual_hull
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
+
+__all__ = ["InSpace", "Layout", "Symmetric", "layout_of"]
+
+COARSEST = 12  # voxels along the longest edge of the first grid, at least
+FEWEST = 4  # along an edge that is halved
+
+
+@dataclass(frozen=True)
+class Layout(ABC):
+    """Grids of coefficients, and what they stand for.
+
+    Parameters
+    ----------
+    box : of the measurement, mm
+    faces : of it on which the field is ambient
+    basis : of the spline
+    """
+
+    box: Box
+    faces: tuple[str, ...]
+    basis: str
+
+    @property
+    def degree(self) -> int:
+        """Of the spline."""
+        return DEGREES[self.basis]
+
+    @property
+    @abstractmethod
+    def boundary(self) -> Boundary:
+        """How coefficients go on beyond the grid."""
+
+    @abstractmethod
+    def grid(self, voxels: int) -> Grid:
+        """Return the grid with voxels of which so many are as long as the longest edge of the box."""
+
+    @abstractmethod
+    def operator(
+        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
+        dtype: torch.dtype,
+    ) -> VoxelOperator:  # fmt: skip
+        """Return what rays see of coefficients on a grid."""
+
+    @abstractmethod
+    def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field:
+        """Return the field that coefficients stand for."""
+
+    @abstractmethod
+    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z y x"]:
+        """Return a field where the coefficients stand, as they are given at first."""
+
+    @abstractmethod
+    def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
+        """Return the coefficients that are not outside the visual hull."""
+
+    def grids(self, voxels: int, coarse_to_fine: bool) -> list[Grid]:
+        """Return grids from coarse to fine, each of voxels twice as small as those before, or the last alone."""
+        last = self.grid(voxels)
+        shape, grids = list(last.shape), [last]
+        while coarse_to_fine and max(shape) >= 2 * COARSEST:
+            shape = [min(n, max(FEWEST, n // 2)) for n in shape]
+            grids.insert(0, Grid(last.box, (shape[0], shape[1], shape[2])))
+        return grids
+
+
+class InSpace(Layout):
+    """Voxels that fill the box."""
+
+    @property
+    def boundary(self) -> Boundary:
+        return Boundary(self.faces)
+
+    def grid(self, voxels: int) -> Grid:
+        least = (self.degree + 1) // 2  # of a slice too
+        nz, ny, nx = (max(least, n) for n in Grid.of_resolution(self.box, voxels).shape)
+        return Grid(self.box, (nz, ny, nx))
+
+    def operator(
+        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
+        dtype: torch.dtype,
+    ) -> VoxelOperator:  # fmt: skip
+        return VoxelOperator(rays, grid, model, self.basis, self.boundary, step, device, dtype)
+
+    def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field:
+        return VoxelField.of(coefficients, grid, self.degree, self.boundary)
+
+    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z y x"]:
+        return field.sample(grid, device)
+
+    def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
+        return visual_hull(measurement, grid)
+
+
+@dataclass(frozen=True)
+class Symmetric(Layout):
+    """Splines of (r, h), one a number that the field has there.
+
+    Parameters
+    ----------
+    symmetry : Symmetry, mm
+    """
+
+    symmetry: Symmetry
+
+    @property
+    def boundary(self) -> Boundary:
+        return Boundary(self.symmetry.faces(self.faces), around=True)
+
+    def grid(self, voxels: int) -> Grid:
+        least, size = (self.degree + 1) // 2, max(self.box.edges) / voxels
+        box = self.symmetry.reduced_box(self.box, self.faces)
+        if self.symmetry.axial:  # differences from angle to angle are as steep as half way from the axis
+            round_it = math.pi * box.edges[0] / 2
+            box = Box((box.lower[0], -round_it, box.lower[2]), (box.upper[0], round_it, box.upper[2]))
+        nx, nz = (max(least, round(edge / size)) for edge in (box.edges[0], box.edges[2]))
+        return Grid(box, (nz, self.symmetry.angles, nx))
+
+    def grids(self, voxels: int, coarse_to_fine: bool) -> list[Grid]:
+        angles, grids = self.symmetry.angles, super().grids(voxels, coarse_to_fine)
+        return [Grid(grid.box, (grid.shape[0], angles, grid.shape[2])) for grid in grids]
+
+    def operator(
+        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
+        dtype: torch.dtype,
+    ) -> VoxelOperator:  # fmt: skip
+        return SymmetricOperator(self.symmetry, rays, grid, model, self.basis, self.boundary, step, dtype)
+
+    def field(self, coefficients: Float[Tensor, "z k x"], grid: Grid) -> Field:
+        nz, angles, nx = grid.shape
+        layers = (self.degree + 1) // 2
+        flat, parts = Grid(grid.box, (nz, layers, nx)), []
+        for k in range(angles):
+            own = coefficients[:, k : k + 1].expand(nz, layers, nx)
+            parts.append(VoxelField.of(own, flat, self.degree, self.boundary))
+        return SymmetricVoxels(parts, self.symmetry)
+
+    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z k x"]:
+        angle = 2 * math.pi * torch.arange(self.symmetry.angles, dtype=torch.float64) / self.symmetry.angles
+        h, angle, r = torch.meshgrid(grid.axis("z"), angle, grid.axis("x"), indexing="ij")
+        points = self.symmetry.places(r, angle, h).float()
+        return field.to("cpu")(points.reshape(-1, 3)).detach().reshape(points.shape[:-1])
+
+    def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z k x"]:
+        space = Grid.of_resolution(self.box, round(max(self.box.edges) / min(grid.spacing)))
+        inside = visual_hull(measurement, space).flatten()
+        place = self.symmetry.reduced(space.points(torch.float64).reshape(-1, 3))
+        box, (nz, angles, nx) = grid.box, grid.shape
+        r = ((place[:, 0] - box.lower[0]) / grid.spacing[0]).floor().long()
+        h = ((place[:, 2] - box.lower[2]) / grid.spacing[2]).floor().long().clamp(0, nz - 1)
+        on_grid = (r >= 0) & (r < nx)
+        cell = (h * nx + r)[on_grid]
+        found = torch.zeros(2, nz * nx, dtype=torch.float64)
+        found[0].index_add_(0, cell, inside[on_grid].double())
+        found[1].index_add_(0, cell, torch.ones_like(cell, dtype=torch.float64))
+        # most of a ring within the masks of all views, where the grid in space has any of it
+        free = (2 * found[0] > found[1]) | (found[1] == 0)
+        return free.reshape(nz, 1, nx).expand(nz, angles, nx).contiguous()
+
+
+def layout_of(symmetry: Symmetry | None, box: Box, faces: tuple[str, ...], basis: str) -> Layout:
+    """Return the layout of a flow with a symmetry, or with none."""
+    return InSpace(box, faces, basis) if symmetry is None else Symmetric(box, faces, basis, symmetry)

@@ -1,0 +1,298 @@
+"""The linear least-squares problem that the classical methods share, on one grid and in numbers of order one.
+
+    min_x  |F x - b|^2 + weight R(x),     F = (1/sigma) A scale / sqrt(N),   b = (1/sigma) y / sqrt(N), |b| = 1
+
+x is the field over its scale, one coefficient a voxel; y is what was measured, all techniques one after the other, and
+N counts its numbers; lengths in the penalties are in units of the box (cube root of its volume), and sums over voxels
+are means, so that a weight means the same on every grid. Voxels that are not free are ambient: x = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerif.fields.grid import Boundary
+from nerif.geometry import Grid
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels.operator import VoxelOperator
+from nerif.reconstruction.voxels.preconditioner import filtered, response, spectrum_of_differences
+
+__all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients", "minimise"]
+
+ROUND = 10  # iterations between looks at which bounds are met
+HALVINGS = 20  # of a step, after which it is no more than rounding
+
+Bounds = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Where a method stands after an iteration.
+
+    Parameters
+    ----------
+    x : (z, y, x) scaled coefficients
+    residual : |F x - b|^2; 1 for the zero field
+    penalty : R(x)
+    """
+
+    x: Tensor
+    residual: float
+    penalty: float
+
+    def objective(self, weight: float) -> float:
+        """Return |F x - b|^2 + weight R(x)."""
+        return self.residual + weight * self.penalty
+
+
+class Differences:
+    """The gradient of a voxel field in units of the box edge: differences between neighbours, and their adjoint.
+
+        (D_x c)_i = (edge / h_x) (c_i - c_{i-1}),     at the n + 1 faces of the n voxels along x
+
+    Parameters
+    ----------
+    grid : Grid
+    boundary : what lies beyond the faces of the box
+    """
+
+    def __init__(self, grid: Grid, boundary: Boundary) -> None:
+        self.boundary, self.shape = boundary, grid.shape
+        edge = math.prod(grid.box.edges) ** (1 / 3)
+        hx, hy, hz = grid.spacing
+        self.inverse = (edge / hz, edge / hy, edge / hx)
+
+    def __call__(self, x: Float[Tensor, "z y x"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the differences along z, y and x."""
+        padded = self.boundary.extend(x, 1)
+        z, y, x = (torch.diff(self._line(padded, axis), dim=axis) * self.inverse[axis] for axis in range(3))
+        return z, y, x
+
+    def adjoint(self, along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y x"]:
+        """Return the adjoint of the differences (minus the divergence)."""
+        padded = along[0].new_zeros([n + 2 for n in self.shape])
+        for axis in range(3):
+            inner, n = self._line(padded, axis), self.shape[axis] + 1
+            inner.narrow(axis, 1, n).add_(along[axis], alpha=self.inverse[axis])
+            inner.narrow(axis, 0, n).sub_(along[axis], alpha=self.inverse[axis])
+        return self.boundary.fold(padded, 1)
+
+    def _line(self, padded: Tensor, axis: int) -> Tensor:
+        """The part of a padded field that goes beyond the box along one axis only."""
+        for other in range(3):
+            if other != axis:
+                padded = padded.narrow(other, 1, self.shape[other])
+        return padded
+
+
+class Problem:
+    """The data and the operators on one grid; see the head of this file.
+
+    Parameters
+    ----------
+    operators : VoxelOperator of each part of the target
+    target : Target, on the operators' device
+    free : (z, y, x) voxels that are not pinned to the ambient, or None for all
+    bounds : lowest and highest value of the field, or None
+    """
+
+    def __init__(
+        self,
+        operators: Sequence[VoxelOperator],
+        target: Target,
+        free: Bool[Tensor, "z y x"] | None = None,
+        bounds: Bounds | None = None,
+    ) -> None:
+        self.operators, self.target, self.scale = tuple(operators), target, target.scale
+        self.operator = operator = self.operators[0]
+        self.differences = Differences(operator.grid, operator.boundary)
+        self.voxels = math.prod(operator.grid.shape)
+        self._free = None if free is None else free.to(operator.device, operator.dtype)
+        root = math.sqrt(target.numbers)
+        self._inverse = [(part.inverse_scale / root).to(operator.device, operator.dtype) for part in target.parts]
+        self.data = self._joined(
+            [inverse * part.of_field.to(inverse) for inverse, part in zip(self._inverse, target.parts, strict=True)]
+        )
+        self.bounds = None if bounds is None else (bounds[0] / self.scale, bounds[1] / self.scale)
+
+    def forward(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, " n"]:
+        """Return F x."""
+        x = self.pin(x) * self.scale
+        return self._joined([a(x) * inverse for a, inverse in zip(self.operators, self._inverse, strict=True)])
+
+    def adjoint(self, y: Float[Tensor, " n"]) -> Float[Tensor, "z y x"]:
+        """Return F^T y."""
+        parts = y.split([inverse.numel() for inverse in self._inverse])
+        total: Tensor | None = None
+        for operator, inverse, part in zip(self.operators, self._inverse, parts, strict=True):
+            own = operator.T(part.reshape(inverse.shape) * inverse)
+            total = own if total is None else total + own
+        assert total is not None
+        return self.pin(total * self.scale)
+
+    @staticmethod
+    def _joined(parts: list[Tensor]) -> Float[Tensor, " n"]:
+        return parts[0].reshape(-1) if len(parts) == 1 else torch.cat([part.reshape(-1) for part in parts])
+
+    def pin(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
+        """Return x with 0, the ambient index, where it is not free."""
+        return x if self._free is None else x * self._free
+
+    def clip(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
+        """Return x within the bounds and pinned."""
+        return self.pin(x) if self.bounds is None else self.pin(x.clamp(*self.bounds))
+
+    @cached_property
+    def response(self) -> Float[Tensor, "z y k"]:
+        """The spectrum of F^T F, about (preconditioner.py)."""
+        free = None if self._free is None else self._free > 0
+        return response(lambda x: self.adjoint(self.forward(x)), self.zero(), free)
+
+    def random(self) -> Float[Tensor, "z y x"]:
+        """Return a random field, the same every time: where the power method starts."""
+        x = torch.rand(self.operator.domain_shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        return self.pin(x.to(self.operator.device, self.operator.dtype))
+
+    def zero(self) -> Float[Tensor, "z y x"]:
+        """Return the ambient field."""
+        return torch.zeros(self.operator.domain_shape, dtype=self.operator.dtype, device=self.operator.device)
+
+
+class Penalty:
+    """A quadratic penalty R(x) = |L x|^2, a mean over voxels.
+
+    Parameters
+    ----------
+    problem : Problem
+    kind : "identity" (L = 1), "gradient" (L = edge grad) or "laplacian" (L = edge^2 div grad)
+    face_weights : for "gradient": weights of the squares at the faces along z, y, x; None for 1
+    """
+
+    KINDS = ("identity", "gradient", "laplacian")
+
+    def __init__(self, problem: Problem, kind: str, face_weights: tuple[Tensor, Tensor, Tensor] | None = None) -> None:
+        self.problem, self.kind = problem, kind
+        self.root = 1 / math.sqrt(problem.voxels)
+        self.roots = None if face_weights is None else tuple(w.sqrt() for w in face_weights)
+
+    @cached_property
+    def spectrum(self) -> Float[Tensor, "z y k"]:
+        """The spectrum of L^T L; of the mean of weights that differ from face to face."""
+        of = spectrum_of_differences(self.problem.zero(), self.problem.differences.inverse)
+        if self.kind == "identity":
+            return torch.ones_like(of) * self.root**2
+        if self.kind == "laplacian":
+            return (of * self.root) ** 2
+        mean = 1.0 if self.roots is None else float(torch.stack([r.square().mean() for r in self.roots]).mean())
+        return mean * of * self.root**2
+
+    def __call__(self, x: Float[Tensor, "z y x"]) -> tuple[Tensor, ...]:
+        """Return L x."""
+        if self.kind == "identity":
+            return (x * self.root,)
+        along = self.problem.differences(x)
+        if self.kind == "laplacian":
+            return (self.problem.differences.adjoint(along) * self.root,)
+        if self.roots is None:
+            return tuple(a * self.root for a in along)
+        return tuple(a * (w * self.root) for a, w in zip(along, self.roots, strict=True))
+
+    def adjoint(self, y: tuple[Tensor, ...]) -> Float[Tensor, "z y x"]:
+        """Return L^T y."""
+        if self.kind == "identity":
+            return y[0] * self.root
+        if self.kind == "laplacian":
+            return self.problem.differences.adjoint(self.problem.differences(y[0] * self.root))
+        if self.roots is None:
+            y = tuple(a * self.root for a in y)
+        else:
+            y = tuple(a * (w * self.root) for a, w in zip(y, self.roots, strict=True))
+        return self.problem.differences.adjoint((y[0], y[1], y[2]))
+
+
+def minimise(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
+    """Minimise |F x - b|^2 + weight |L x|^2 within the bounds, without end; no iterate is worse than the one before.
+
+    A round takes conjugate gradients with the voxels at their bounds held, brings what passes a bound back to it, and
+    ends after ROUND iterations or where that makes the objective rise; a first step that does is halved until it falls.
+
+    Source: More & Toraldo, SIAM J. Optim. 1 (1991) 93, with a search along the path in place of one along a line.
+    """
+    x = problem.clip(x)
+    if problem.bounds is None:
+        yield from conjugate_gradients(problem, penalty, weight, x)
+    best = _within(problem, penalty, x)
+    while True:
+        begun = best
+        for _, beyond in zip(range(ROUND), conjugate_gradients(problem, penalty, weight, best.x), strict=False):
+            there = problem.clip(beyond.x)
+            found = beyond if torch.equal(there, beyond.x) else _within(problem, penalty, there)
+            if found.objective(weight) >= best.objective(weight):
+                break
+            best = found
+            yield best
+        step, halvings = beyond.x - begun.x, 0
+        while best is begun:
+            step, halvings = step / 2, halvings + 1
+            found = _within(problem, penalty, problem.clip(begun.x + step))
+            if found.objective(weight) < begun.objective(weight):
+                best = found
+            if best is found or halvings > HALVINGS:  # there is but rounding left
+                yield best
+
+
+def _within(problem: Problem, penalty: Penalty, x: Tensor) -> Iterate:
+    """The iterate at x."""
+    return Iterate(x, _square(problem.data - problem.forward(x)), sum(_square(a) for a in penalty(x)))
+
+
+def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
+    """Minimise |F x - b|^2 + weight |L x|^2 by conjugate gradients on the least-squares problem (CGLS), without end.
+
+        alpha = s.z / (|F p|^2 + weight |L p|^2),         x <- x + alpha p,    r <- r - alpha F p
+        s = F^T r - weight L^T L x,    z = M^-1 s,        p <- z + (s.z / s_last.z_last) p
+
+    Where bounds are given, voxels at a bound towards which the objective falls are held there; the others may pass
+    theirs.
+
+    M is that of preconditioner.py.
+
+    Source: Bjorck, Numerical Methods for Least Squares Problems (SIAM, 1996), Sec. 7.4; with circulant M: Chan & Ng,
+    SIAM Review 38 (1996) 427.
+    """
+    r = problem.data - problem.forward(x)
+    q = tuple(-a for a in penalty(x))
+    s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q))
+    hold = torch.ones_like(x)
+    if problem.bounds is not None:
+        low, high = problem.bounds
+        hold = (~((x <= low) & (s < 0)) & ~((x >= high) & (s > 0))).to(x)
+    s = s * hold
+    spectrum = problem.response + weight * penalty.spectrum
+    p = problem.pin(filtered(s, spectrum)) * hold
+    gamma = float((s * p).sum())
+    done = gamma * (100 * torch.finfo(x.dtype).eps) ** 2  # from here on there is but rounding to follow
+    while True:
+        if gamma > done:
+            fp, lp = problem.forward(p), penalty(p)
+            alpha = gamma / (_square(fp) + weight * sum(_square(a) for a in lp))
+            x = x + alpha * p
+            r = r - alpha * fp
+            q = tuple(a - alpha * b for a, b in zip(q, lp, strict=True))
+        yield Iterate(x, _square(r), sum(_square(a) for a in q))
+        if gamma > done:
+            s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q)) * hold
+            z = problem.pin(filtered(s, spectrum)) * hold
+            last, gamma = gamma, float((s * z).sum())
+            p = z + (gamma / last) * p
+
+
+def _square(x: Tensor) -> float:
+    return float(x.square().sum())

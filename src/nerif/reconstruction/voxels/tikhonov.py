@@ -1,0 +1,37 @@
+"""Tikhonov regularisation: the smoothest field, or the smallest, that fits the data as well as it should.
+
+min_x  |F x - b|^2 + weight |L x|^2,      L = 1, edge grad, or edge^2 div grad
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from torch import Tensor
+
+from nerif.common.conventions import InputError
+from nerif.reconstruction.voxels.problem import Iterate, Penalty, Problem, minimise
+from nerif.reconstruction.voxels.settings import WeightedVoxelReconstructor
+
+__all__ = ["Tikhonov"]
+
+
+@dataclass(frozen=True)
+class Tikhonov(WeightedVoxelReconstructor):
+    """Voxels with a quadratic penalty, solved by conjugate gradients.
+
+    Source: Tikhonov & Arsenin (1977); for BOST: Nicolas et al., Exp. Fluids 57:13 (2016).
+    """
+
+    penalty: Literal["identity", "gradient", "laplacian"] = "gradient"
+    """What is kept small: the field, its gradient, or its Laplacian."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.penalty not in Penalty.KINDS:
+            raise InputError(f"penalty: expected one of {', '.join(Penalty.KINDS)}, got '{self.penalty}'")
+
+    def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
+        yield from minimise(problem, Penalty(problem, self.penalty), weight, x)
