@@ -30,7 +30,7 @@ from bench import Table, add_write
 from nerif.common.files import atomic
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.uncertainty.bootstrap import LOST, Deviations
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from random_flows import random_flow
 
 SHARES = (0.6827, 0.9545)  # of a normal distribution, within one and two standard deviations

@@ -23,7 +23,7 @@ def run(path: Path, truth: Path, method: str, limit: float, hold_out: str) -> tu
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.voxels.total_variation import TotalVariation
-    from nerif.result import ResultDirectory
+    from nerif.results.directory import ResultDirectory
     from nerif.workflow import Run, reconstruct_into
 
     keep_freed_memory()

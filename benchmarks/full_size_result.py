@@ -30,7 +30,7 @@ from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.warm_start import fit_network
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.workflow import write_report
 
 BOX, N_AMBIENT, NOISE = Box.cube(50.0), 1.00027, 0.05

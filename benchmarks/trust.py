@@ -61,7 +61,7 @@ def case(
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import Box, Grid, Ring
     from nerif.reconstruction.device import keep_freed_memory
-    from nerif.result import ResultDirectory
+    from nerif.results.directory import ResultDirectory
     from nerif.simulation.simulate import simulate
     from nerif.workflow import reconstruct_into
 

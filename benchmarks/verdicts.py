@@ -23,7 +23,7 @@ from typing import Any
 
 from bench import Table, add_write
 from nerif.common.files import atomic
-from nerif.result import Result
+from nerif.results.directory import Result
 from nerif.verdict import WORDS, Verdict, verdict
 from spoiling import RIGS, SPOILED, case
 
@@ -80,7 +80,7 @@ def _reconstructed(number: int, method: str, steps: int, pixels: int) -> dict[st
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.voxels.total_variation import TotalVariation
-    from nerif.result import ResultDirectory
+    from nerif.results.directory import ResultDirectory
     from nerif.workflow import Run, reconstruct_into
 
     keep_freed_memory()

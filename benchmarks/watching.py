@@ -24,7 +24,7 @@ EVERY = 1.0  # seconds, as the page of a run does
 def look(directory: str) -> None:
     """Read and draw how a run goes on until somebody ends it."""
     from nerif.app.live_view import curve_options, look_html
-    from nerif.live import read_live, read_look
+    from nerif.results.live import read_live, read_look
 
     while True:
         live, seen = read_live(Path(directory)), read_look(Path(directory))
@@ -50,11 +50,11 @@ def steps_of(way: str, path: Path, preset_name: str, seconds: float, device: str
     from dataclasses import replace
 
     from nerif.data.measurement import Measurement
-    from nerif.live import Live
     from nerif.reconstruction.base import Step
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.presets import preset
     from nerif.reconstruction.progress import QUIET
+    from nerif.results.live import Live
 
     keep_freed_memory()
     measurement = Measurement.read(path)

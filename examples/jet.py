@@ -29,7 +29,7 @@ from nerif.plotting.drawing import style
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.report.meridian_figure import draw_centre_line, draw_section
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.workflow import Run, reconstruct_into
 
 HARMONICS = 3  # of a cell

@@ -16,7 +16,7 @@ from nerif.evaluation import evaluate
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
 
 N_AMBIENT = 1.00027

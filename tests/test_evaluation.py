@@ -18,7 +18,7 @@ from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid
 from nerif.prediction import predict_view, reproject
-from nerif.result import METRICS, ResultDirectory
+from nerif.results.directory import METRICS, ResultDirectory
 
 
 class Scaled(Field):

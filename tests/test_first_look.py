@@ -20,7 +20,7 @@ from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import trust, trust_figures
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.workflow import Run, reconstruct_into
 
 VOXELS = Tikhonov(voxels=16, basis="linear", iterations=8, regularisation=0.1, device="cpu")

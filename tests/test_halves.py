@@ -19,7 +19,7 @@ from nerif.geometry.symmetry import Symmetry
 from nerif.halves import Reflection, departures, halved, kept_half, left_of_axis
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.verdict import WORDS
 from nerif.workflow import Run, reconstruct_into

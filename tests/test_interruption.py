@@ -17,7 +17,7 @@ from nerif.common.interruption import Interrupted, if_interrupted
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.workflow import Run, reconstruct_into
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import nerif.live
+import nerif.results.live
 from nerif.geometry import Ring
-from nerif.live import Live, read_live, read_look
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.results.live import Live, read_live, read_look
 from nerif.simulation.simulate import Simulation
 from nerif.workflow import Run, reconstruct_into
 
@@ -33,9 +33,9 @@ METHODS = [NeRIF(max_steps=10, points_per_batch=256), Tikhonov(voxels=8, iterati
     "hold_out", [pytest.param(("45deg",), marks=pytest.mark.slow), ("auto",)], ids=["held out", "auto"]
 )
 def test_a_run_tells_how_it_goes_on(measurement, method, hold_out, tmp_path, monkeypatch):
-    monkeypatch.setattr(nerif.live, "FIRST", 0.0)
+    monkeypatch.setattr(nerif.results.live, "FIRST", 0.0)
     for name, value in {"SHARE": 1e9, "VOXELS": 8, "SAMPLES": 16}.items():
-        monkeypatch.setattr(nerif.live, name, value)
+        monkeypatch.setattr(nerif.results.live, name, value)
     run = Run(hold_out=hold_out, report=False)
     result = reconstruct_into(tmp_path / "r", measurement, method, run, voxels=8, live=True)
     live, look = read_live(tmp_path / "r"), read_look(tmp_path / "r")
@@ -48,7 +48,7 @@ def test_a_run_tells_how_it_goes_on(measurement, method, hold_out, tmp_path, mon
     assert look.components == ("u", "v")
     assert look.measured.shape == look.predicted.shape == (12, 18, 2)
     assert look.quantity == result.quantity
-    assert max(look.values.shape) == nerif.live.VOXELS
+    assert max(look.values.shape) == nerif.results.live.VOXELS
     assert np.isfinite(look.values).all()
     known = np.isfinite(look.measured)
     assert np.mean((look.predicted - look.measured)[known] ** 2) < 2 * np.mean(look.measured[known] ** 2)
@@ -76,5 +76,5 @@ def test_looks_take_a_share_of_the_time(measurement, tmp_path, monkeypatch):
         for i in range(4000):
             clock[0] += 0.05
             assert not told(replace(step, step=i))
-    assert 0.8 * nerif.live.SHARE < len(looks) * 0.5 / clock[0] <= nerif.live.SHARE
-    assert len(read_live(tmp_path)["curve"]["step"]) <= nerif.live.POINTS
+    assert 0.8 * nerif.results.live.SHARE < len(looks) * 0.5 / clock[0] <= nerif.results.live.SHARE
+    assert len(read_live(tmp_path)["curve"]["step"]) <= nerif.results.live.POINTS

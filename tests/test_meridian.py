@@ -14,7 +14,7 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 
 

@@ -12,7 +12,7 @@ from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.kept_run import ASKED
-from nerif.result import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
+from nerif.results.directory import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
 
 
 def put(path: Path, text: str = "mine") -> Path:

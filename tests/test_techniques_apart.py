@@ -21,7 +21,7 @@ from nerif.geometry import Box, Ring
 from nerif.prediction import predict
 from nerif.quick_views import binned
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.result import REPROJECTION, ResultDirectory
+from nerif.results.directory import REPROJECTION, ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
 from nerif.symptoms import open_faces
 from nerif.workflow import Run, reconstruct_into

@@ -25,7 +25,7 @@ from nerif.plotting import drawing
 from nerif.report import packing
 from nerif.report.pages import error_of, figures_of, residuals_over_sigma, view
 from nerif.report.view_images import view_images
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.sequence.plan import SequenceSettings
 from nerif.symptoms import looks
 

@@ -32,7 +32,7 @@ from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import draw_rig, picture_corners
 from nerif.report.scene import scene_of
-from nerif.result import Result
+from nerif.results.directory import Result
 from nerif.simulation.simulate import simulate, view_displacement
 
 AMBIENT = 1.00027

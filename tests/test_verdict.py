@@ -14,7 +14,7 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import headline
-from nerif.result import Missing, Result, ResultDirectory
+from nerif.results.directory import Missing, Result, ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.verdict import ONE_CAMERA, WORDS, Estimate, verdict
 from nerif.workflow import Run, reconstruct_into

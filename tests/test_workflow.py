@@ -17,7 +17,7 @@ from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import picture_corners
-from nerif.result import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
+from nerif.results.directory import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
 from nerif.workflow import Run, reconstruct_into
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")

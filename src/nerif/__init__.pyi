@@ -30,7 +30,7 @@ from .reconstruction.voxels.multiplicative import MART as MART
 from .reconstruction.voxels.multiplicative import MLEM as MLEM
 from .reconstruction.voxels.tikhonov import Tikhonov as Tikhonov
 from .reconstruction.voxels.total_variation import TotalVariation as TotalVariation
-from .result import ResultDirectory as ResultDirectory
+from .results.directory import ResultDirectory as ResultDirectory
 from .sequence.plan import SequenceSettings as SequenceSettings
 from .sequence.reconstruct import reconstruct_sequence as reconstruct_sequence
 from .simulation.simulate import Simulation as Simulation

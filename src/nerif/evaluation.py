@@ -32,7 +32,7 @@ from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.rig.refined import with_corrections
 from nerif.residuals import leftover, white_noise
-from nerif.result import METRICS, VOLUME, ResultDirectory
+from nerif.results.directory import METRICS, VOLUME, ResultDirectory
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")

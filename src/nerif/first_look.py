@@ -20,7 +20,7 @@ from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 
 __all__ = ["AUTO", "FEWEST", "NONE", "FirstLook", "kept_apart", "kept_out"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from nerif.data.volume import Volume
 from nerif.reconstruction.files import FIELD
-from nerif.result import METRICS, RUN, UNREADABLE, VOLUME, Missing, Result, ResultDirectory
+from nerif.results.directory import METRICS, RUN, UNREADABLE, VOLUME, Missing, Result, ResultDirectory
 
 __all__ = ["glance"]
 

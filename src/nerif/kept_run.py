@@ -15,7 +15,7 @@ from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstru
 from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, write_state
 from nerif.reconstruction.fingerprint import fingerprint
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 
 __all__ = ["KeptRun"]
 

@@ -22,7 +22,7 @@ from nerif.prediction import reproject
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.uncertainty.repetition import Found, Maps, Repetitions, certainty
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 
 __all__ = ["Members", "all_quantities"]
 

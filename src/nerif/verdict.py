@@ -32,7 +32,7 @@ from nerif.data.volume import field_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.halves import camera_of
 from nerif.residuals import CAUSES
-from nerif.result import Result
+from nerif.results.directory import Result
 
 __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]
 

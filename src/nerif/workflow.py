@@ -21,7 +21,6 @@ from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
 from nerif.gains import fit_gains, with_gains
 from nerif.halves import departure_sentence, departures, halved
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
-from nerif.live import Live
 from nerif.members import Members, all_quantities
 from nerif.physics.quantities import NOT_UNIFORM, GasSettings, masked_lines
 from nerif.prediction import check_sees, reproject
@@ -49,7 +48,8 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
-from nerif.result import CALIBRATION, REPORT, ResultDirectory, versions
+from nerif.results.directory import CALIBRATION, REPORT, ResultDirectory, versions
+from nerif.results.live import Live
 from nerif.verdict import verdict
 
 __all__ = ["METHODS", "Run", "reconstruct_into", "write_report", "write_sequence_report"]

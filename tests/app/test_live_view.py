@@ -15,8 +15,8 @@ from nerif.app.jobs import Jobs
 from nerif.app.live_surface import said_of
 from nerif.app.live_view import told
 from nerif.json_file import write_json
-from nerif.live import read_look
-from nerif.result import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_LOOK
+from nerif.results.live import read_look
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
 OUT = "results/a <b>"

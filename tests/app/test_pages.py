@@ -12,7 +12,7 @@ import pytest
 from app.serving import Served, opened
 from nerif.cli import main
 from nerif.geometry import Ring
-from nerif.live import read_live, read_look
+from nerif.results.live import read_live, read_look
 from nerif.simulation.design import DesignSettings, expect
 from report.browsing import errors, needs_browser, requests, text, wait_for
 

@@ -27,7 +27,7 @@ from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
 BOX = Box((-25.0, -24.0, -20.0), (25.0, 24.0, 20.0))

@@ -32,7 +32,7 @@ from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.voxels.operator import VoxelOperator, rays_through
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate, view_displacement
 
 BOX = Box.cube(50.0)

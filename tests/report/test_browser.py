@@ -17,7 +17,7 @@ from nerif.geometry import Box, Grid
 from nerif.report import html
 from nerif.report.packing import relation
 from nerif.report.pages import error_of
-from nerif.result import Result, ResultDirectory
+from nerif.results.directory import Result, ResultDirectory
 from report.browsing import (
     choose,
     drag,

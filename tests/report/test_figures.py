@@ -19,7 +19,7 @@ from nerif.plotting import drawing
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface, surface_triangles
 from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, view
-from nerif.result import Result, ResultDirectory
+from nerif.results.directory import Result, ResultDirectory
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
 from nerif.report.summary import LEVELS, Statement, trust
 from nerif.report.view_images import _shrink, lattice_step, view_images
-from nerif.result import Result, ResultDirectory
+from nerif.results.directory import Result, ResultDirectory
 from report.page_reading import quantity_of, unpack
 
 PARTS = ("run.toml", "metrics.json", "history.csv", "volume.nc", "reprojection.nc")

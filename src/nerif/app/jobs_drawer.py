@@ -13,8 +13,8 @@ from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.live import read_live
 from nerif.report.movie import frames_there
+from nerif.results.live import read_live
 
 __all__ = ["JobsDrawer", "film_progress", "progress_of"]
 

@@ -13,8 +13,8 @@ from nerif.app.result_answers import live_address
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import describe, name_of
 from nerif.geometry import Box
-from nerif.live import Look
 from nerif.report.isosurface import default_level, surface_triangles
+from nerif.results.live import Look
 
 __all__ = ["LiveSurface", "said_of"]
 

@@ -18,10 +18,10 @@ from nerif.app.workspace import Workspace
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import name_of
 from nerif.geometry import Box
-from nerif.live import Look, read_live, read_look
 from nerif.plotting.drawing import colour_range, map_range
 from nerif.report.view_images import picture_address
-from nerif.result import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_LOOK
+from nerif.results.live import Look, read_live, read_look
 
 __all__ = ["LiveView", "curve_options", "look_html", "told"]
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 from nerif.commands.info import is_measurement
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.views import View, find_views
-from nerif.result import LIVE, RUN
+from nerif.results.directory import LIVE, RUN
 
 __all__ = ["OWN", "Contents", "Project"]
 

@@ -15,9 +15,9 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from nerif.app.sources import source_of
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
-from nerif.live import read_look
 from nerif.report.isosurface import default_level, stl_of, surface_triangles
-from nerif.result import REPORT
+from nerif.results.directory import REPORT
+from nerif.results.live import read_look
 
 __all__ = ["ROUTES", "live_address", "report_address", "report_file", "surface_address"]
 

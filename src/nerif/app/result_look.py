@@ -22,7 +22,7 @@ from nerif.data.volume import Volume, describe
 from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_pictures import colours_of
 from nerif.resampling import common_grid, difference, resampled
-from nerif.result import VOLUME
+from nerif.results.directory import VOLUME
 
 __all__ = ["ResultLook"]
 

@@ -16,7 +16,7 @@ from nerif.glance import glance
 from nerif.reconstruction.files import FIELD
 from nerif.report.movie import frames_there
 from nerif.report.summary import trust_figures
-from nerif.result import LIVE, METRICS, RUN, VOLUME, Result
+from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result
 from nerif.verdict import verdict
 
 __all__ = ["Row", "result_table", "rows_of"]

@@ -15,7 +15,7 @@ from nerif.plotting.drawing import colour_range, shown
 from nerif.report.isosurface import default_level
 from nerif.report.movie import frames_there, ranges_over_time
 from nerif.report.packing import coarsen
-from nerif.result import VOLUME
+from nerif.results.directory import VOLUME
 
 __all__ = ["Film", "Source", "Still", "source_of"]
 

@@ -16,7 +16,7 @@ from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.geometry import Ring
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import Simulation
 from nerif.workflow import Run, write_report
 

@@ -15,7 +15,7 @@ from nerif.data.exports import FORMATS, export
 from nerif.data.volume import Volume, quantities_of
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, derive, masked_lines
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 
 __all__ = ["Export", "main", "run"]
 

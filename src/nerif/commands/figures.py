@@ -12,7 +12,7 @@ from nerif.commands.output import counting_bar, say
 from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.report.pages import JOURNALS, save_figures
-from nerif.result import FIGURES, ResultDirectory
+from nerif.results.directory import FIGURES, ResultDirectory
 
 __all__ = ["Figures", "main", "run"]
 

@@ -22,7 +22,7 @@ from nerif.data.volume_file import read_volume
 from nerif.evaluation import rms_text
 from nerif.forward.registry import TECHNIQUES
 from nerif.plotting.notebook import number
-from nerif.result import METRICS, ResultDirectory
+from nerif.results.directory import METRICS, ResultDirectory
 
 __all__ = ["Info", "is_measurement", "main", "run"]
 

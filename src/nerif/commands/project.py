@@ -16,7 +16,7 @@ from nerif.forward.registry import AUTO, model_of, technique, technique_of
 from nerif.geometry import Ring
 from nerif.prediction import predict
 from nerif.reconstruction.aperture import seen_through
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 
 __all__ = ["Project", "main", "run"]
 

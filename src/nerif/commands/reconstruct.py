@@ -16,7 +16,7 @@ from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Step
 from nerif.reconstruction.neural.presets import preset
-from nerif.result import RUN
+from nerif.results.directory import RUN
 from nerif.workflow import reconstruct_into
 
 __all__ = ["main", "run"]

@@ -15,7 +15,7 @@ from nerif.common.conventions import AMBIENT_INDEX
 from nerif.common.interruption import if_interrupted
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.result import ResultDirectory
+from nerif.results.directory import ResultDirectory
 from nerif.simulation.experiment import Experiment
 
 __all__ = ["Render", "main", "run"]

@@ -11,7 +11,7 @@ import tyro
 from nerif.commands.output import MONITOR, check_file
 from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
-from nerif.result import REPORT
+from nerif.results.directory import REPORT
 from nerif.workflow import write_report, write_sequence_report
 
 __all__ = ["Report", "main", "run"]

@@ -25,7 +25,7 @@ from nerif.report.scene import scene_of
 from nerif.report.summary import came_out, headline, looked, measured, repeated, trust, trust_figures
 from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import colour_table, view_images
-from nerif.result import Result
+from nerif.results.directory import Result
 
 if TYPE_CHECKING:
     import jinja2

@@ -36,7 +36,7 @@ from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_s
 from nerif.report.moves_figure import draw_moves
 from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import lattice_step
-from nerif.result import Result
+from nerif.results.directory import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

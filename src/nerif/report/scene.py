@@ -19,7 +19,7 @@ from nerif.report.isosurface import default_level
 from nerif.report.pages import error_of
 from nerif.report.rig_figure import picture_corners
 from nerif.report.view_images import colour_table
-from nerif.result import Result
+from nerif.results.directory import Result
 
 __all__ = ["scene_of", "scene_over_time"]
 

@@ -18,7 +18,7 @@ from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.rig.refined import moved_lines
 from nerif.report.packing import relation
 from nerif.residuals import CAUSES
-from nerif.result import METRICS, VOLUME, Result
+from nerif.results.directory import METRICS, VOLUME, Result
 from nerif.verdict import verdict
 
 __all__ = ["Statement", "came_out", "headline", "looked", "measured", "repeated", "trust", "trust_figures"]

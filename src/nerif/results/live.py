@@ -34,7 +34,7 @@ from nerif.observation import Observation
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
-from nerif.result import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_LOOK
 
 __all__ = ["Live", "Look", "read_live", "read_look"]
 
