@@ -14,7 +14,7 @@ import statistics
 from dataclasses import replace
 
 from bench import Table, add_write
-from nerif.evaluation import evaluate_volume
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.forward.absorption import MODELS
 from nerif.geometry import Ring

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from bench import N_AMBIENT, Table, add_write
-from nerif.evaluation import evaluate_volume
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor

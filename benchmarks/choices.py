@@ -17,8 +17,8 @@ from functools import partial
 import torch
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, paper_rig

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.analysis.evaluation import evaluate_volume
+from nerif.analysis.prediction import predict_view
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
-from nerif.prediction import predict_view
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.tikhonov import Tikhonov

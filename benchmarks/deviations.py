@@ -51,10 +51,10 @@ def looked_at(number: int, folder: Path) -> dict[str, float | str]:
 def _reconstructed(number: int) -> dict[str, float | str]:
     import torch
 
-    from nerif.evaluation import FLOW
+    from nerif.analysis.evaluation import FLOW
+    from nerif.analysis.prediction import reproject
     from nerif.geometry import Grid
     from nerif.physics.quantities import GasSettings
-    from nerif.prediction import reproject
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.uncertainty.bootstrap import Trials

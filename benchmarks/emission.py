@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from bench import Table, add_write
-from nerif.evaluation import evaluate_volume
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.geometry import Ring
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF

@@ -19,9 +19,9 @@ import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
 from full_size import flame, measured
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.geometry import Grid
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural.presets import preset

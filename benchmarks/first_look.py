@@ -18,7 +18,7 @@ from nerif.common.conventions import InputError
 
 def run(path: Path, truth: Path, method: str, limit: float, hold_out: str) -> tuple[float, float, float, float]:
     """Return L2, seconds, and how far off the view was predicted, before and in the end, in sigma; NaN where not."""
-    from nerif.evaluation import evaluate
+    from nerif.analysis.evaluation import evaluate
     from nerif.reconstruction.base import Reconstructor
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF

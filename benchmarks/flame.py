@@ -16,8 +16,8 @@ from dataclasses import replace
 import torch
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Step

@@ -17,13 +17,13 @@ from pathlib import Path
 import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
+from nerif.analysis.evaluation import evaluate_volume
+from nerif.analysis.prediction import predict
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, paper_rig
-from nerif.prediction import predict
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import bins
 from nerif.reconstruction.neural.neural import NeRIF

@@ -18,15 +18,15 @@ from pathlib import Path
 import torch
 
 from bench import Table, add_write, alone
+from nerif.analysis.evaluation import evaluate_views
+from nerif.analysis.prediction import reproject
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Reprojection
-from nerif.evaluation import evaluate_views
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.members import all_quantities
 from nerif.physics.quantities import GasSettings
-from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.warm_start import fit_network

@@ -90,9 +90,9 @@ def run(case: Case, seed: int, data: Path, truth: Path) -> dict[str, Any]:
     """Reconstruct in this process; return errors, seconds, the residual and why it ended."""
     import torch
 
+    from nerif.analysis.evaluation import evaluate_volume
     from nerif.data.measurement import Measurement
     from nerif.data.volume_file import read_volume
-    from nerif.evaluation import evaluate_volume
     from nerif.forward.path_integral import PathIntegral, project
     from nerif.forward.registry import forward_model
     from nerif.reconstruction.device import keep_freed_memory

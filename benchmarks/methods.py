@@ -16,9 +16,9 @@ from typing import Literal
 import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Reconstructor

@@ -23,15 +23,15 @@ from typing import Any
 
 from abel_peers import ORDERS, PEERS, ParallelView, Peer, Revolution, attempts, pyabel
 from bench import N_AMBIENT, Table, add_write
+from nerif.analysis.evaluation import evaluate_volume
+from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Grid, Ring
-from nerif.metrics import volume_errors
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.tikhonov import Tikhonov

@@ -17,9 +17,9 @@ from statistics import fmean
 from types import SimpleNamespace
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Reconstruction

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from bench import N_AMBIENT, Table, add_write, alone
+from nerif.analysis.prediction import predict
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume, write_netcdf
@@ -29,7 +30,6 @@ from nerif.geometry import Grid, paper_rig
 from nerif.imaging.assembly import Scene, Surroundings, join_views
 from nerif.imaging.displacement.displacement import DisplacementSettings, measure
 from nerif.imaging.patterns import Background
-from nerif.prediction import predict
 from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
 
 REFERENCES = 5
@@ -134,7 +134,7 @@ def photographed(case: Case, folder: Path) -> None:
 
 def reconstruct(folder: Path, method: str, flow: str, source: str, seconds: float, seed: int) -> dict[str, Any]:
     """Reconstruct, and compare with the truth."""
-    from nerif.evaluation import evaluate_volume
+    from nerif.analysis.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.voxels.total_variation import TotalVariation

@@ -41,9 +41,9 @@ def turned(camera: Camera, degrees: float) -> Camera:
 
 def of_views(folder: Path, views: int, seed: int) -> Measurement:
     """Return the measurement by 5, 9 or 18 views, their cameras as they are."""
+    from nerif.analysis.prediction import predict
     from nerif.data.volume_file import read_volume
     from nerif.fields.grid import VoxelField
-    from nerif.prediction import predict
 
     thin = Measurement.read(folder / "thin.nc")
     if views <= len(thin.cameras):
@@ -74,9 +74,9 @@ def knocked(measurement: Measurement, mm: float, degrees: float, seed: int) -> M
 
 def run(folder: Path, views: int, size: str, seed: int, refine: bool, steps: int) -> tuple[float, float]:
     """Reconstruct, and return L2 before and after the best rigid motion of the field."""
-    from nerif.alignment import aligned
+    from nerif.analysis.alignment import aligned
+    from nerif.analysis.evaluation import evaluate_volume
     from nerif.data.volume_file import read_volume
-    from nerif.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
 

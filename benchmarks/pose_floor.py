@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from bench import Table, add_write, alone
-from nerif.alignment import Moved
+from nerif.analysis.alignment import Moved
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
@@ -68,8 +68,8 @@ def shifted(camera: Camera, b: Tensor) -> Camera:
 
 def run(path: Path, cameras: tuple[Camera, ...], steps: int, seed: int) -> tuple[float, float]:
     """Reconstruct with cameras of these poses; return L2 before and after the best rigid motion."""
-    from nerif.alignment import aligned
-    from nerif.evaluation import evaluate_volume
+    from nerif.analysis.alignment import aligned
+    from nerif.analysis.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
 
@@ -83,7 +83,7 @@ def run(path: Path, cameras: tuple[Camera, ...], steps: int, seed: int) -> tuple
 
 def main() -> None:
     """Run and print the table."""
-    from nerif.evaluation import evaluate_volume
+    from nerif.analysis.evaluation import evaluate_volume
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("rigs", type=Path, help="folder with the measurement files and truth.nc")

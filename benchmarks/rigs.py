@@ -57,11 +57,11 @@ def goals(name: str, method: str, way: Way) -> tuple[float | None, float | None]
 
 def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[str, Any]:
     """Reconstruct a file, and compare with the truth beside it."""
-    from nerif.alignment import aligned
+    from nerif.analysis.alignment import aligned
+    from nerif.analysis.evaluation import evaluate_views, evaluate_volume
+    from nerif.analysis.prediction import reproject
     from nerif.data.measurement import Measurement
     from nerif.data.volume_file import read_volume
-    from nerif.evaluation import evaluate_views, evaluate_volume
-    from nerif.prediction import reproject
     from nerif.reconstruction.aperture import seen_through
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF

@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.analysis.metrics import volume_errors
 from nerif.commands.simulate import Simulate, instants
 from nerif.commands.simulate import run as simulate
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Ring
-from nerif.metrics import volume_errors
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset

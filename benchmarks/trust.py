@@ -55,9 +55,9 @@ def case(
     from scipy.ndimage import gaussian_filter
     from scipy.stats import spearmanr
 
+    from nerif.analysis.evaluation import FLOW, evaluate
     from nerif.data.volume import Volume
     from nerif.data.volume_file import write_netcdf
-    from nerif.evaluation import FLOW, evaluate
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import Box, Grid, Ring
     from nerif.reconstruction.device import keep_freed_memory

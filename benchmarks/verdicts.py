@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from bench import Table, add_write
+from nerif.analysis.verdict import WORDS, Verdict, verdict
 from nerif.common.files import atomic
 from nerif.results.directory import Result
-from nerif.verdict import WORDS, Verdict, verdict
 from spoiling import RIGS, SPOILED, case
 
 BAD, GOOD = 0.05, 0.02  # of the variation
@@ -72,9 +72,9 @@ def record(number: int, folder: Path, method: str, steps: int, pixels: int) -> R
 
 
 def _reconstructed(number: int, method: str, steps: int, pixels: int) -> dict[str, Any]:
+    from nerif.analysis.evaluation import evaluate
     from nerif.data.volume import Volume
     from nerif.data.volume_file import write_netcdf
-    from nerif.evaluation import evaluate
     from nerif.geometry import Grid
     from nerif.reconstruction.base import Reconstructor
     from nerif.reconstruction.device import keep_freed_memory

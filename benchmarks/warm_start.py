@@ -12,9 +12,9 @@ import argparse
 from dataclasses import replace
 
 from bench import N_AMBIENT, Table, add_write
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig

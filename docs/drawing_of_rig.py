@@ -7,9 +7,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from nerif.analysis.prediction import predict
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Camera, paper_rig
-from nerif.prediction import predict
 from nerif.reconstruction.rig.posterior import covariance
 from nerif.reconstruction.rig.refinement import Refinement
 from nerif.simulation.simulate import add_noise

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerif.analysis.evaluation import evaluate
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
-from nerif.evaluation import evaluate
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Outcome, Reconstruction

@@ -18,12 +18,12 @@ import pytest
 import torch
 import xarray as xr
 
+from nerif.analysis.evaluation import evaluate_views
+from nerif.analysis.prediction import reproject
 from nerif.cli import VERBS, main
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
-from nerif.evaluation import evaluate_views
 from nerif.forward.deflection import MODELS
-from nerif.prediction import reproject
 from nerif.reconstruction.files import read_field
 
 TINY = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]

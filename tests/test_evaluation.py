@@ -9,15 +9,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerif.analysis.evaluation import evaluate_views, evaluate_volume
+from nerif.analysis.prediction import predict_view, reproject
 from nerif.common.conventions import Points, Values, Vectors
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid
-from nerif.prediction import predict_view, reproject
 from nerif.results.directory import METRICS, ResultDirectory
 
 

@@ -10,18 +10,18 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerif.analysis.asymmetry import Reflection, departures, halved, kept_half, left_of_axis
+from nerif.analysis.verdict import WORDS
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import paper_rig
 from nerif.geometry.symmetry import Symmetry
-from nerif.halves import Reflection, departures, halved, kept_half, left_of_axis
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.verdict import WORDS
 from nerif.workflow import Run, reconstruct_into
 
 ABOUT_Z = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)

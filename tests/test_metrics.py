@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from nerif.metrics import correlation, psnr, slice_metrics, ssim, view_metrics, volume_metrics
+from nerif.analysis.metrics import correlation, psnr, slice_metrics, ssim, view_metrics, volume_metrics
 
 RNG = np.random.default_rng(0)
 TRUTH = -2e-4 * RNG.random((20, 11, 13))

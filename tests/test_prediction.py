@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif import prediction
+from nerif.analysis import prediction
+from nerif.analysis.prediction import SampledViews, on_voxels, reproject
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.fields.network import Network, NetworkShape, NeuralField
@@ -15,7 +16,6 @@ from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import MODELS, Deflection
 from nerif.forward.path_integral import PathIntegral
 from nerif.geometry import Box, Ring
-from nerif.prediction import SampledViews, on_voxels, reproject
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from nerif.analysis.resampling import common_grid, difference, resampled
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
-from nerif.resampling import common_grid, difference, resampled
 
 
 def sloping(grid: Grid) -> Volume:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
+from nerif.analysis.prediction import predict
+from nerif.analysis.residuals import BLOCK, leftover, white_noise
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.fields.grid import VoxelField
-from nerif.prediction import predict
-from nerif.residuals import BLOCK, leftover, white_noise
 
 RIGS = Path(__file__).parents[2] / "shared" / "data" / "rigs"
 SHAPE, SIGMA = (96, 80), 0.05

@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerif.analysis.evaluation import evaluate
+from nerif.analysis.gains import fit_gains, with_gains
+from nerif.analysis.prediction import predict
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.evaluation import evaluate
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.absorption import Absorption
 from nerif.forward.emission import Emission
-from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Ring
-from nerif.prediction import predict
 from nerif.quick_views import binned
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import REPROJECTION, ResultDirectory

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from nerif.analysis.evaluation import score_lines
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import INDEX, Volume, field_of
 from nerif.data.volume_file import read_volume, write_netcdf
-from nerif.evaluation import score_lines
 from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid
 from nerif.mistakes import everywhere, of_one_view

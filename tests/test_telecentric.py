@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from nerif.analysis.consistency import binned
+from nerif.analysis.prediction import _interpolated, reproject
 from nerif.cli import main
 from nerif.common.conventions import InputError
-from nerif.consistency import binned
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.volume import Volume
 from nerif.fields.grid import Boundary
@@ -24,7 +25,6 @@ from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.physics.quantities import GasSettings, derive
-from nerif.prediction import _interpolated, reproject
 from nerif.reconstruction.fingerprint import _parts, digest
 from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.neural.bins import binned_rays

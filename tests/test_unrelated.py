@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerif.analysis.consistency import check_consistency
+from nerif.analysis.residuals import CAUSES
+from nerif.analysis.unrelated_views import repeatable, unrelated, unrelated_finding
 from nerif.cli import main
-from nerif.consistency import check_consistency
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring
 from nerif.mistakes import Change, Correction, of_one_view, orders
 from nerif.quick_views import compare, predicted_by_others
-from nerif.residuals import CAUSES
 from nerif.simulation.simulate import simulate
-from nerif.unrelated import repeatable, unrelated, unrelated_finding
 
 BOX = Box.cube(50.0)
 RIGS = sorted(Path(__file__).parents[2].glob("shared/data/rigs/*.nc"))

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from nerif.analysis.verdict import ONE_CAMERA, WORDS, Estimate, verdict
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
@@ -16,7 +17,6 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import headline
 from nerif.results.directory import Missing, Result, ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.verdict import ONE_CAMERA, WORDS, Estimate, verdict
 from nerif.workflow import Run, reconstruct_into
 
 WHITE = {"grain": 1.0, "white": True, "cause": "", "share": 0.0, "row": 4.0, "column": 4.0, "alike": 0.0}

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from nerif import workflow
+from nerif.analysis.prediction import predict, reproject
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN
-from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov

@@ -16,16 +16,16 @@ from pathlib import Path
 
 import torch
 
+from nerif.analysis.evaluation import evaluate_volume
+from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid
-from nerif.metrics import volume_errors
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural.neural import NeRIF
@@ -44,7 +44,7 @@ SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 PRELOADED = [
     # of the study's own modules forkserver knows no path before Python 3.12.8; they are small
-    *("nerif.evaluation", "nerif.resolution", "nerif.simulation.simulate", "nerif.reconstruction.neural.neural"),
+    *("nerif.analysis.evaluation", "nerif.analysis.resolution", "nerif.simulation.simulate", "nerif.reconstruction.neural.neural"),
     *("nerif.reconstruction.voxels.landweber", "nerif.reconstruction.voxels.tikhonov", "nerif.reconstruction.voxels.total_variation"),
     *("xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.voxels.kernels_numba"),
     # every optimiser imports it; with CUDA a process must not inherit what the import found out of the GPU

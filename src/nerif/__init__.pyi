@@ -1,16 +1,18 @@
 """The names that are here, and their homes: read by type checkers, and at run time to load them when asked for."""
 
+from .analysis.consistency import check_consistency as check_consistency
+from .analysis.evaluation import evaluate as evaluate
+from .analysis.evaluation import evaluate_views as evaluate_views
+from .analysis.evaluation import evaluate_volume as evaluate_volume
+from .analysis.prediction import predict as predict
+from .analysis.prediction import reproject as reproject
 from .common.conventions import InputError as InputError
-from .consistency import check_consistency as check_consistency
 from .data.exports import export as export
 from .data.measurement import Measurement as Measurement
 from .data.reprojection import Reprojection as Reprojection
 from .data.volume import Volume as Volume
 from .data.volume_file import read_volume as read_volume
 from .data.volume_file import read_volumes as read_volumes
-from .evaluation import evaluate as evaluate
-from .evaluation import evaluate_views as evaluate_views
-from .evaluation import evaluate_volume as evaluate_volume
 from .fields.phantoms import make_phantom as make_phantom
 from .geometry import Box as Box
 from .geometry import Camera as Camera
@@ -20,8 +22,6 @@ from .geometry import Ring as Ring
 from .geometry import paper_rig as paper_rig
 from .physics.quantities import GasSettings as GasSettings
 from .physics.quantities import derive as derive
-from .prediction import predict as predict
-from .prediction import reproject as reproject
 from .reconstruction.base import Reconstruction as Reconstruction
 from .reconstruction.neural.neural import NeRIF as NeRIF
 from .reconstruction.neural.presets import preset as preset

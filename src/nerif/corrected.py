@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from nerif.analysis.consistency import Consistency
 from nerif.common.conventions import InputError
-from nerif.consistency import Consistency
 from nerif.data.measurement import Measurement
 from nerif.mistakes import Correction
 from nerif.observation import integrals_of

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nerif.analysis.asymmetry import HALVES, kept_half
+from nerif.analysis.evaluation import evaluate_views, rms_text
+from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.evaluation import evaluate_views, rms_text
-from nerif.halves import HALVES, kept_half
 from nerif.json_file import write_json
 from nerif.kept_run import KeptRun
-from nerif.prediction import reproject
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.shared_settings import SharedSettings

@@ -11,14 +11,14 @@ from typing import Any
 
 import torch
 
+from nerif.analysis.evaluation import evaluate_views, rms_text
+from nerif.analysis.prediction import reproject
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_views, rms_text
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 from nerif.kept_run import KeptRun
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
-from nerif.prediction import reproject
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.uncertainty.repetition import Found, Maps, Repetitions, certainty

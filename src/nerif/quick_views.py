@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.analysis.prediction import predict_view
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.fields.base import Field
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
-from nerif.prediction import predict_view
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 __all__ = [

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.analysis.prediction import predict_view
 from nerif.common.conventions import FACES
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.forward.base import ForwardModel
-from nerif.prediction import predict_view
 from nerif.quick_views import path_integral, values_of
 from nerif.reconstruction.gauge import ambient_faces
 

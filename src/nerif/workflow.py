@@ -10,20 +10,21 @@ from typing import Any
 
 import torch
 
+from nerif.analysis.asymmetry import departure_sentence, departures, halved
+from nerif.analysis.evaluation import evaluate_views, score_lines
+from nerif.analysis.gains import fit_gains, with_gains
+from nerif.analysis.prediction import check_sees, reproject
+from nerif.analysis.verdict import verdict
 from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
 from nerif.data.measurement import Measurement
 from nerif.data.volume import quantities_of
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.evaluation import evaluate_views, score_lines
 from nerif.fields.base import Field
 from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
-from nerif.gains import fit_gains, with_gains
-from nerif.halves import departure_sentence, departures, halved
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.members import Members, all_quantities
 from nerif.physics.quantities import NOT_UNIFORM, GasSettings, masked_lines
-from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
 from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints
@@ -50,7 +51,6 @@ from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.results.directory import CALIBRATION, REPORT, ResultDirectory, versions
 from nerif.results.live import Live
-from nerif.verdict import verdict
 
 __all__ = ["METHODS", "Run", "reconstruct_into", "write_report", "write_sequence_report"]
 

@@ -10,10 +10,10 @@ import torch
 
 from abel_peers import PEERS, HalfView, ParallelView, Revolution, attempts, pyabel, quadrature
 from bench import N_AMBIENT
+from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
 from nerif.fields.jets import GaussianJet
 from nerif.geometry import Box, Grid, Ring
-from nerif.metrics import volume_errors
 from nerif.simulation.simulate import simulate
 from one_camera import BOX, EVALUATED, camera_of
 

@@ -9,19 +9,19 @@ import pytest
 import torch
 import xarray as xr
 
+from nerif.analysis.consistency import check_consistency
+from nerif.analysis.evaluation import evaluate_views, evaluate_volume
+from nerif.analysis.prediction import predict_view, reproject
 from nerif.cli import main
 from nerif.common.conventions import InputError
-from nerif.consistency import check_consistency
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
-from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.images import Pictures
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
-from nerif.prediction import predict_view, reproject
 from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.neural.losses import LossWeights
 from nerif.reconstruction.neural.neural import NeRIF

@@ -9,10 +9,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerif.analysis.evaluation import evaluate_volume
 from nerif.common.conventions import InputError
 from nerif.data.measurement import measurement_of
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.forward.deflection import Deflection
 from nerif.forward.interferometry import Interferometry

@@ -9,10 +9,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerif.analysis.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.network import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.base import Weights

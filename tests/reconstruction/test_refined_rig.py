@@ -12,6 +12,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from nerif.analysis.rig_check import check_rig
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
@@ -27,7 +28,6 @@ from nerif.reconstruction.rig.refit import refit
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report.moves_figure import draw_moves
-from nerif.rig_check import check_rig
 from nerif.simulation.simulate import simulate
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.alignment import Moved, aligned
+from nerif.analysis.alignment import Moved, aligned
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement

@@ -9,15 +9,15 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from nerif.analysis.consistency import check_consistency
+from nerif.analysis.prediction import predict, reproject
+from nerif.analysis.rig_check import check_rig
 from nerif.common.pauses import at_pauses, pause
-from nerif.consistency import check_consistency
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
-from nerif.prediction import predict, reproject
 from nerif.reconstruction import threads
 from nerif.reconstruction.threads import Cores, Used, free_threads
-from nerif.rig_check import check_rig
 from nerif.simulation.simulate import view_displacement
 
 NUMBA_STARTS = """

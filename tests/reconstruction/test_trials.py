@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid, Ring
 from nerif.physics.quantities import GasSettings
-from nerif.prediction import reproject
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.uncertainty.bootstrap import BLOCK, LOST, WIDTH, Deviations, Trials, best_covered

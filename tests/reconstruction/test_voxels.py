@@ -9,9 +9,9 @@ import pytest
 import torch
 from safetensors import SafetensorError
 
+from nerif.analysis.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Reconstruction, State, Step

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+from nerif.analysis.evaluation import evaluate_views
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_views
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings, derive
 from nerif.plotting.notebook import number

@@ -12,11 +12,12 @@ import torch
 import xarray as xr
 from scipy.ndimage import map_coordinates
 
+from nerif.analysis.evaluation import evaluate_views, evaluate_volume
+from nerif.analysis.prediction import predict, reproject
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.evaluation import evaluate_views, evaluate_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import LeverArm
@@ -24,7 +25,6 @@ from nerif.forward.images import Pictures
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
-from nerif.prediction import predict, reproject
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.training import Training
 from nerif.reconstruction.neural.training_data import FrameData

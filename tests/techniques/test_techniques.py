@@ -13,9 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.analysis.evaluation import evaluate_views
+from nerif.analysis.gains import fit_gains, with_gains
+from nerif.analysis.prediction import predict, reproject
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, measurement_of
-from nerif.evaluation import evaluate_views
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
 from nerif.fields.network import Network, NetworkShape, NeuralField
@@ -28,9 +30,7 @@ from nerif.forward.emission import Emission
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import TECHNIQUES, forward_model, forward_models
-from nerif.gains import fit_gains, with_gains
 from nerif.geometry import Box, Grid, Lens, Rays, Ring
-from nerif.prediction import predict, reproject
 from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.neural.losses import LossWeights, loss_terms

@@ -11,6 +11,7 @@ from typing import Any
 
 from nicegui import ui
 
+from nerif.analysis.resampling import common_grid, difference, resampled
 from nerif.app.pieces import text_html
 from nerif.app.range_slider import RangeSlider
 from nerif.app.slices_view import Panel, SlicesView
@@ -21,7 +22,6 @@ from nerif.common.conventions import InputError, unit_shown
 from nerif.data.volume import Volume, describe
 from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_pictures import colours_of
-from nerif.resampling import common_grid, difference, resampled
 from nerif.results.directory import VOLUME
 
 __all__ = ["ResultLook"]

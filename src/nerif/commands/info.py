@@ -11,6 +11,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from nerif.analysis.evaluation import rms_text
 from nerif.commands.output import say
 from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError, with_unit
@@ -19,7 +20,6 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import known_conventions
 from nerif.data.volume import INDEX, Volume, name_of
 from nerif.data.volume_file import read_volume
-from nerif.evaluation import rms_text
 from nerif.forward.registry import TECHNIQUES
 from nerif.plotting.notebook import number
 from nerif.results.directory import METRICS, ResultDirectory

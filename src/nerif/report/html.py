@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerif import __version__
+from nerif.analysis.evaluation import rms_text
 from nerif.common.files import atomic
 from nerif.data.meridian import Meridian
 from nerif.data.volume import name_of
-from nerif.evaluation import rms_text
 from nerif.forward.registry import technique_of
 from nerif.plotting.drawing import drawn_of, map_colours
 from nerif.plotting.notebook import number, picture

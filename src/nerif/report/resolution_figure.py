@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from nerif.analysis.resolution import MTF, THRESHOLD
 from nerif.plotting.drawing import COLOURS
-from nerif.resolution import MTF, THRESHOLD
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

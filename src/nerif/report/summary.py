@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from nerif.analysis.evaluation import rms_text
+from nerif.analysis.residuals import CAUSES
+from nerif.analysis.verdict import verdict
 from nerif.common.conventions import with_unit
 from nerif.data.volume import INDEX, field_of, name_of
-from nerif.evaluation import rms_text
 from nerif.forward.registry import TECHNIQUES
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.plotting.drawing import LABELS, drawn_of, shown
@@ -17,9 +19,7 @@ from nerif.plotting.notebook import number, percent, span
 from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.rig.refined import moved_lines
 from nerif.report.packing import relation
-from nerif.residuals import CAUSES
 from nerif.results.directory import METRICS, VOLUME, Result
-from nerif.verdict import verdict
 
 __all__ = ["Statement", "came_out", "headline", "looked", "measured", "repeated", "trust", "trust_figures"]
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nerif.analysis.metrics import LEVELS
 from nerif.data.volume import Volume
-from nerif.metrics import LEVELS
 from nerif.plotting.drawing import COLOURS, drawn_of, label_of, shown
 from nerif.reconstruction.uncertainty.bootstrap import TAILS
 

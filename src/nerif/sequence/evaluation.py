@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from nerif.analysis.evaluation import check_inside
+from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
 from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.evaluation import check_inside
 from nerif.forward.registry import ASSUMED, technique
 from nerif.json_file import write_json
-from nerif.metrics import volume_errors
 from nerif.sequence.store import DONE, SequenceStore
 
 __all__ = ["evaluate_sequence"]

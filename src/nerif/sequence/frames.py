@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from nerif.analysis.metrics import correlation
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -25,7 +26,6 @@ from nerif.fields.network import NeuralField
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Grid
-from nerif.metrics import correlation
 from nerif.physics.quantities import derive
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Step

@@ -8,6 +8,7 @@ from html import escape
 
 from nicegui import ui
 
+from nerif.analysis.consistency import Consistency, check_consistency
 from nerif.app.file_choice import FileChoice
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
@@ -17,7 +18,6 @@ from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.commands.check import Check
-from nerif.consistency import Consistency, check_consistency
 from nerif.data.measurement import Measurement
 
 __all__ = ["PAGE"]

@@ -28,10 +28,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nerif.analysis.asymmetry import camera_of
+from nerif.analysis.residuals import CAUSES
 from nerif.data.volume import field_of
 from nerif.forward.registry import TECHNIQUES
-from nerif.halves import camera_of
-from nerif.residuals import CAUSES
 from nerif.results.directory import Result
 
 __all__ = ["WORDS", "Estimate", "Verdict", "verdict"]

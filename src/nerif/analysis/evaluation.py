@@ -13,7 +13,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.alignment import aligned
+from nerif.analysis.alignment import aligned
+from nerif.analysis.asymmetry import kept_half
+from nerif.analysis.gains import gains_of, with_gains
+from nerif.analysis.metrics import coverage, slice_metrics, view_metrics, volume_metrics
+from nerif.analysis.prediction import check_sees, reproject
+from nerif.analysis.residuals import leftover, white_noise
 from nerif.common.conventions import InputError, with_unit
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Reprojection
@@ -22,16 +27,11 @@ from nerif.data.volume_file import read_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.forward.registry import AUTO, forward_model
-from nerif.gains import gains_of, with_gains
 from nerif.geometry import Box
-from nerif.halves import kept_half
-from nerif.metrics import coverage, slice_metrics, view_metrics, volume_metrics
 from nerif.observation import Observation
 from nerif.plotting.notebook import number
-from nerif.prediction import check_sees, reproject
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.rig.refined import with_corrections
-from nerif.residuals import leftover, white_noise
 from nerif.results.directory import METRICS, VOLUME, ResultDirectory
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow

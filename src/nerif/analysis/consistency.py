@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from nerif.analysis.unrelated_views import NOISY, repeatable, unrelated, unrelated_finding
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement
@@ -35,7 +36,6 @@ from nerif.quick_views import (
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.threads import on_free_cores
 from nerif.symptoms import looks, open_faces
-from nerif.unrelated import NOISY, repeatable, unrelated, unrelated_finding
 
 __all__ = ["Consistency", "ViewAgreement", "check_consistency"]
 
