@@ -59,7 +59,7 @@ def _reconstructed(number: int) -> dict[str, float | str]:
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.uncertainty.bootstrap import Trials
     from nerif.reconstruction.uncertainty.repetition import VOXELS, Found
-    from nerif.workflow import Run, reconstruct_into
+    from nerif.workflow.pipeline import Run, reconstruct_into
 
     torch.set_num_threads(1)
     keep_freed_memory()

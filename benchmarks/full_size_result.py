@@ -25,13 +25,13 @@ from nerif.data.reprojection import Reprojection
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.members import all_quantities
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.warm_start import fit_network
 from nerif.results.directory import ResultDirectory
-from nerif.workflow import write_report
+from nerif.workflow.pipeline import write_report
+from nerif.workflow.repeats import all_quantities
 
 BOX, N_AMBIENT, NOISE = Box.cube(50.0), 1.00027, 0.05
 COLUMNS = ("stage", "seconds", "of CPU", "peak [GiB]", "")

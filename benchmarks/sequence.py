@@ -32,11 +32,11 @@ from nerif.geometry import Ring
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.sequence.frames import reconstruct_frames
-from nerif.sequence.joint import reconstruct_jointly
-from nerif.sequence.plan import SequencePlan, SequenceSettings
-from nerif.sequence.store import DONE, Frame, SequenceStore
 from nerif.simulation.simulate import Simulation
+from nerif.workflow.sequence.frames import reconstruct_frames
+from nerif.workflow.sequence.joint import reconstruct_jointly
+from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
+from nerif.workflow.sequence.store import DONE, Frame, SequenceStore
 
 COLUMNS = (
     "views", "s between frames", "change", "how", "steps a frame", "seconds a frame", "L2", "L2 of variation", "CC",

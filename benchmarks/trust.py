@@ -26,7 +26,7 @@ from nerif.common.conventions import InputError
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.workflow import Run
+from nerif.workflow.pipeline import Run
 
 PHANTOMS = ("gaussians", "flame", "octahedron", "fire")
 COLUMNS = ("L2 of variation", "in 1 std", "in 2 std", "Spearman, all", "Spearman, averaged", "std / error", "cost")
@@ -63,7 +63,7 @@ def case(
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.results.directory import ResultDirectory
     from nerif.simulation.simulate import simulate
-    from nerif.workflow import reconstruct_into
+    from nerif.workflow.pipeline import reconstruct_into
 
     keep_freed_memory()
     box = Box.cube(EDGE)

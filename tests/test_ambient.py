@@ -86,8 +86,8 @@ def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_p
     from nerif.data.measurement_sequence import MeasurementSequence
     from nerif.data.volume_sequence import VolumeSequence
     from nerif.fields.network import Network, NetworkShape, NeuralField
-    from nerif.sequence.evaluation import evaluate_sequence
-    from nerif.sequence.store import Frame, SequenceStore
+    from nerif.workflow.sequence.evaluation import evaluate_sequence
+    from nerif.workflow.sequence.store import Frame, SequenceStore
 
     shape, grid = NetworkShape(2, 8, 1), Grid(measurement.box, (6, 7, 8))
     sequence = MeasurementSequence.create(tmp_path / "m.zarr", [0.0], measurement)

@@ -18,7 +18,7 @@ from nerif.reconstruction.base import Outcome
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.pages import slices
-from nerif.workflow import Run, reconstruct_into
+from nerif.workflow.pipeline import Run, reconstruct_into
 
 RIG = ["--image-size", "14", "18", "--pixel-pitch", "0.25", "--views", "4", "--steps", "30", "--truth-voxels", "12"]
 QUICK = ["--method", "tikhonov", "--voxels", "10", "--basis", "linear", "--iterations", "20"]

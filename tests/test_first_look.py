@@ -13,7 +13,6 @@ import torch
 
 from nerif.cli import main
 from nerif.fields.network import NetworkShape
-from nerif.first_look import FEWEST, kept_out
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
@@ -21,7 +20,8 @@ from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import trust, trust_figures
 from nerif.results.directory import ResultDirectory
-from nerif.workflow import Run, reconstruct_into
+from nerif.workflow.cross_validation import FEWEST, kept_out
+from nerif.workflow.pipeline import Run, reconstruct_into
 
 VOXELS = Tikhonov(voxels=16, basis="linear", iterations=8, regularisation=0.1, device="cpu")
 SHAPE = NetworkShape(depth=2, width=24, octaves=2)

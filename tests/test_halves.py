@@ -22,7 +22,7 @@ from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow import Run, reconstruct_into
+from nerif.workflow.pipeline import Run, reconstruct_into
 
 ABOUT_Z = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)
 QUICK = ["--symmetry", "axis", "--method", "tikhonov", "--voxels", "20", "--no-report"]

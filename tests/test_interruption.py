@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 
-from nerif import workflow
 from nerif.cli import VERBS, main
 from nerif.commands import info, output, simulate
 from nerif.commands.output import MONITOR, counting_bar
@@ -18,7 +17,8 @@ from nerif.reconstruction.base import Step
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
-from nerif.workflow import Run, reconstruct_into
+from nerif.workflow import pipeline as workflow
+from nerif.workflow.pipeline import Run, reconstruct_into
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")
 

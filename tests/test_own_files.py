@@ -11,8 +11,8 @@ import pytest
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN, OwnFiles
-from nerif.kept_run import ASKED
 from nerif.results.directory import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
+from nerif.workflow.checkpointed import ASKED
 
 
 def put(path: Path, text: str = "mine") -> Path:

@@ -24,7 +24,7 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import REPROJECTION, ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
 from nerif.symptoms import open_faces
-from nerif.workflow import Run, reconstruct_into
+from nerif.workflow.pipeline import Run, reconstruct_into
 
 RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=5, regularisation=1e-3, device="cpu")

@@ -26,8 +26,8 @@ from nerif.report import packing
 from nerif.report.pages import error_of, figures_of, residuals_over_sigma, view
 from nerif.report.view_images import view_images
 from nerif.results.directory import ResultDirectory
-from nerif.sequence.plan import SequenceSettings
 from nerif.symptoms import looks
+from nerif.workflow.sequence.plan import SequenceSettings
 
 RIG = ["--image-size", "14", "17", "--pixel-pitch", "0.26", "--views", "3", "--steps", "20", "--truth-voxels", "8"]
 QUICK = ["--method", "tikhonov", "--voxels", "8", "--iterations", "5", "--regularisation", "1e-4"]

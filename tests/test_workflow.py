@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from nerif import workflow
 from nerif.analysis.prediction import predict, reproject
 from nerif.cli import main
 from nerif.common.conventions import InputError
@@ -18,7 +17,8 @@ from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import picture_corners
 from nerif.results.directory import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
-from nerif.workflow import Run, reconstruct_into
+from nerif.workflow import pipeline as workflow
+from nerif.workflow.pipeline import Run, reconstruct_into
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")
 

@@ -31,13 +31,13 @@ from .reconstruction.voxels.multiplicative import MLEM as MLEM
 from .reconstruction.voxels.tikhonov import Tikhonov as Tikhonov
 from .reconstruction.voxels.total_variation import TotalVariation as TotalVariation
 from .results.directory import ResultDirectory as ResultDirectory
-from .sequence.plan import SequenceSettings as SequenceSettings
-from .sequence.reconstruct import reconstruct_sequence as reconstruct_sequence
 from .simulation.simulate import Simulation as Simulation
 from .simulation.simulate import add_noise as add_noise
 from .simulation.simulate import simulate as simulate
-from .workflow import Run as Run
-from .workflow import reconstruct_into as reconstruct_into
-from .workflow import write_report as write_report
+from .workflow.pipeline import Run as Run
+from .workflow.pipeline import reconstruct_into as reconstruct_into
+from .workflow.pipeline import write_report as write_report
+from .workflow.sequence.plan import SequenceSettings as SequenceSettings
+from .workflow.sequence.reconstruct import reconstruct_sequence as reconstruct_sequence
 
 __version__: str

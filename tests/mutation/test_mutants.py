@@ -31,8 +31,8 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_camer
 from nerif.imaging.calibration.importers.importers import import_cameras
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.sequence.store import Frame, SequenceStore
 from nerif.simulation.simulate import simulate
+from nerif.workflow.sequence.store import Frame, SequenceStore
 
 pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 

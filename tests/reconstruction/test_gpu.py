@@ -19,7 +19,7 @@ from nerif.reconstruction.neural.presets import PRESETS
 from nerif.reconstruction.neural.training import Training
 from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.sequence.chunk_data import ChunkData
+from nerif.workflow.sequence.chunk_data import ChunkData
 
 pytestmark = pytest.mark.filterwarnings("ignore:User provided device_type of 'cuda'")
 

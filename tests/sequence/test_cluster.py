@@ -31,11 +31,11 @@ from nerif import __version__
 from nerif.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.sequence import cluster
-from nerif.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
-from nerif.sequence.plan import SequenceSettings
-from nerif.sequence.reconstruct import reconstruct_sequence
-from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
+from nerif.workflow.sequence import cluster
+from nerif.workflow.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
+from nerif.workflow.sequence.plan import SequenceSettings
+from nerif.workflow.sequence.reconstruct import reconstruct_sequence
+from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed <(socket|ssl):ResourceWarning")
 
@@ -242,14 +242,14 @@ def test_memory_of_the_command_and_of_each_worker_stays_flat_over_500_frames(tmp
 
 @pytest.mark.slow
 def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monkeypatch):
-    from nerif.sequence import run
-    from nerif.sequence.run import run_sequence
+    from nerif.workflow.sequence import run
+    from nerif.workflow.sequence.run import run_sequence
 
     plan = _plan(film, tmp_path / "out.zarr", 6)
     deadly = tmp_path / "deadly.py"
     monkeypatch.syspath_prepend(tmp_path)  # workers get it
     deadly.write_text(
-        "import os\nfrom nerif.sequence.run import _in_worker as real\n"
+        "import os\nfrom nerif.workflow.sequence.run import _in_worker as real\n"
         "from nerif.sequence import frames\n"
         "before = frames._frame\n"
         "def _frame(plan, settings, measurement, *rest):\n"
@@ -273,7 +273,7 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
 def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(five, tmp_path, monkeypatch):
     from distributed import Client
 
-    from nerif.sequence import run
+    from nerif.workflow.sequence import run
 
     plan, real = _plan(five, tmp_path / "out.zarr", 3), run.reconstruct_frames
 
@@ -294,7 +294,7 @@ def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(fi
 
 def _plan(film: Path, out: Path, chunk: int):
     from nerif.geometry import Grid
-    from nerif.sequence.plan import SequencePlan
+    from nerif.workflow.sequence.plan import SequencePlan
 
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.fullest().box, 10)

@@ -19,12 +19,12 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.symmetric import symmetry_of_field
 from nerif.geometry import Grid
 from nerif.reconstruction.symmetry import with_axis
-from nerif.sequence import frames
-from nerif.sequence.frames import reconstruct_frames
-from nerif.sequence.plan import SequencePlan, SequenceSettings
-from nerif.sequence.reconstruct import _store
-from nerif.sequence.run import chunks_of, outcome_table
-from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
+from nerif.workflow.sequence import frames
+from nerif.workflow.sequence.frames import reconstruct_frames
+from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
+from nerif.workflow.sequence.reconstruct import _store
+from nerif.workflow.sequence.run import chunks_of, outcome_table
+from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 from sequence_films import COLD, blank
 
 

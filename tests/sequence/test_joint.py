@@ -26,12 +26,12 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.target import Target
-from nerif.sequence import joint
-from nerif.sequence.chunk_data import ChunkData
-from nerif.sequence.joint import reconstruct_jointly
-from nerif.sequence.plan import SequencePlan, SequenceSettings
-from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
 from nerif.simulation.simulate import simulate
+from nerif.workflow.sequence import joint
+from nerif.workflow.sequence.chunk_data import ChunkData
+from nerif.workflow.sequence.joint import reconstruct_jointly
+from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
+from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore, chunk_tau
 from sequence_films import QUICK, blank
 
 SHAPE = NetworkShape(depth=2, width=16, octaves=2)

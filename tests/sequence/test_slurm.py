@@ -13,7 +13,7 @@ from sequence_films import QUICK
 
 pytest.importorskip("dask_jobqueue", reason="pip install '.[cluster]'")
 
-from nerif.sequence.store import DONE, SequenceStore
+from nerif.workflow.sequence.store import DONE, SequenceStore
 
 
 def slurm_answers() -> bool:

@@ -24,12 +24,12 @@ from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, Ring
 from nerif.report.movie import Movie
 from nerif.report.sequence_page import render_sequence
-from nerif.sequence.evaluation import evaluate_sequence
-from nerif.sequence.frames import finished_frame
-from nerif.sequence.plan import SequencePlan, SequenceSettings
-from nerif.sequence.run import outcome_table
-from nerif.sequence.store import SequenceStore
 from nerif.simulation.simulate import Simulation
+from nerif.workflow.sequence.evaluation import evaluate_sequence
+from nerif.workflow.sequence.frames import finished_frame
+from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
+from nerif.workflow.sequence.run import outcome_table
+from nerif.workflow.sequence.store import SequenceStore
 from sequence_films import COLD, RIG, blank
 
 

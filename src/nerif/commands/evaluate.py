@@ -76,7 +76,7 @@ def run(settings: Evaluate) -> dict[str, Any]:
 
 def run_over_time(settings: Evaluate) -> dict[str, Any]:
     """Print the metrics of every frame of a sequence and return them."""
-    from nerif.sequence.evaluation import evaluate_sequence
+    from nerif.workflow.sequence.evaluation import evaluate_sequence
 
     if settings.truth is None or replace(settings, truth=None) != Evaluate(settings.result):
         raise InputError(

@@ -15,7 +15,7 @@ from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.workflow import Run
+from nerif.workflow.pipeline import Run
 
 __all__ = ["RECORDS", "Reconstruct", "ReconstructNeRIF"]
 

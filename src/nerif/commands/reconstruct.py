@@ -17,7 +17,7 @@ from nerif.common.installation import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Step
 from nerif.reconstruction.neural.presets import preset
 from nerif.results.directory import RUN
-from nerif.workflow import reconstruct_into
+from nerif.workflow.pipeline import reconstruct_into
 
 __all__ = ["main", "run"]
 

@@ -12,7 +12,7 @@ from nerif.commands.output import MONITOR, check_file
 from nerif.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.results.directory import REPORT
-from nerif.workflow import write_report, write_sequence_report
+from nerif.workflow.pipeline import write_report, write_sequence_report
 
 __all__ = ["Report", "main", "run"]
 

@@ -12,10 +12,10 @@ from nerif.commands.output import MONITOR, figures_bar
 from nerif.commands.settings import Flat, Settings, read_settings, value_given
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import preset
-from nerif.sequence.plan import SequenceSettings
-from nerif.sequence.reconstruct import reconstruct_sequence
-from nerif.sequence.run import Progress
-from nerif.sequence.store import DONE, SequenceStore
+from nerif.workflow.sequence.plan import SequenceSettings
+from nerif.workflow.sequence.reconstruct import reconstruct_sequence
+from nerif.workflow.sequence.run import Progress
+from nerif.workflow.sequence.store import DONE, SequenceStore
 
 __all__ = ["Sequence", "main", "run"]
 

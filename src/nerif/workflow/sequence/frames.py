@@ -30,8 +30,8 @@ from nerif.physics.quantities import derive
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Step
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.sequence.plan import Event, SequencePlan
-from nerif.sequence.store import DONE, MISSING, Frame, SequenceStore
+from nerif.workflow.sequence.plan import Event, SequencePlan
+from nerif.workflow.sequence.store import DONE, MISSING, Frame, SequenceStore
 
 __all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame", "reconstruct_frames"]
 

@@ -21,9 +21,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import quantities_of
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.base import Field
-from nerif.first_look import AUTO, FEWEST, FirstLook, kept_apart
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
-from nerif.members import Members, all_quantities
 from nerif.physics.quantities import NOT_UNIFORM, GasSettings, masked_lines
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
@@ -51,6 +49,8 @@ from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.results.directory import CALIBRATION, REPORT, ResultDirectory, versions
 from nerif.results.live import Live
+from nerif.workflow.cross_validation import AUTO, FEWEST, FirstLook, kept_apart
+from nerif.workflow.repeats import Members, all_quantities
 
 __all__ = ["METHODS", "Run", "reconstruct_into", "write_report", "write_sequence_report"]
 

@@ -17,10 +17,10 @@ from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.symmetry import axis_of, symmetry_asked, with_axis
-from nerif.sequence.cluster import check_workers, open_cluster
-from nerif.sequence.plan import SequencePlan, SequenceSettings
-from nerif.sequence.run import Progress, outcome_table, run_sequence
-from nerif.sequence.store import MISSING, SequenceStore
+from nerif.workflow.sequence.cluster import check_workers, open_cluster
+from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
+from nerif.workflow.sequence.run import Progress, outcome_table, run_sequence
+from nerif.workflow.sequence.store import MISSING, SequenceStore
 
 __all__ = ["reconstruct_sequence"]
 

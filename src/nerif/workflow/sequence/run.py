@@ -13,10 +13,10 @@ import torch
 
 from nerif.common.conventions import with_unit
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.sequence.frames import ATTEMPTS, reconstruct_frames
-from nerif.sequence.joint import reconstruct_jointly
-from nerif.sequence.plan import SequencePlan
-from nerif.sequence.store import DONE, FAILED, MISSING, SequenceStore
+from nerif.workflow.sequence.frames import ATTEMPTS, reconstruct_frames
+from nerif.workflow.sequence.joint import reconstruct_jointly
+from nerif.workflow.sequence.plan import SequencePlan
+from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
 if TYPE_CHECKING:
     from distributed import Client, Future

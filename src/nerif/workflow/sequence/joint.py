@@ -22,10 +22,10 @@ from nerif.reconstruction.base import OnStep, Reconstruction, State, Step, compo
 from nerif.reconstruction.files import CHECKPOINT, checkpoints, read_state
 from nerif.reconstruction.neural.training import Training
 from nerif.reconstruction.neural.training_data import FrameData
-from nerif.sequence.chunk_data import ChunkData
-from nerif.sequence.frames import ATTEMPTS, FAILURES, FrameError, end_without, finished_frame
-from nerif.sequence.plan import Event, SequencePlan
-from nerif.sequence.store import DONE, MISSING, SequenceStore, chunk_tau
+from nerif.workflow.sequence.chunk_data import ChunkData
+from nerif.workflow.sequence.frames import ATTEMPTS, FAILURES, FrameError, end_without, finished_frame
+from nerif.workflow.sequence.plan import Event, SequencePlan
+from nerif.workflow.sequence.store import DONE, MISSING, SequenceStore, chunk_tau
 
 __all__ = ["reconstruct_jointly"]
 

@@ -17,12 +17,12 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.geometry import Grid
-from nerif.kept_run import KeptRun
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.uncertainty.repetition import Found, Maps, Repetitions, certainty
 from nerif.results.directory import ResultDirectory
+from nerif.workflow.checkpointed import KeptRun
 
 __all__ = ["Members", "all_quantities"]
 

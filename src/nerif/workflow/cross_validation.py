@@ -14,13 +14,13 @@ from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.json_file import write_json
-from nerif.kept_run import KeptRun
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.results.directory import ResultDirectory
+from nerif.workflow.checkpointed import KeptRun
 
 __all__ = ["AUTO", "FEWEST", "NONE", "FirstLook", "kept_apart", "kept_out"]
 

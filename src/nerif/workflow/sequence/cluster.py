@@ -127,7 +127,7 @@ def check_workers(client: Client) -> None:
         If one cannot import nerif, or has another version.
     """
     client.wait_for_workers(1)
-    ask = "(__import__('nerif.sequence.run'), __import__('nerif').__version__)[1]"
+    ask = "(__import__('nerif.workflow.sequence.run'), __import__('nerif').__version__)[1]"
     try:
         versions = client.run(eval, ask)
     except ImportError as error:

@@ -14,7 +14,7 @@ from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.forward.registry import ASSUMED, technique
 from nerif.json_file import write_json
-from nerif.sequence.store import DONE, SequenceStore
+from nerif.workflow.sequence.store import DONE, SequenceStore
 
 __all__ = ["evaluate_sequence"]
 
