@@ -24,8 +24,8 @@ import numpy as np
 
 from bench import N_AMBIENT, Table, add_write
 from nerif.analysis.metrics import volume_errors
-from nerif.commands.simulate import Simulate, instants
-from nerif.commands.simulate import run as simulate
+from nerif.cli.commands.simulate import Simulate, instants
+from nerif.cli.commands.simulate import run as simulate
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Ring

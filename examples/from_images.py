@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from nerif.cli import main
+from nerif.cli.cli import main
 
 
 def nerif(*words: object) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.imaging.calibration.cameras_file import read_cameras, write_cameras
 
 KNOCKED, BY = "85deg", (0.3, 0.0, 0.0)  # mm along the camera's own axes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.neural.neural import NeRIF

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerif.analysis.evaluation import evaluate
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf

@@ -20,7 +20,7 @@ import xarray as xr
 
 from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.prediction import reproject
-from nerif.cli import VERBS, main
+from nerif.cli.cli import VERBS, main
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.forward.deflection import MODELS
@@ -475,7 +475,7 @@ def test_help_is_quick_and_whole(capsys):
         assert main([verb, "--help"]) == 0
         assert "TOML file of settings" in " ".join(capsys.readouterr().out.split())
     loaded = subprocess.run(
-        [sys.executable, "-c", "import sys, nerif.cli; nerif.cli.main(['--help']); print('torch' in sys.modules)"],
+        [sys.executable, "-c", "import sys, nerif.cli.cli; nerif.cli.cli.main(['--help']); print('torch' in sys.modules)"],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert loaded.stdout.strip().endswith("False")

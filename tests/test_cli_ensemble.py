@@ -15,7 +15,7 @@ import pytest
 import torch
 import xarray as xr
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes, write_netcdf
@@ -142,7 +142,7 @@ def test_coverage_counts_the_voxels_of_the_truth(ensemble, tmp_path):
 
 def test_interrupted_in_the_second_member(measured, ensemble, tmp_path, capsys, monkeypatch):
     """Ctrl-C in a member keeps the main result and the members before it; --resume goes on with that member."""
-    from nerif.commands import output
+    from nerif.cli.commands import output
 
     out = tmp_path / "r"
     arguments = ["reconstruct", str(measured), *QUICK, "--ensemble", "3", "--no-report"]

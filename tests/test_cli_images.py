@@ -14,7 +14,7 @@ import tifffile
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.imaging.calibration.cameras_file import read_cameras

@@ -17,7 +17,7 @@ import pytest
 import torch
 import xarray as xr
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.grid import VoxelField
 from nerif.reconstruction.files import read_field

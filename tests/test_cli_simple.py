@@ -6,7 +6,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box
 from nerif.imaging.calibration.cameras_file import read_box, read_cameras

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.volume_file import read_volumes
 from nerif.reconstruction.base import Outcome
 from nerif.reconstruction.progress import Monitor

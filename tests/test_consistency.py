@@ -9,7 +9,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from nerif.analysis.consistency import check_consistency
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring, paper_rig

@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural.neural import NeRIF
@@ -138,7 +138,7 @@ def test_interrupted_after_the_short_run(measurement, whole, tmp_path):
 
 
 def test_the_command_line_goes_on_with_the_short_run(measurement, tmp_path, capsys, monkeypatch):
-    from nerif.commands import output
+    from nerif.cli.commands import output
 
     measurement.write(tmp_path / "m.nc")
     plain, sent = output.progress_bar, []

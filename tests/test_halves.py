@@ -12,7 +12,7 @@ import torch
 
 from nerif.analysis.asymmetry import Reflection, departures, halved, kept_half, left_of_axis
 from nerif.analysis.verdict import WORDS
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom

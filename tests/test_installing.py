@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.installation import DISTRIBUTION, install, stranger
 
 ROOT = Path(__file__).parents[1]
@@ -65,14 +65,14 @@ def installed(tmp_path, monkeypatch):
 
 
 def test_the_other_package_is_named_with_the_remedy(installed):
-    installed("1.4.0", "nerif.cli.main:main")
+    installed("1.4.0", "nerif.cli.cli.main:main")
     assert stranger().startswith("the package nerif 1.4.0 of another project is installed")
     assert "pip uninstall nerif" in stranger()
 
 
 def test_an_older_installation_of_this_program_is_none_of_another_project(installed):
     assert stranger() == ""
-    installed("0.1.0", "nerif.cli:main")
+    installed("0.1.0", "nerif.cli.cli:main")
     assert stranger() == ""
 
 
@@ -85,5 +85,5 @@ def test_a_verb_says_it_in_one_line(monkeypatch, capsys):
 
 
 def test_help_does_not_look_for_it():
-    code = "import sys; from nerif.cli import main; main(['--help']); sys.exit('nerif.common.installation' in sys.modules)"
+    code = "import sys; from nerif.cli.cli import main; main(['--help']); sys.exit('nerif.common.installation' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0

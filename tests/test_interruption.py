@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from nerif.cli import VERBS, main
-from nerif.commands import info, output, simulate
-from nerif.commands.output import MONITOR, counting_bar
+from nerif.cli.cli import VERBS, main
+from nerif.cli.commands import info, output, simulate
+from nerif.cli.commands.output import MONITOR, counting_bar
 from nerif.common.files import atomic, written
 from nerif.common.interruption import Interrupted, if_interrupted
 from nerif.reconstruction.base import Step
@@ -142,9 +142,9 @@ def test_a_note_of_a_step_is_one_line(capsys):
 
 def test_a_signal_ends_a_command_without_a_traceback(tmp_path):
     code = (
-        "import os, signal, sys, nerif.commands.info as info, nerif.cli\n"
+        "import os, signal, sys, nerif.cli.commands.info as info, nerif.cli.cli\n"
         "info.main = lambda words: os.kill(os.getpid(), signal.SIGINT)\n"
-        "sys.exit(nerif.cli.main(['info', 'x']))\n"
+        "sys.exit(nerif.cli.cli.main(['info', 'x']))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 130

@@ -199,4 +199,4 @@ def test_core_imports_torch_and_numpy_only():
 
 
 def test_help_loads_neither_torch_nor_numpy():
-    assert not loaded_by("from nerif.cli import main; main(['--help'])") & {"torch", "numpy", *HEAVY}
+    assert not loaded_by("from nerif.cli.cli import main; main(['--help'])") & {"torch", "numpy", *HEAVY}

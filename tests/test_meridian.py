@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.meridian import Meridian
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.results.directory import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
@@ -163,7 +163,7 @@ def test_a_link_is_nobodys_file(tmp_path):
 
 
 def test_the_demo_keeps_a_measurement_that_is_not_its_own(tmp_path, monkeypatch):
-    from nerif.commands import demo
+    from nerif.cli.commands import demo
 
     out = tmp_path / "demo"
     put(out / "measurement.nc", "measured in the laboratory")

@@ -12,7 +12,7 @@ import torch
 from nerif.analysis.evaluation import evaluate
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import predict
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import GaussianBalls

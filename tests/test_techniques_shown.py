@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from nerif.analysis.evaluation import score_lines
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import INDEX, Volume, field_of

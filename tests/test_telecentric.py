@@ -12,7 +12,7 @@ import torch
 
 from nerif.analysis.consistency import binned
 from nerif.analysis.prediction import _interpolated, reproject
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.volume import Volume

@@ -11,7 +11,7 @@ import torch
 from nerif.analysis.consistency import check_consistency
 from nerif.analysis.residuals import CAUSES
 from nerif.analysis.unrelated_views import repeatable, unrelated, unrelated_finding
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerif.analysis.prediction import predict, reproject
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN
 from nerif.reconstruction.base import Reconstruction

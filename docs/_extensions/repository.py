@@ -22,7 +22,7 @@ LINK = re.compile(r"(!?)\[([^\]\n]*(?:\n[^\]\n]*)?)\]\(([^)\s#:]+)(#[^)\s]*)?\)"
 PAGES = {"README.md": "index", "CHANGELOG.md": "changelog", "CONTRIBUTING.md": "contributing"}
 PAGES |= {"benchmarks/README.md": "benchmarks"}
 MODULE = "## {0}\n\n```{{eval-rst}}\n.. automodule:: {0}\n```\n"
-INTERNAL = {"nerif.cli", "nerif.reconstruction.voxels.kernels_numba", "nerif.reconstruction.voxels.kernels_torch"}
+INTERNAL = {"nerif.cli.cli", "nerif.reconstruction.voxels.kernels_numba", "nerif.reconstruction.voxels.kernels_torch"}
 
 
 def api_pages(docs: Path) -> dict[str, str]:

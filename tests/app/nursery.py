@@ -18,7 +18,7 @@ WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux
 def main() -> None:
     """Fork until nobody asks any more."""
     import nerif.app.server
-    from nerif.cli import main as nerif
+    from nerif.cli.cli import main as nerif
 
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # whoever has ended is not waited for
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the servers

@@ -13,7 +13,7 @@ from app.serving import Served, opened, served
 from app.test_pages import line, put
 from calibration_pictures import target_pictures
 from nerif.app.pages.calibration import form_of
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.geometry import Ring
 from nerif.imaging.calibration.calibrate import calibrate
 from nerif.imaging.calibration.cameras_file import read_cameras

@@ -143,7 +143,7 @@ def test_the_command_imports_nothing_of_a_folder_nor_do_its_workers(tmp_path):
     folder.mkdir()
     plant(folder)
     command.write_text(
-        "from nerif.cli import main\n"
+        "from nerif.cli.cli import main\n"
         "if __name__ == '__main__':\n"
         "    assert main() == 0\n"
         "    import numba\n"

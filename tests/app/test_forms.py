@@ -10,9 +10,9 @@ import tyro
 from nerif.app.form_view import _meant, _shown
 from nerif.app.forms import Form
 from nerif.app.pages.reconstruct import form_of
-from nerif.commands.design import Design
-from nerif.commands.methods import RECORDS
-from nerif.commands.settings import help_of, parse
+from nerif.cli.commands.design import Design
+from nerif.cli.commands.methods import RECORDS
+from nerif.cli.commands.settings import help_of, parse
 from nerif.common.conventions import InputError
 from nerif.geometry import Ring
 

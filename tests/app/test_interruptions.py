@@ -17,7 +17,7 @@ from app.test_pages import line, put, visit
 from nerif.app.jobs import Jobs
 from nerif.app.pages import PAGES
 from nerif.app.workspace import READ_ONLY
-from nerif.cli import main
+from nerif.cli.cli import main
 from report.browsing import errors, needs_browser, text, wait_for
 
 pytestmark = needs_browser

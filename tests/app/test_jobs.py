@@ -15,7 +15,7 @@ import pytest
 from nerif.app import runner
 from nerif.app.jobs import Job, Jobs, claim, command_line
 from nerif.app.jobs_drawer import film_progress
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.json_file import write_json
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.serving import Served, opened
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.geometry import Ring
 from nerif.results.live import read_live, read_look
 from nerif.simulation.design import DesignSettings, expect

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from nerif.app.project import Project
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 
 

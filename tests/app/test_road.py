@@ -14,7 +14,7 @@ from app.serving import served
 from app.test_calibration import choose
 from app.test_pages import line, put
 from app.test_results import pick, tab
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.volume_file import read_volumes
 from nerif.toml import read_toml
 from report.browsing import errors, needs_browser, requests, text, wait_for

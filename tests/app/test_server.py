@@ -21,8 +21,8 @@ from nerif.app.command import App
 from nerif.app.guard import cookie_of
 from nerif.app.private import page_leading_to
 from nerif.app.server import Address, told_of
-from nerif.cli import main
-from nerif.commands.settings import read_settings
+from nerif.cli.cli import main
+from nerif.cli.commands.settings import read_settings
 from nerif.common.conventions import InputError
 from report.browsing import needs_browser, wait_for
 

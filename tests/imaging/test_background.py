@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.patterns import KINDS, Background

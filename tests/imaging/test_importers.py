@@ -14,7 +14,7 @@ import tomli_w
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerif.commands import calibrate
+from nerif.cli.commands import calibrate
 from nerif.common.conventions import InputError
 from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import Scaled, make_phantom

@@ -16,7 +16,7 @@ import scipy.io
 import torch
 
 from mutation.mutators import make
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.exports import export
 from nerif.data.measurement import Measurement

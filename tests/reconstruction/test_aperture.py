@@ -12,7 +12,7 @@ import xarray as xr
 from nerif.analysis.consistency import check_consistency
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume
 from nerif.analysis.prediction import predict_view, reproject
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume

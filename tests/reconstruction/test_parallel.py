@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.files import read_field

@@ -13,7 +13,7 @@ import torch
 from matplotlib.figure import Figure
 
 from nerif.analysis.rig_check import check_rig
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field

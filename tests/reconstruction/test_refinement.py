@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerif.analysis.alignment import Moved, aligned
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume

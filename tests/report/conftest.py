@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from report.browsing import open_browser
 
 RIG = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]

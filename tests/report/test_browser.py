@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.report import html

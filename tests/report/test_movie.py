@@ -14,7 +14,7 @@ pytest.importorskip("imageio_ffmpeg", reason="pip install '.[movie]'")
 
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence

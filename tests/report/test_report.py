@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from nerif.analysis.evaluation import evaluate_views
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume

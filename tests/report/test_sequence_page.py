@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence, add_frames

@@ -28,7 +28,7 @@ from sequence_films import COLD, QUICK, blank, simulated
 pytest.importorskip("distributed", reason="pip install '.[sequence]'")
 
 from nerif import __version__
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.workflow.sequence import cluster

@@ -13,7 +13,7 @@ import torch
 import xarray as xr
 import zarr
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.symmetric import symmetry_of_field
@@ -85,7 +85,7 @@ def test_frames_of_a_symmetric_film_share_an_axis_and_are_read_back_as_they_were
 
 def test_a_film_of_which_no_frame_is_found_exits_with_1(five, tmp_path, monkeypatch):
     store = SequenceStore(begun(five, tmp_path / "r.zarr").out)
-    monkeypatch.setattr("nerif.commands.sequence.run", lambda settings: store)
+    monkeypatch.setattr("nerif.cli.commands.sequence.run", lambda settings: store)
     assert main(["sequence", str(five), "-o", str(tmp_path / "r.zarr")]) == 1
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls

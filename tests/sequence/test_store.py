@@ -13,7 +13,7 @@ import pytest
 import torch
 import xarray as xr
 
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence

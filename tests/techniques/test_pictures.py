@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume
 from nerif.analysis.prediction import predict, reproject
-from nerif.cli import main
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 

@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 
 import tyro
 
-from nerif.commands.settings import flat_names, help_of, merge
+from nerif.cli.commands.settings import flat_names, help_of, merge
 from nerif.common.conventions import InputError
 
 __all__ = ["Form", "FormField"]

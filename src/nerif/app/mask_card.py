@@ -17,7 +17,7 @@ from nerif.app.pieces import refusals, text_html
 from nerif.app.project import OWN
 from nerif.app.view_maps import magnitude_address, threshold_address
 from nerif.app.workspace import Workspace
-from nerif.commands.mask import Mask
+from nerif.cli.commands.mask import Mask
 from nerif.data.measurement import Measurement
 from nerif.imaging.mask_shapes import write_masks
 from nerif.imaging.masks import MaskSettings

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from nerif.commands.info import is_measurement
+from nerif.cli.commands.info import is_measurement
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN

@@ -26,7 +26,7 @@ from nerif.app.private import page_leading_to
 from nerif.app.project import Project
 from nerif.app.result_answers import ROUTES
 from nerif.app.workspace import READ_ONLY, Workspace
-from nerif.commands.output import say
+from nerif.cli.commands.output import say
 from nerif.common.conventions import InputError
 
 __all__ = ["Address", "serve", "told_of"]

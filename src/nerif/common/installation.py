@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["DISTRIBUTION", "install", "stranger"]
 
 DISTRIBUTION = "nerif-bost"
-COMMAND = "nerif.cli:main"
+COMMAND = "nerif.cli.cli:main"
 """What the command `nerif` of this program runs, under whatever name it was installed."""
 
 

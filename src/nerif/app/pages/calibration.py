@@ -18,8 +18,8 @@ from nerif.app.project import Contents
 from nerif.app.rig_scene import read_rig, show_rig
 from nerif.app.target_pictures import TargetPictures
 from nerif.app.workspace import Workspace
-from nerif.commands.calibrate import Calibrate
-from nerif.commands.settings import merge
+from nerif.cli.commands.calibrate import Calibrate
+from nerif.cli.commands.settings import merge
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.result import ImageError
 from nerif.imaging.calibration.simple_rig import SimpleRig

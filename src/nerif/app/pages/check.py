@@ -17,7 +17,7 @@ from nerif.app.job_told import JobTold
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
-from nerif.commands.check import Check
+from nerif.cli.commands.check import Check
 from nerif.data.measurement import Measurement
 
 __all__ = ["PAGE"]

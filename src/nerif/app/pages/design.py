@@ -13,7 +13,7 @@ from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, figures
 from nerif.app.rig_drawing import rig_drawing
 from nerif.app.workspace import Workspace
-from nerif.commands.design import Design
+from nerif.cli.commands.design import Design
 from nerif.simulation.design import Expectation, expect
 
 __all__ = ["PAGE"]

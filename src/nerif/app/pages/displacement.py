@@ -17,7 +17,7 @@ from nerif.app.pieces import card, refusals, text_html
 from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
-from nerif.commands.displacement import Displacement
+from nerif.cli.commands.displacement import Displacement
 from nerif.data.measurement import Measurement
 from nerif.imaging.measuring import measure_instant
 

@@ -17,8 +17,8 @@ from nerif.app.live_view import LiveView
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
-from nerif.commands.methods import RECORDS, Reconstruct
-from nerif.commands.sequence import Sequence
+from nerif.cli.commands.methods import RECORDS, Reconstruct
+from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.neural.presets import PRESETS, preset

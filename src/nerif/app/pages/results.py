@@ -19,9 +19,9 @@ from nerif.app.result_answers import report_address, report_file
 from nerif.app.result_look import ResultLook
 from nerif.app.result_table import Row, result_table, rows_of
 from nerif.app.workspace import Workspace
-from nerif.commands.export import Export
-from nerif.commands.figures import Figures
-from nerif.commands.movie import MovieCommand
+from nerif.cli.commands.export import Export
+from nerif.cli.commands.figures import Figures
+from nerif.cli.commands.movie import MovieCommand
 from nerif.common.installation import install
 from nerif.data.exports import FORMATS
 from nerif.report.movie import STYLES

@@ -9,9 +9,9 @@ from typing import Any
 
 import tyro
 
-from nerif.commands.methods import RECORDS, Reconstruct
-from nerif.commands.output import MONITOR
-from nerif.commands.settings import flag_value, read_settings, value_given
+from nerif.cli.commands.methods import RECORDS, Reconstruct
+from nerif.cli.commands.output import MONITOR
+from nerif.cli.commands.settings import flag_value, read_settings, value_given
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Step

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from nerif.commands.settings import Flat, Settings
+from nerif.cli.commands.settings import Flat, Settings
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.landweber import Landweber

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, say
-from nerif.commands.settings import Flat, Settings, read_settings, value_given
+from nerif.cli.commands.output import check_file, say
+from nerif.cli.commands.settings import Flat, Settings, read_settings, value_given
 from nerif.common.conventions import InputError
 from nerif.imaging import patterns as background
 from nerif.imaging.calibration import targets

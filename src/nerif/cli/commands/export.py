@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands.output import check_file, counting_bar, say
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.data.exports import FORMATS, export
 from nerif.data.volume import Volume, quantities_of

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Flat, Settings, read_settings
+from nerif.cli.commands.output import check_file, counting_bar, say
+from nerif.cli.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
 from nerif.data.volume_file import write_netcdf

@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
         code = _run(list(arguments))
         sys.stdout.flush()
     except BrokenPipeError:  # nerif info FILE | head -2
-        from nerif.commands.output import silence
+        from nerif.cli.commands.output import silence
 
         silence()
         return 141

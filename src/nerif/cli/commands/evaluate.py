@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import tyro
 
 from nerif.analysis.evaluation import FLOW, evaluate, rms_text
-from nerif.commands.output import counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands.output import counting_bar, say
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.data.volume import INDEX, name_of
 

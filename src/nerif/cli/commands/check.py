@@ -10,8 +10,8 @@ import tyro
 
 from nerif.analysis.consistency import Consistency, check_consistency
 from nerif.analysis.rig_check import RigCheck, check_rig
-from nerif.commands.output import MONITOR, check_file, counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands.output import MONITOR, check_file, counting_bar, say
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.corrected import corrected
 from nerif.data.measurement import Measurement

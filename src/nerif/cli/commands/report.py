@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import MONITOR, check_file
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands.output import MONITOR, check_file
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.results.directory import REPORT
 from nerif.workflow.pipeline import write_report, write_sequence_report

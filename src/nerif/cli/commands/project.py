@@ -9,8 +9,8 @@ from typing import Annotated
 import tyro
 
 from nerif.analysis.prediction import predict
-from nerif.commands.output import check_file, counting_bar, say
-from nerif.commands.settings import Flat, Settings, read_settings
+from nerif.cli.commands.output import check_file, counting_bar, say
+from nerif.cli.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError, with_unit
 from nerif.data.measurement import Measurement
 from nerif.forward.registry import AUTO, model_of, technique, technique_of

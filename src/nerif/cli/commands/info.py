@@ -12,8 +12,8 @@ import tyro
 from torch import Tensor
 
 from nerif.analysis.evaluation import rms_text
-from nerif.commands.output import say
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands.output import say
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.netcdf import opened
 from nerif.data.measurement import Measurement

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands import evaluate, reconstruct, simulate
-from nerif.commands.methods import ReconstructNeRIF
-from nerif.commands.output import MONITOR, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands import evaluate, reconstruct, simulate
+from nerif.cli.commands.methods import ReconstructNeRIF
+from nerif.cli.commands.output import MONITOR, say
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.geometry import Ring

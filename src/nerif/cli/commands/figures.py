@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import counting_bar, say
-from nerif.commands.settings import Settings, read_settings
+from nerif.cli.commands.output import counting_bar, say
+from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.report.pages import JOURNALS, save_figures
 from nerif.results.directory import FIGURES, ResultDirectory

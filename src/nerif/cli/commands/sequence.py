@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.commands.output import MONITOR, figures_bar
-from nerif.commands.settings import Flat, Settings, read_settings, value_given
+from nerif.cli.commands.output import MONITOR, figures_bar
+from nerif.cli.commands.settings import Flat, Settings, read_settings, value_given
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import preset
 from nerif.workflow.sequence.plan import SequenceSettings
