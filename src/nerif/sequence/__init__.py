@@ -1,1 +1,0 @@
-"""Many frames: a store of results, frames that start from one another, and the cluster they run on."""
