@@ -42,11 +42,11 @@ def corrected(measurement: Measurement, found: Consistency) -> Measurement:
     if alone.names != measurement.names:
         raise InputError("measurement: expected that every view measured something, for views are corrected by number")
     for correction in corrections:
-        alone = _without(correction, alone)
+        alone = _undone(correction, alone)
     return alone
 
 
-def _without(correction: Correction, measurement: Measurement) -> Measurement:
+def _undone(correction: Correction, measurement: Measurement) -> Measurement:
     (own,) = measurement.observations
     cameras, name = measurement.cameras, own.technique.name
     values = correction.undo(own.values, cameras)

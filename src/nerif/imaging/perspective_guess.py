@@ -27,8 +27,8 @@ def guess_perspective(views: Sequence[ViewPictures], world: str) -> Guess:
     InputError
         If a camera has too few poses, is not tied to the others by shared ones, or contradicts them.
     """
-    alone = [_alone(view) for view in views]
-    cameras, targets = _tie_together(views, alone, world)
+    alone = [_perspective_view(view) for view in views]
+    cameras, targets = _perspective_rig(views, alone, world)
     return Guess(
         intrinsics=np.stack([k for k, _ in alone]),
         cameras=tuple(cameras[i] for i in range(len(views))),
@@ -40,7 +40,7 @@ def guess_perspective(views: Sequence[ViewPictures], world: str) -> Guess:
     )
 
 
-def _alone(view: ViewPictures) -> Alone:
+def _perspective_view(view: ViewPictures) -> Alone:
     """Focal length of one camera and the pose of each target before it, by name and whether it is on the background."""
     import cv2
 
@@ -74,7 +74,7 @@ def _alone(view: ViewPictures) -> Alone:
     return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0], dtype=np.float64), found
 
 
-def _tie_together(
+def _perspective_rig(
     views: Sequence[ViewPictures], alone: Sequence[Alone], world: str
 ) -> tuple[dict[int, Pose], dict[str, Pose]]:
     """Poses of cameras (world to camera) and targets (to world), from camera to camera through shared poses."""

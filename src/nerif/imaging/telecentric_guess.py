@@ -36,8 +36,8 @@ def guess_telecentric(views: Sequence[ViewPictures], world: str) -> Guess:
     InputError
         If a camera has too few poses, is not tied to the others by shared ones, or contradicts them.
     """
-    alone = [_alone(view) for view in views]
-    cameras, targets = _tie_together(views, alone, world)
+    alone = [_telecentric_view(view) for view in views]
+    cameras, targets = _telecentric_rig(views, alone, world)
     places, offsets = _places(alone, cameras, targets, world)
     return Guess(
         intrinsics=np.stack([[a.scale, a.scale, *a.middle, 0, 0, 0, 0, 0] for a in alone]),
@@ -57,7 +57,7 @@ def mirrored(bundle: Bundle) -> Bundle:
 
 
 @dataclass(frozen=True)
-class _Alone:
+class _TelecentricView:
     """One camera: px/mm, the middle of its picture (px), and of each pose both rotations and the place (x, y) in mm."""
 
     scale: float
@@ -66,7 +66,7 @@ class _Alone:
     places: Mapping[str, Float[np.ndarray, 2]]
 
 
-def _alone(view: ViewPictures) -> _Alone:
+def _telecentric_view(view: ViewPictures) -> _TelecentricView:
     enough(view, len(view.poses))
     affine = {name: _affine(found) for name, found in view.poses.items()}
     for name, (matrix, _) in affine.items():
@@ -74,7 +74,7 @@ def _alone(view: ViewPictures) -> _Alone:
             raise InputError(f"view '{view.name}': sees the target of '{name}' from behind; is it mirrored (flip)?")
     scale = float(np.median([np.linalg.norm(matrix, 2) for matrix, _ in affine.values()]))
     middle = ((view.size[1] - 1) / 2, (view.size[0] - 1) / 2)
-    return _Alone(
+    return _TelecentricView(
         scale,
         middle,
         {name: _both_turns(matrix / scale) for name, (matrix, _) in affine.items()},
@@ -101,8 +101,8 @@ def _both_turns(block: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 3 3"]:
     return np.stack([left @ t @ right for t in (tilt, tilt.T)])
 
 
-def _tie_together(
-    views: Sequence[ViewPictures], alone: Sequence[_Alone], world: str
+def _telecentric_rig(
+    views: Sequence[ViewPictures], alone: Sequence[_TelecentricView], world: str
 ) -> tuple[dict[int, np.ndarray], dict[str, np.ndarray]]:
     """Rotations of cameras (from the world) and targets (to it): always the camera that shares most poses is next."""
     first = max(range(len(views)), key=lambda i: len(views[i].poses))
@@ -142,7 +142,7 @@ def _turned_alike(
 
 
 def _places(
-    alone: Sequence[_Alone], cameras: Mapping[int, np.ndarray], targets: Mapping[str, np.ndarray], world: str
+    alone: Sequence[_TelecentricView], cameras: Mapping[int, np.ndarray], targets: Mapping[str, np.ndarray], world: str
 ) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     """Places of targets in the world and offsets of cameras (x, y, 0), mm, by least squares; unseen depths are 0."""
     names = [n for n in targets if n != world]
