@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nerif.common.conventions import InputError
-from nerif.toml import check_known, read_toml, write_toml
+from nerif.common.files import check_known, read_toml, write_toml
 
 
 def test_there_and_back_below_a_comment(tmp_path):

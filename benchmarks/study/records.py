@@ -12,7 +12,7 @@ import torch
 
 from bench import machine
 from nerif import __version__
-from nerif.json_file import write_json
+from nerif.common.files import write_json
 from study.cases import Case
 from study.results import Record
 

@@ -17,7 +17,7 @@ from nerif.app.jobs import Job, Jobs, claim, command_line
 from nerif.app.jobs_drawer import film_progress
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
-from nerif.json_file import write_json
+from nerif.common.files import write_json
 
 HELP = ("--version",)
 

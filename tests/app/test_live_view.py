@@ -14,7 +14,7 @@ from app.serving import opened
 from nerif.app.jobs import Jobs
 from nerif.app.live_surface import said_of
 from nerif.app.live_view import told
-from nerif.json_file import write_json
+from nerif.common.files import write_json
 from nerif.results.directory import LIVE, LIVE_LOOK
 from nerif.results.live import read_look
 from report.browsing import errors, needs_browser, requests, text, wait_for

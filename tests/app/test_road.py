@@ -15,8 +15,8 @@ from app.test_calibration import choose
 from app.test_pages import line, put
 from app.test_results import pick, tab
 from nerif.cli.cli import main
+from nerif.common.files import read_toml
 from nerif.data.volume_file import read_volumes
-from nerif.toml import read_toml
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
 pytestmark = [needs_browser, pytest.mark.slow]

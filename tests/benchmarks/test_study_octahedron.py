@@ -7,11 +7,11 @@ import json
 import pytest
 import torch
 
+from nerif.common.files import write_json
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Box, Grid, Ring
-from nerif.json_file import write_json
 from study.octahedron import from_plain, pixels_per_unit, to_plain
 from study.resolution import measure_resolution
 

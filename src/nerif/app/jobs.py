@@ -38,7 +38,7 @@ from nerif.app.private import secret
 from nerif.app.project import OWN
 from nerif.app.runner import ENDED, JOB, LOG, STARTED
 from nerif.common.conventions import InputError
-from nerif.json_file import write_json
+from nerif.common.files import write_json
 from nerif.results.directory import RUN
 
 __all__ = ["REFUSED", "Job", "Jobs", "command_line"]

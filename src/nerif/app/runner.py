@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from nerif.json_file import write_json
+from nerif.common.files import write_json
 
 __all__ = ["ENDED", "JOB", "LOG", "STARTED", "main"]
 

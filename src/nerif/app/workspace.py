@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 from nerif.app.jobs import Jobs
 from nerif.app.picture_files import PictureFiles
 from nerif.app.project import OWN, Project
-from nerif.json_file import write_json
+from nerif.common.files import write_json
 
 __all__ = ["READ_ONLY", "Workspace"]
 

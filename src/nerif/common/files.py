@@ -1,14 +1,26 @@
-"""Files and stores that appear whole or not at all."""
+"""Files and stores that appear whole or not at all.
+
+TOML files, written whole, read, and refused in words; and the keys that people mistype in them.
+
+JSON files: written whole or not at all, with null for numbers that are none.
+"""
 
 from __future__ import annotations
 
+import difflib
+import json
+import math
 import os
 import shutil
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-__all__ = ["atomic", "written"]
+from nerif.common.conventions import InputError
+
+__all__ = ["atomic", "check_known", "read_toml", "write_json", "write_toml", "written"]
 
 written: list[Path] = []
 """What this process has written, in that order."""
@@ -39,3 +51,58 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    InputError
+        If it is missing (`expected` says what should be there), or no TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such {expected}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise InputError(f"{path}: not a TOML file ({error})") from None
+
+
+def write_toml(path: str | os.PathLike[str], table: Mapping[str, Any], head: str = "") -> None:
+    """Write a TOML file, atomically, below a comment."""
+    import tomli_w
+
+    with atomic(path) as part:
+        part.write_text(head + tomli_w.dumps(table), encoding="utf-8")
+
+
+def check_known(words: Iterable[str], known: Iterable[str], where: str, what: str = "key", more: str = "") -> None:
+    """Refuse a word that is not known.
+
+    Raises
+    ------
+    InputError
+        Naming the nearest known one.
+    """
+    known = list(known)
+    for word in words:
+        if word not in known:
+            near = difflib.get_close_matches(word, known, n=1, cutoff=0)[0]
+            raise InputError(f"{where}: unknown {what} '{word}'; the nearest known one is '{near}'{more}")
+
+
+def write_json(path: Path, entries: Mapping[str, Any]) -> None:
+    """Write a JSON file, atomically; NaN and infinity as null."""
+    with atomic(path) as part:
+        part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

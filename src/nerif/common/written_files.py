@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from nerif.json_file import write_json
+from nerif.common.files import write_json
 
 __all__ = ["WARN", "WRITTEN", "OwnFiles", "remove_empty"]
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from nerif import __version__
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, read_toml, write_json, write_toml
 from nerif.common.written_files import WARN, OwnFiles, remove_empty
 from nerif.data.exports import export
 from nerif.data.measurement import Measurement
@@ -26,11 +26,9 @@ from nerif.data.volume_file import read_volume, read_volumes
 from nerif.fields.base import Field
 from nerif.geometry import Box
 from nerif.geometry.symmetry import Symmetry
-from nerif.json_file import write_json
 from nerif.reconstruction import files as kept
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
-from nerif.toml import read_toml, write_toml
 
 __all__ = [
     "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions",

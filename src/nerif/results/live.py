@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.common.files import atomic
+from nerif.common.files import atomic, write_json
 from nerif.common.written_files import OwnFiles
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, describe
@@ -29,7 +29,6 @@ from nerif.forward.base import ForwardModel
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box, Grid
-from nerif.json_file import write_json
 from nerif.observation import Observation
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
 from nerif.reconstruction.progress import Monitor

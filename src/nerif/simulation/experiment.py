@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.common.files import write_toml
 from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
@@ -25,7 +26,6 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_camer
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.patterns import Background
 from nerif.simulation.rendering import Sensor, Texture, background_texture, pattern_size, render
-from nerif.toml import write_toml
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "side_of_one", "target_poses", "world_axes"]
 

@@ -12,8 +12,8 @@ from nerif.analysis.asymmetry import HALVES, kept_half
 from nerif.analysis.evaluation import evaluate_views, rms_text
 from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
+from nerif.common.files import write_json
 from nerif.data.measurement import Measurement
-from nerif.json_file import write_json
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.shared_settings import SharedSettings

@@ -21,11 +21,11 @@ from nerif.app.workspace import Workspace
 from nerif.cli.commands.calibrate import Calibrate
 from nerif.cli.commands.settings import merge
 from nerif.common.conventions import InputError
+from nerif.common.files import read_toml
 from nerif.imaging.calibration.result import ImageError
 from nerif.imaging.calibration.simple_rig import SimpleRig
 from nerif.imaging.calibration.targets import KINDS, CalibrationTarget
 from nerif.imaging.readers.views import View
-from nerif.toml import read_toml
 
 __all__ = ["PAGE"]
 

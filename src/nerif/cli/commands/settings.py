@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import tyro
 
 from nerif.common.conventions import InputError
-from nerif.toml import check_known, read_toml
+from nerif.common.files import check_known, read_toml
 
 __all__ = ["Flat", "Settings", "flag_value", "flat_names", "help_of", "merge", "parse", "read_settings", "value_given"]
 

@@ -32,8 +32,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError, Matrix3
+from nerif.common.files import check_known, read_toml, write_toml
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
-from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = [
     "FORMAT", "CalibratedCamera", "check_distortion", "check_model", "check_names", "checked", "five", "flat",

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 
 from nerif.common.conventions import InputError
+from nerif.common.files import read_toml
 from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
 from nerif.imaging.calibration.bundle import Bundle, Observation, Pose, crossing
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
-from nerif.toml import read_toml
 
 __all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "rms_of"]
 

@@ -28,13 +28,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
+from nerif.common.files import check_known, read_toml
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewPictures
 from nerif.imaging.displacement.exposure import check_exposure, full_scale
 from nerif.imaging.masks import read_mask
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
 from nerif.imaging.readers.open import open_frames
-from nerif.toml import check_known, read_toml
 
 __all__ = ["SOURCES", "Pictures", "View", "find_targets", "find_views", "good_pictures", "pose_names"]
 

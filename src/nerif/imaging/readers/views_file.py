@@ -8,9 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from nerif.common.files import check_known, read_toml, write_toml
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import find_views
-from nerif.toml import check_known, read_toml, write_toml
 
 __all__ = ["BEFORE", "write_crops"]
 

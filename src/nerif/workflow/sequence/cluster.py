@@ -16,8 +16,8 @@ import torch
 
 from nerif import __version__
 from nerif.common.conventions import InputError
+from nerif.common.files import check_known
 from nerif.common.installation import install
-from nerif.toml import check_known
 
 if TYPE_CHECKING:
     from distributed import Client, Security

@@ -10,10 +10,10 @@ from typing import Any
 from nerif.analysis.evaluation import check_inside
 from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
+from nerif.common.files import write_json
 from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.forward.registry import ASSUMED, technique
-from nerif.json_file import write_json
 from nerif.workflow.sequence.store import DONE, SequenceStore
 
 __all__ = ["evaluate_sequence"]

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.common.files import check_known, read_toml
 from nerif.geometry import PERSPECTIVE, projection_named
 from nerif.imaging.calibration.cameras_file import (
     FORMAT,
@@ -21,7 +22,6 @@ from nerif.imaging.calibration.cameras_file import (
     read_cameras,
     upright,
 )
-from nerif.toml import check_known, read_toml
 
 __all__ = ["read_csv", "read_tables"]
 
