@@ -10,7 +10,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.geometry import PROJECTIONS, Box, Camera, Plane, projection_named
-from nerif.geometry.distortion import distort, fold, undistort
+from nerif.geometry.camera import distort, fold, undistort
 
 F64 = torch.float64
 

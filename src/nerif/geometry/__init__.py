@@ -1,9 +1,8 @@
 """Cameras, rays, boxes and grids."""
 
-from nerif.geometry.camera import Camera, Plane
+from nerif.geometry.camera import PERSPECTIVE, PROJECTIONS, TELECENTRIC, Camera, Plane, Projection, projection_named
 from nerif.geometry.grid import Box, Grid
 from nerif.geometry.lens import Lens, LensDiscs, spread_points
-from nerif.geometry.projection import PERSPECTIVE, PROJECTIONS, TELECENTRIC, Projection, projection_named
 from nerif.geometry.rays import BackgroundPoints, Rays
 from nerif.geometry.rig import Ring, paper_rig
 

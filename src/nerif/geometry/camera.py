@@ -1,23 +1,249 @@
 """The camera: OpenCV's, perspective or telecentric, with five distortion coefficients, looking at a background plane.
 
 x_cam = R x_world + t,   (x, y) = projection(x_cam) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
+
+The two projections: where a point of the camera's frame is in the image plane, and the line that is seen there.
+
+    perspective    (x, y) = (X/Z, Y/Z)    lines through the optical centre; K holds focal lengths, px
+    telecentric    (x, y) = (X, Y)        lines parallel to the optical axis; K holds px per mm
+
+Distortion and K act on (x, y) alike: pixel = K distorted(x, y, 1).
+
+Brown's distortion with OpenCV's five coefficients, and its inverse.
+
+    x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y_d = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y,        r^2 = x^2 + y^2
 """
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
-from nerif.geometry.distortion import distort, fold, undistort
 from nerif.geometry.lens import Lens, LensDiscs
-from nerif.geometry.projection import PERSPECTIVE, Projection
 from nerif.geometry.rays import BackgroundPoints, Rays
 
-__all__ = ["Camera", "Plane"]
+__all__ = [
+    "PERSPECTIVE",
+    "POWERS",
+    "PROJECTIONS",
+    "TELECENTRIC",
+    "Camera",
+    "Perspective",
+    "Plane",
+    "Projection",
+    "Telecentric",
+    "distort",
+    "fold",
+    "projection_named",
+    "undistort",
+]
+
+POWERS = (2, 4, 1, 1, 6)
+"""Of the unit of (x, y), by which k1, k2, p1, p2, k3 are divided."""
+REAL = 1e-6  # imaginary part over absolute value, below which a root is real
+START, STEP = 0.9, 0.25  # of the radius of the fold: how far out Newton's method starts, and its longest step
+
+
+def distort(x: Array, y: Array, coefficients: Iterable[Any]) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Return x_d, y_d and their derivatives d x_d / d x, d x_d / d y = d y_d / d x, d y_d / d y.
+
+    Parameters
+    ----------
+    x, y : ideal image coordinates
+    coefficients : k1, k2, p1, p2, k3
+    """
+    k1, k2, p1, p2, k3 = coefficients
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d r2, times 2
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return xd, yd, (xx, cross, yy)
+
+
+def fold(coefficients: Float[Tensor, 5]) -> float:
+    """Return the radius r up to which no two points (x, y) are distorted to the same; infinite where there is no end.
+
+    Beyond, the image that a polynomial makes folds back. The derivatives are a symmetric matrix, and as long as that is
+    positive definite points stay apart. Its lowest eigenvalue is at least
+
+        1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 - 6 (p1^2 + p2^2)^(1/2) r
+    """
+    k1, k2, p1, p2, k3 = coefficients.tolist()
+    roots = np.roots([7 * k3, 0.0, 5 * k2, 0.0, 3 * k1, -6 * math.hypot(p1, p2), 1.0])
+    real = roots.real[(roots.real > 0) & (np.abs(roots.imag) < REAL * np.abs(roots))]
+    return float(real.min(initial=math.inf))
+
+
+def undistort(distorted: Pixels, coefficients: Float[Tensor, 5]) -> Pixels:
+    """Return the ideal coordinates by Newton's method (at most 20 steps); NaN where there are none before the fold."""
+    if not (distorted.numel() and bool(coefficients.any())):
+        return distorted
+    end = fold(coefficients)
+    size = max(1.0, float(distorted.abs().amax()))
+    x, y = _within(distorted[..., 0], distorted[..., 1], START * end)
+    for _ in range(20):
+        xd, yd, (xx, cross, yy) = distort(x, y, coefficients)
+        left, below = distorted[..., 0] - xd, distorted[..., 1] - yd
+        if float(torch.maximum(left.abs(), below.abs()).amax()) < 1e-14 * size:
+            break
+        determinant = xx * yy - cross * cross
+        step = (yy * left - cross * below) / determinant, (xx * below - cross * left) / determinant
+        aside, down = _within(step[0], step[1], STEP * end)
+        x, y = _within(x + aside, y + down, end)
+    xd, yd, _ = distort(x, y, coefficients)
+    error = (distorted - torch.stack([xd, yd], dim=-1)).abs().amax(dim=-1, keepdim=True)
+    return torch.where(error < 1e-9 * size, torch.stack([x, y], dim=-1), torch.nan)
+
+
+def _within(x: Tensor, y: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """The vector (x, y), no longer than that."""
+    share = (radius / torch.hypot(x, y)).clamp(max=1)
+    return x * share, y * share
+
+
+Array = TypeVar("Array", Tensor, np.ndarray)
+
+
+class Projection(ABC):
+    """From the camera's frame (mm) to its image plane, before distortion and K, and back."""
+
+    name: ClassVar[str]
+    """In files and settings."""
+    begin: ClassVar[float]
+    """Path length before which there is no ray, mm."""
+    shows_depth: ClassVar[bool]
+    """Whether a picture changes with the depth of what it shows."""
+    scale: ClassVar[str]
+    """What fx and fy of K are called."""
+    unit: ClassVar[str]
+    """Of fx and fy."""
+    least_scale: ClassVar[float]
+    """Of fx and fy."""
+
+    @abstractmethod
+    def image(self, local: Array) -> Array:
+        """Return (x, y) (..., 2) of points (..., 3)."""
+
+    @abstractmethod
+    def slope(self, along_x: Array, along_y: Array, image: Array, local: Array) -> tuple[Array, Array, Array]:
+        """Return d g / d (X, Y, Z) of what has d g / d (x, y) = (along_x, along_y), at points and their (x, y)."""
+
+    @abstractmethod
+    def lines(self, image: Pixels) -> tuple[Float[Tensor, "*#batch 3"], Points]:
+        """Return where the lines seen at (x, y) start, mm (one place if it is the same), and their directions.
+
+        The directions are of any length, and lead away from the camera.
+        """
+
+    @abstractmethod
+    def sight(self, local: Points) -> Points:
+        """Return the unit directions in which points are seen, away from the camera."""
+
+    @abstractmethod
+    def distance(self, local: Points) -> Values:
+        """Return how far the camera is from points, mm."""
+
+    @abstractmethod
+    def magnification(self, local: Points) -> Values:
+        """Return how far (x, y) moves as a point moves by 1 mm across the optical axis."""
+
+
+@dataclass(frozen=True)
+class Perspective(Projection):
+    """All lines go through the optical centre."""
+
+    name = "perspective"
+    begin = 0.0
+    shows_depth = True
+    scale = "focal length"
+    unit = "px"
+    least_scale = 1.0
+
+    def image(self, local: Array) -> Array:
+        return local[..., :2] / local[..., 2:]
+
+    def slope(self, along_x: Array, along_y: Array, image: Array, local: Array) -> tuple[Array, Array, Array]:
+        depth = local[..., 2]
+        along_z = -(along_x * image[..., 0] + along_y * image[..., 1])
+        return along_x / depth, along_y / depth, along_z / depth
+
+    def lines(self, image: Pixels) -> tuple[Float[Tensor, "*#batch 3"], Points]:
+        direction = torch.cat([image, torch.ones_like(image[..., :1])], dim=-1)
+        return direction.new_zeros(3), direction
+
+    def sight(self, local: Points) -> Points:
+        return local / local.norm(dim=-1, keepdim=True)
+
+    def distance(self, local: Points) -> Values:
+        return local.norm(dim=-1)
+
+    def magnification(self, local: Points) -> Values:
+        return 1 / local[..., 2]
+
+
+@dataclass(frozen=True)
+class Telecentric(Projection):
+    """All lines are parallel to the optical axis, and start where they cross Z = 0."""
+
+    name = "telecentric"
+    begin = -math.inf
+    shows_depth = False
+    scale = "scale"
+    unit = "px/mm"
+    least_scale = 1 / LARGEST_LENGTH
+
+    def image(self, local: Array) -> Array:
+        return local[..., :2]
+
+    def slope(self, along_x: Array, along_y: Array, image: Array, local: Array) -> tuple[Array, Array, Array]:
+        return along_x, along_y, 0 * along_x
+
+    def lines(self, image: Pixels) -> tuple[Float[Tensor, "*#batch 3"], Points]:
+        start = torch.cat([image, torch.zeros_like(image[..., :1])], dim=-1)
+        return start, self.sight(start)
+
+    def sight(self, local: Points) -> Points:
+        axis: Float[Tensor, 3] = local.new_tensor([0.0, 0.0, 1.0])
+        return axis.expand_as(local)
+
+    def distance(self, local: Points) -> Values:
+        return torch.full_like(local[..., 0], math.inf)
+
+    def magnification(self, local: Points) -> Values:
+        return torch.ones_like(local[..., 0])
+
+
+PERSPECTIVE, TELECENTRIC = Perspective(), Telecentric()
+PROJECTIONS: dict[str, Projection] = {kind.name: kind for kind in (PERSPECTIVE, TELECENTRIC)}
+"""Every projection by its name."""
+
+
+def projection_named(name: object, what: str = "projection") -> Projection:
+    """Return a projection by its name.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    if not isinstance(name, str) or name not in PROJECTIONS:
+        raise InputError(f"{what}: expected one of {', '.join(PROJECTIONS)}, got {name!r}")
+    return PROJECTIONS[name]
+
 
 LARGEST_IMAGE = 100_000  # px
 EVENLY = 33  # pixels along either edge that stand for a picture

@@ -3,22 +3,49 @@
     L = O + r (x e_1 + y e_2),  |(x, y)| <= 1        a point of the disc about the camera's centre O, of radius r
     X_f = O + s_f t                                  in focus on the pixel's own ray, O + s t
     p' = p + w (a, b),  |a|, |b| <= 1                a pixel of the window about p, of half the edge w
+
+Records of arrays that have one entry each for many things alike, such as rays.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import LARGEST_LENGTH, InputError
-from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
 
-__all__ = ["Lens", "LensDiscs", "spread_points"]
+__all__ = ["Columns", "Lens", "LensDiscs", "spread_points"]
+
+C = TypeVar("C", bound="Columns")
+
+
+class Columns:
+    """A record of arrays with one entry a ray, or of such records; None where there is nothing."""
+
+    def each(self: C, change: Callable[..., Tensor], *others: C) -> C:
+        """Return the record of what `change` makes of every array and those of the others in its place.
+
+        What is no array, such as a box, is the same in all of them.
+        """
+        made: dict[str, Any] = {}
+        for f in fields(self):  # type: ignore[arg-type]
+            first, *more = (getattr(part, f.name) for part in (self, *others))
+            if isinstance(first, Columns):
+                first = first.each(change, *more)
+            elif isinstance(first, Tensor):
+                first = change(first, *more)
+            else:
+                assert all(other == first for other in more), f"{f.name}: expected the same in all records"
+            made[f.name] = first
+        return type(self)(**made)
+
 
 CHEBYSHEV = (-0.7946544723, -0.1875924741, 0.1875924741, 0.7946544723)  # of -1 to 1, all of one weight
 MIXED = 3

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.transfer import constant, sent
-from nerif.geometry.columns import Columns
 from nerif.geometry.grid import Box
-from nerif.geometry.lens import LensDiscs, spread_points
+from nerif.geometry.lens import Columns, LensDiscs, spread_points
 
 __all__ = ["BackgroundPoints", "Rays"]
 

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.geometry.camera import Camera, Plane
+from nerif.geometry.camera import Camera, Plane, Projection, projection_named
 from nerif.geometry.grid import Box
-from nerif.geometry.projection import Projection, projection_named
 
 __all__ = ["Ring", "paper_rig"]
 

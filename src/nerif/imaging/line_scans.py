@@ -24,7 +24,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Camera
-from nerif.geometry.projection import TELECENTRIC
+from nerif.geometry.camera import TELECENTRIC
 
 __all__ = ["LineScan", "Told"]
 

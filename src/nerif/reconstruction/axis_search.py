@@ -20,8 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.data.measurement import Measurement
-from nerif.geometry.axis import Axis
-from nerif.geometry.symmetry import Symmetry
+from nerif.geometry.symmetry import Axis, Symmetry
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.layout import Symmetric
 from nerif.reconstruction.voxels.levels import bins_of

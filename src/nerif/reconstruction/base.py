@@ -17,7 +17,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
-from nerif.geometry.axis import Axis
+from nerif.geometry.symmetry import Axis
 
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 

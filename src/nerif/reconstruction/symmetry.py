@@ -10,8 +10,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.geometry.axis import Axis
-from nerif.geometry.symmetry import Symmetry, parse_symmetry
+from nerif.geometry.symmetry import Axis, Symmetry, parse_symmetry
 from nerif.reconstruction.axis_search import find_axis
 from nerif.reconstruction.gauge import ambient_faces
 from nerif.reconstruction.shared_settings import SharedSettings

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.geometry import PERSPECTIVE, Projection
-from nerif.geometry.distortion import POWERS, distort
+from nerif.geometry.camera import POWERS, distort
 from nerif.imaging.calibration.targets import Detection
 
 __all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust", "crossing"]

@@ -20,7 +20,7 @@ from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.forward.base import ForwardModel
 from nerif.geometry import Box
-from nerif.geometry.axis import Axis
+from nerif.geometry.symmetry import Axis
 from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device

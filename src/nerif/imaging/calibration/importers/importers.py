@@ -15,7 +15,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane
-from nerif.geometry.distortion import POWERS
+from nerif.geometry.camera import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_names, checked, read_box
 from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.calibration.importers.nerfstudio import read_transforms
