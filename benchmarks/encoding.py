@@ -20,7 +20,7 @@ import torch
 from bench import N_AMBIENT, Table, add_write
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.volume import Volume
-from nerif.fields.encoding import DIRECTIONS
+from nerif.fields.network import DIRECTIONS
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.neural.neural import NeRIF

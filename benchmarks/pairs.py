@@ -20,11 +20,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench import Table, add_write
-from nerif.forward.images import Pictures
+from nerif.forward.images import Pictures, References
 from nerif.imaging.displacement.displacement import DisplacementSettings, displacement
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.readers.open import open_frames
-from nerif.techniques.warped import References
 
 MARGIN = 20
 BLURS = (3.0, 1.0, 0.0)

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from nerif.geometry import Box, Camera, Grid, Lens, Ring
-from nerif.techniques.warped import References
+from nerif.forward.images import References
 
 __all__ = ["DRAWINGS", "draw_all"]
 

@@ -8,9 +8,8 @@ from torch import Tensor
 
 from nerif.analysis.consistency import Consistency
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, integrals_of
 from nerif.mistakes import Correction
-from nerif.observation import integrals_of
 
 __all__ = ["corrected"]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from nerif.data.measurement import Observation
 from nerif.geometry import Camera
-from nerif.observation import Observation
 
 __all__ = ["Correction", "everywhere", "exchanges", "of_one_view", "orders"]
 

@@ -11,8 +11,16 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from nerif.common.conventions import InputError
-from nerif.fields.encoding import encode, encode_pullback, encoded_width, wave_vectors
-from nerif.fields.network import ACTIVATIONS, Network, NetworkShape, NeuralField
+from nerif.fields.network import (
+    ACTIVATIONS,
+    Network,
+    NetworkShape,
+    NeuralField,
+    encode,
+    encode_pullback,
+    encoded_width,
+    wave_vectors,
+)
 from nerif.geometry import Box
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.files import FIELD, read_field, write_field

@@ -21,7 +21,7 @@ from nerif.data.volume import Volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import LeverArm
-from nerif.forward.images import Pictures
+from nerif.forward.images import Pictures, References
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
@@ -32,7 +32,6 @@ from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.techniques.warped import References
 
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
 RING = Ring(views=4, image_size=(38, 43), pixel_pitch=0.06, distance=400.0, background_distance=300.0)

@@ -21,10 +21,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Observation
 from nerif.geometry import Camera
 from nerif.geometry.symmetry import Symmetry
-from nerif.observation import Observation
 
 __all__ = [
     "HALVES", "Reflection", "camera_of", "departure_sentence", "departures", "halved", "kept_half", "left_of_axis",

@@ -17,12 +17,11 @@ from torch import Tensor
 from nerif.analysis.unrelated_views import NOISY, repeatable, unrelated, unrelated_finding
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Observation, integrals_of
 from nerif.data.volume import INDEX
 from nerif.geometry import Grid
 from nerif.geometry.plausibility import rig_findings
 from nerif.mistakes import Correction, everywhere, exchanges, of_one_view, orders
-from nerif.observation import Observation, integrals_of
 from nerif.quick_views import (
     binned,
     compare,

@@ -20,7 +20,7 @@ from nerif.analysis.metrics import coverage, slice_metrics, view_metrics, volume
 from nerif.analysis.prediction import check_sees, reproject
 from nerif.analysis.residuals import leftover, white_noise
 from nerif.common.conventions import InputError, with_unit
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volume
@@ -28,7 +28,6 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box
-from nerif.observation import Observation
 from nerif.plotting.notebook import number
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.rig.refined import with_corrections

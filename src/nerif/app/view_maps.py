@@ -6,9 +6,8 @@ from html import escape
 
 import torch
 
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, integrals_of
 from nerif.imaging.masks import MaskSettings, with_flow_masks
-from nerif.observation import integrals_of
 from nerif.report.view_images import picture_address
 
 __all__ = ["magnitude_address", "maps_html", "threshold_address"]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from nerif.common.conventions import with_unit
+from nerif.data.measurement import Observation
 from nerif.forward.deflection import Deflection
-from nerif.observation import Observation
 from nerif.plotting.notebook import PIXELS, number, panel, show_views
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerif.common.conventions import Points
-from nerif.fields.encoding import encode, encode_pullback, encoded_width
-from nerif.fields.network import UNBOUNDED, Network, NetworkShape, NeuralField
+from nerif.fields.network import UNBOUNDED, Network, NetworkShape, NeuralField, encode, encode_pullback, encoded_width
 from nerif.geometry import Box
 
 __all__ = ["AtTimes", "SpaceTimeField", "SpaceTimeNetwork", "with_time"]

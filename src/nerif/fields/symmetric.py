@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from nerif.common.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field, in_chunks
-from nerif.fields.encoding import encode, encode_pullback
 from nerif.fields.grid import VoxelField
-from nerif.fields.network import ACTIVATIONS, UNBOUNDED, Network, NetworkShape, NeuralField
+from nerif.fields.network import ACTIVATIONS, UNBOUNDED, Network, NetworkShape, NeuralField, encode, encode_pullback
 from nerif.geometry import Grid
 from nerif.geometry.symmetry import Symmetry
 

@@ -21,9 +21,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.forward.base import ForwardModel, Light
-from nerif.forward.line_integral import LineIntegral
+from nerif.forward.line_integral import IMPOSSIBLE, LineIntegral, share_below
 from nerif.geometry import Rays
-from nerif.techniques.plausible import IMPOSSIBLE, share_below
 
 __all__ = ["Absorption", "Intensity", "absorbance"]
 

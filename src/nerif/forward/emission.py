@@ -14,8 +14,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.forward.base import ForwardModel, Light
-from nerif.forward.line_integral import LineIntegral
-from nerif.techniques.plausible import share_below
+from nerif.forward.line_integral import LineIntegral, share_below
 
 __all__ = ["Emission"]
 

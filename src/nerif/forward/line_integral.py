@@ -1,6 +1,8 @@
 """What absorption, emission and interferometry have in common: the integral of the field along the straight ray.
 
     y = weight integral f ds
+
+Whether a map can be what a technique says it measures, within its noise.
 """
 
 from __future__ import annotations
@@ -8,13 +10,48 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.forward.base import ForwardModel, Weights
 from nerif.geometry import Rays
 
-__all__ = ["LineIntegral"]
+__all__ = ["IMPOSSIBLE", "LineIntegral", "neighbour_noise", "share_below"]
+
+IMPOSSIBLE = 5.0
+"""Standard deviations by which noise does not lead beyond what there can be."""
+GAUSSIAN = 1.4826  # standard deviations in the median of the size of a Gaussian variable
+
+
+def share_below(
+    least: float,
+    values: Float[Tensor, "row column c"],
+    sigma: Float[Tensor, "row column c"] | None,
+    usable: Bool[Tensor, "row column"],
+) -> float:
+    """Return the share of the usable pixels that are below the least value by more than their noise.
+
+    Parameters
+    ----------
+    least : what there can be without noise
+    values, sigma : the map of a view; where sigma is None, what neighbours tell of it is taken
+    usable : pixels to look at
+    """
+    if not bool(usable.any()):
+        return 0.0
+    noise = neighbour_noise(values, usable) if sigma is None else sigma[usable]
+    return float((values[usable] < least - IMPOSSIBLE * noise).float().mean())
+
+
+def neighbour_noise(values: Float[Tensor, "row column c"], usable: Bool[Tensor, "row column"]) -> float:
+    """Return the standard deviation of the noise by the median difference of neighbours along rows; 0 without any.
+
+        sigma = 1.4826 median |y_(i+1) - y_i| / sqrt(2)
+
+    It is too large where the map is steep in half of its pixels.
+    """
+    steps = values.diff(dim=1)[usable[:, 1:] & usable[:, :-1]]
+    return GAUSSIAN * float(steps.abs().median()) / 2**0.5 if len(steps) else 0.0
 
 
 @dataclass(frozen=True)

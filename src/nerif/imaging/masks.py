@@ -11,10 +11,9 @@ import torch
 from jaxtyping import Bool, Shaped
 
 from nerif.common.conventions import InputError, unit_shown
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Observation, integrals_of
 from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.open import open_frames
-from nerif.observation import Observation, integrals_of
 
 __all__ = ["MaskSettings", "drawn_masks", "flow_mask", "read_mask", "with_flow_masks"]
 

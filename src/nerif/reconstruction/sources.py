@@ -18,8 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement
-from nerif.observation import Observation
+from nerif.data.measurement import Measurement, Observation
 
 __all__ = ["SOURCES", "Stage", "check_source", "chosen_source", "of_source", "stages"]
 

@@ -15,9 +15,9 @@ import torch
 from nerif.common.conventions import with_unit
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
+from nerif.data.measurement import Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
-from nerif.observation import Observation
 from nerif.plotting.drawing import (
     DIVERGING,
     add_colour_bar,

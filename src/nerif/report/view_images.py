@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.common.conventions import unit_shown
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
-from nerif.observation import Observation
 from nerif.plotting.drawing import map_colours, map_range
 
 __all__ = ["Scale", "ViewImages", "colour_table", "lattice_step", "picture_address", "view_images"]

@@ -22,14 +22,13 @@ import torch
 
 from nerif.common.files import atomic, write_json
 from nerif.common.written_files import OwnFiles
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Observation
 from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
 from nerif.forward.base import ForwardModel
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box, Grid
-from nerif.observation import Observation
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.uncertainty.bootstrap import best_covered

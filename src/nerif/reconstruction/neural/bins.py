@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Observation
 from nerif.geometry import Box, Camera, Rays
-from nerif.observation import Observation
 
 __all__ = ["binned_rays", "coarsest_edge", "patches"]
 

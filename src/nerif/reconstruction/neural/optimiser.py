@@ -21,8 +21,7 @@ import math
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.fields.encoding import encoded_width
-from nerif.fields.network import Network, NetworkShape
+from nerif.fields.network import Network, NetworkShape, encoded_width
 from nerif.reconstruction.adam import Adam
 from nerif.reconstruction.muon import Muon
 from nerif.reconstruction.update import Update
