@@ -27,8 +27,8 @@ from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.fields.base import Field
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.imaging.assembly import Scene, Surroundings, join_views
 from nerif.imaging.displacement.displacement import DisplacementSettings, measure
+from nerif.imaging.measuring import Scene, Surroundings, join_views
 from nerif.imaging.patterns import Background
 from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
 

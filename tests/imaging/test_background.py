@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.imaging.patterns import KINDS, Background
-from nerif.imaging.printing import MARGIN, paper_for, print_pattern
+from nerif.imaging.patterns import KINDS, MARGIN, Background, paper_for, print_pattern
 
 
 @pytest.mark.parametrize("kind", KINDS)

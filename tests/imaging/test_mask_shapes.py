@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from nerif.common.conventions import InputError
-from nerif.imaging.mask_shapes import MaskShape, mask_of, write_masks
-from nerif.imaging.masks import drawn_masks, read_mask
+from nerif.imaging.masks import MaskShape, drawn_masks, mask_of, read_mask, write_masks
 
 SQUARE = MaskShape("polygon", ((4, 2), (11, 2), (11, 8), (4, 8)))
 

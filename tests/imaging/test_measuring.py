@@ -15,11 +15,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
-from nerif.imaging.assembly import Scene
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
-from nerif.imaging.measuring import Recording, RestingView, camera_of, measure_instant
+from nerif.imaging.measuring import Recording, RestingView, Scene, camera_of, measure_instant
 from nerif.imaging.over_time import RestingRecording, measure_recording
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View, find_views

@@ -14,10 +14,9 @@ from nerif.common.conventions import InputError
 from nerif.geometry import TELECENTRIC, Camera, Ring
 from nerif.imaging.calibration.bundle import _Layout
 from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_the_right_side, calibrate
-from nerif.imaging.calibration.first_guess import first_guess
+from nerif.imaging.calibration.first_guess import first_guess, mirrored
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
-from nerif.imaging.telecentric_guess import mirrored
 from nerif.simulation.experiment import side_of_one, world_axes
 
 TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)

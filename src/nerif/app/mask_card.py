@@ -19,8 +19,7 @@ from nerif.app.view_maps import magnitude_address, threshold_address
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.mask import Mask
 from nerif.data.measurement import Measurement
-from nerif.imaging.mask_shapes import write_masks
-from nerif.imaging.masks import MaskSettings
+from nerif.imaging.masks import MaskSettings, write_masks
 
 __all__ = ["MaskCard"]
 

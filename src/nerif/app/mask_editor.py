@@ -9,7 +9,7 @@ from nicegui import ui
 
 from nerif.app.mask_edits import MaskEdits
 from nerif.app.pieces import refusals
-from nerif.imaging.mask_shapes import MaskShape
+from nerif.imaging.masks import MaskShape
 
 __all__ = ["MaskEditor"]
 

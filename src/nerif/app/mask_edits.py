@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from nerif.imaging.mask_shapes import MaskShape
+from nerif.imaging.masks import MaskShape
 
 __all__ = ["MaskEdits"]
 

@@ -16,8 +16,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import from_dataset
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Camera, Lens
-from nerif.imaging.assembly import Scene, join_views
-from nerif.imaging.measuring import Recording, RestingView
+from nerif.imaging.measuring import Recording, RestingView, Scene, join_views
 from nerif.imaging.readers.views import View
 from nerif.imaging.workers import work
 

@@ -17,10 +17,9 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.forward.deflection import Deflection
 from nerif.geometry import Box
-from nerif.imaging.assembly import Scene, Surroundings
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
-from nerif.imaging.measuring import Recording, measure_instant
+from nerif.imaging.measuring import Recording, Scene, Surroundings, measure_instant
 from nerif.imaging.over_time import frame_numbers, instants_of, measure_recording
 from nerif.imaging.readers.views import find_views
 

@@ -14,8 +14,7 @@ from nerif.common.conventions import InputError
 from nerif.imaging import patterns as background
 from nerif.imaging.calibration import targets
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.imaging.patterns import Background
-from nerif.imaging.printing import paper_for, print_pattern
+from nerif.imaging.patterns import Background, paper_for, print_pattern
 
 __all__ = ["PrintBackground", "PrintTarget", "main", "run"]
 

@@ -18,11 +18,10 @@ from nerif.common.conventions import FACES, InputError
 from nerif.common.files import check_known
 from nerif.geometry import Projection, projection_named
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
-from nerif.imaging.calibration.first_guess import first_guess
+from nerif.imaging.calibration.first_guess import first_guess, mirrored
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, ViewPictures
 from nerif.imaging.readers.views import View, find_targets, pose_names
-from nerif.imaging.telecentric_guess import mirrored
 
 __all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_pictures"]
 
