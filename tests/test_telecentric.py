@@ -25,7 +25,7 @@ from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.physics.quantities import GasSettings, derive
-from nerif.reconstruction.fingerprint import _parts, digest
+from nerif.reconstruction.files import _parts, digest
 from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.neural.bins import binned_rays
 from nerif.reconstruction.voxels.operator import VoxelOperator

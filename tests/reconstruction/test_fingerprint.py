@@ -13,7 +13,7 @@ from nerif.fields.network import NetworkShape
 from nerif.forward.registry import technique
 from nerif.geometry import Box
 from nerif.reconstruction.base import Reconstructor, State
-from nerif.reconstruction.fingerprint import fingerprint
+from nerif.reconstruction.files import fingerprint
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.simulation.simulate import simulate

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.reconstruction.order import shuffled
+from nerif.reconstruction.neural.training_data import shuffled
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 17, 1024, 40_000])

@@ -18,9 +18,8 @@ from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid, Lens, paper_rig
 from nerif.geometry.symmetry import Symmetry
-from nerif.reconstruction.axis_search import find_axis
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import check_views, symmetry_asked
+from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_asked
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.layout import Symmetric
 from nerif.reconstruction.voxels.multiplicative import MLEM

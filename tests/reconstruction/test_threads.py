@@ -16,8 +16,8 @@ from nerif.common.pauses import at_pauses, pause
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
-from nerif.reconstruction import threads
-from nerif.reconstruction.threads import Cores, Used, free_threads
+from nerif.reconstruction import device as threads
+from nerif.reconstruction.device import Cores, Used, free_threads
 from nerif.simulation.simulate import view_displacement
 
 NUMBA_STARTS = """

@@ -33,7 +33,7 @@ from nerif.quick_views import (
     without_spikes,
 )
 from nerif.reconstruction.aperture import seen_through
-from nerif.reconstruction.threads import on_free_cores
+from nerif.reconstruction.device import on_free_cores
 from nerif.symptoms import looks, open_faces
 
 __all__ = ["Consistency", "ViewAgreement", "check_consistency"]

@@ -24,7 +24,7 @@ from nerif.forward.path_integral import LENS_RAYS, PathIntegral, Projector, proj
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
 from nerif.geometry import Box, Camera, Grid, Rays
-from nerif.reconstruction.threads import on_free_cores
+from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.voxels.operator import rays_through
 from nerif.reconstruction.voxels.symmetric_operator import seen_of
 

@@ -10,12 +10,12 @@ from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement
 from nerif.geometry.plausibility import rig_findings
 from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refined import MOVED, moved_lines
 from nerif.reconstruction.sources import of_source
-from nerif.reconstruction.threads import on_free_cores
 
 __all__ = ["RigCheck", "check_rig"]
 

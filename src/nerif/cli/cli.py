@@ -94,7 +94,7 @@ def _run(words: list[str]) -> int:
     try:
         command = importlib.import_module(ELSEWHERE.get(verb, f"nerif.commands.{verb}"))
         importlib.import_module("nerif.reconstruction.device").keep_freed_memory()
-        on_free_cores = importlib.import_module("nerif.reconstruction.threads").on_free_cores
+        on_free_cores = importlib.import_module("nerif.reconstruction.device").on_free_cores
         on_free_cores(command.main)(words[1:])
     except InputError as error:
         return _refuse(str(error))

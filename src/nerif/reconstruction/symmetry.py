@@ -1,4 +1,16 @@
-"""The symmetry that a reconstruction is asked for, about the axis that is named or found."""
+"""The symmetry that a reconstruction is asked for, about the axis that is named or found.
+
+Where the axis of a symmetric flow is: found together with the field, on a coarse grid, held by what is known of it.
+
+    min  |A(t) c - y|^2 / sigma^2 + weight |L c|^2 + |t / t_sigma|^2,     t = (shift, lean) towards e1 and e2
+
+by Gauss-Newton steps in coefficients and axis at once, so that the field follows. With N the normal matrix,
+covariance of t = (N_tt - N_tc N_cc^-1 N_ct)^-1.
+
+What is left of a picture by a field about a wrong axis is odd where the field is even, so the shift and the lean in the
+picture are found within a few steps. e1 is turned across the way the cameras look. Where they all look along e2, shift
+and lean towards them change the picture by no more than a field somewhat different does, and stay as they are given.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +19,144 @@ from dataclasses import replace
 from typing import TypeVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry.symmetry import Axis, Symmetry, parse_symmetry
-from nerif.reconstruction.axis_search import find_axis
 from nerif.reconstruction.gauge import ambient_faces
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels.layout import Symmetric
+from nerif.reconstruction.voxels.levels import bins_of
+from nerif.reconstruction.voxels.problem import Penalty, Problem
+from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
-__all__ = ["axis_of", "check_views", "symmetry_asked", "with_axis"]
+__all__ = ["axis_of", "check_views", "find_axis", "symmetry_asked", "with_axis"]
+
+VOXELS = 40  # along the longest edge of the box
+MOST_RAYS = 6000  # by which it is found
+STEPS = 12
+ENOUGH = 0.02  # standard deviations, of a last step
+WEIGHT = 1e-4  # of the penalty: far below what keeps noise out, so that it pulls at no axis
+NUDGE = 1e-3  # of the longest edge of the box, for differences
+ACROSS = math.sin(math.radians(15)) ** 2  # mean square of a direction's share across the views, from which they tell it
+
+
+def find_axis(
+    measurement: Measurement, symmetry: Symmetry, sigma: tuple[float, float], faces: tuple[str, ...],
+    open_faces: tuple[str, ...] = (),
+) -> Axis:  # fmt: skip
+    """Find the axis of a flow near the one given.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    symmetry : about the axis as it is named
+    sigma : standard deviations of its place (mm) and of its direction (rad) to each side; 0 for what is certain
+    faces : of the box on which the field is ambient
+    open_faces : whose rays are left out
+    """
+    symmetry, across = _across(measurement, symmetry)
+    before = (sigma[0], sigma[0], sigma[1], sigma[1])
+    refined = [i for i, s in enumerate(before) if s > 0 and across[i % 2] > ACROSS]
+    still = replace(symmetry, harmonics=0)
+    values = torch.zeros(4, dtype=torch.float64)
+    if not refined:
+        return Axis(symmetry, tuple(values.tolist()), before, before, math.nan)
+    layout = Symmetric(measurement.box, faces, "cubic", still)
+    grid = layout.grid(VOXELS)
+    target = Target.of(measurement, open_faces, bins_of(measurement, grid), linear=True).without_outliers().to("cpu")
+    if len(target) > MOST_RAYS:
+        chosen = torch.randperm(len(target), generator=torch.Generator().manual_seed(0))[:MOST_RAYS]
+        target = target[chosen]
+    scales = torch.tensor([before[i] for i in refined], dtype=torch.float64)
+    edge = max(measurement.box.edges)
+    nudges = torch.tensor([NUDGE * edge] * 2 + [NUDGE] * 2, dtype=torch.float64)
+    penalty: Tensor | None = None
+
+    def about(v: Float[Tensor, " 4"]) -> Symmetry:
+        a, b, c, d = v.tolist()
+        return still.moved((a, b), (c, d))
+
+    def operators(v: Float[Tensor, " 4"]) -> list[SymmetricOperator]:
+        moved = about(v)
+        return [
+            SymmetricOperator(moved, p.rays, grid, p.model, "cubic", layout.boundary, dtype=torch.float64)
+            for p in target.parts
+        ]
+
+    def seen(v: Float[Tensor, " 4"], c: Tensor) -> Tensor:
+        x = c.reshape(grid.shape)
+        each = [o(x) * p.inverse_scale for o, p in zip(operators(v), target.parts, strict=True)]
+        return torch.cat([e.flatten() for e in each]).double()
+
+    data = torch.cat([(p.of_field * p.inverse_scale).flatten() for p in target.parts]).double()
+    c = torch.zeros(math.prod(grid.shape), dtype=torch.float64)
+    for _ in range(STEPS):
+        here = operators(values)
+        if penalty is None:
+            problem = Problem(here, target)
+            penalty = _squares(Penalty(problem, "gradient")) / target.scale**2 * WEIGHT * target.numbers
+        rows = torch.cat(
+            [
+                (o.matrix() * p.inverse_scale[..., None]).flatten(0, 1).double()
+                for o, p in zip(here, target.parts, strict=True)
+            ]
+        )
+        normal = rows.T @ rows + penalty
+        factor = torch.linalg.cholesky(normal + 1e-12 * normal.diagonal().mean() * torch.eye(len(normal)))
+        c = torch.cholesky_solve((rows.T @ data)[:, None], factor)[:, 0]
+        left = data - rows @ c
+        columns = []
+        for i in refined:
+            nudge = torch.zeros(4, dtype=torch.float64)
+            nudge[i] = nudges[i]
+            columns.append((seen(values + nudge, c) - seen(values - nudge, c)) / (2 * nudges[i]))
+        slopes = torch.stack(columns, dim=1) * scales
+        aside = slopes - rows @ torch.cholesky_solve(rows.T @ slopes, factor)
+        # one over the square of the noise in these units; what is left beside it counts as noise as well
+        level = float(left.square().mean())
+        noise = max(1 / target.chi_square if target.sigma_known else 0.0, level)
+        curvature = slopes.T @ aside / noise + torch.eye(len(refined))
+        pull = aside.T @ left / noise - values[refined] / scales
+        step = torch.linalg.solve(curvature, pull)
+        values[refined] += step * scales
+        after = torch.linalg.inv(curvature).diagonal().sqrt()
+        if bool((step.abs() < ENOUGH * after).all()):
+            break
+    sigma_after = torch.tensor(before, dtype=torch.float64)
+    sigma_after[refined] = after * scales
+    found = replace(about(values), harmonics=symmetry.harmonics)
+    unit = math.sqrt(target.chi_square) if target.sigma_known else 1.0
+    return Axis(found, tuple(values.tolist()), before, tuple(sigma_after.tolist()), math.sqrt(level) * unit)
+
+
+def _across(measurement: Measurement, symmetry: Symmetry) -> tuple[Symmetry, tuple[float, float]]:
+    """The symmetry with e1 across the views, and how much of e1 and e2 is across them, mean square."""
+    frame = symmetry.matrix
+    looks = torch.stack([camera.rotation[2].double() for camera in measurement.cameras]) @ frame[:2].T
+    looks = looks / looks.norm(dim=1, keepdim=True).clamp_min(1e-9)
+    shares, ways = torch.linalg.eigh(looks.T @ looks / len(looks))  # e1 is looked along least
+    e1 = ways[:, 0] @ frame[:2]
+    e1 = e1 * torch.sign(e1[e1.abs().argmax()])
+    rows = torch.stack([e1, torch.linalg.cross(frame[2], e1), frame[2]]).tolist()
+    return replace(symmetry, frame=tuple((a, b, c) for a, b, c in rows)), (1 - float(shares[0]), 1 - float(shares[1]))
+
+
+def _squares(penalty: Penalty) -> Float[Tensor, "m m"]:
+    """L^T L as a matrix."""
+    problem = penalty.problem
+    rows = torch.empty(problem.voxels, problem.voxels, dtype=torch.float64)
+    one = problem.zero()
+    for i in range(problem.voxels):
+        one.view(-1)[i] = 1
+        rows[i] = penalty.adjoint(penalty(one)).flatten()
+        one.view(-1)[i] = 0
+    return rows
+
 
 Asked = TypeVar("Asked", bound=SharedSettings)
 

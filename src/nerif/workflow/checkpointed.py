@@ -12,8 +12,7 @@ from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step, compose
-from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, write_state
-from nerif.reconstruction.fingerprint import fingerprint
+from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, fingerprint, write_state
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.results.directory import ResultDirectory
 

@@ -25,6 +25,7 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_camer
 from nerif.physics.quantities import NOT_UNIFORM, GasSettings, masked_lines
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step, compose
+from nerif.reconstruction.device import Cores
 from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
@@ -36,7 +37,6 @@ from nerif.reconstruction.rig.refit import refit
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
-from nerif.reconstruction.threads import Cores
 from nerif.reconstruction.uncertainty.bootstrap import Trials
 from nerif.reconstruction.uncertainty.ensemble import Ensemble
 from nerif.reconstruction.uncertainty.repetition import Repetitions

@@ -24,7 +24,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from nerif.fields.network import Network
-from nerif.reconstruction.threads import share_threads
+from nerif.reconstruction.device import share_threads
 
 __all__ = ["value_and_gradient"]
 

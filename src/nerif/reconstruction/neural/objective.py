@@ -19,8 +19,7 @@ from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.sampling import SamplingDensity, sample_count, sample_rays
 from nerif.reconstruction.neural.settings import TrainingSettings
-from nerif.reconstruction.neural.training_data import TrainingData
-from nerif.reconstruction.order import shuffled
+from nerif.reconstruction.neural.training_data import TrainingData, shuffled
 from nerif.reconstruction.rig.refinement import MOMENTUM
 from nerif.reconstruction.target import Part
 

@@ -12,21 +12,131 @@ a share of it, such that a step changes what a layer gives as much as in the ref
 
 Source: Kingma & Ba, Adam, ICLR (2015); Yang et al., Tensor Programs V, arXiv:2203.03466 (2022), for Adam; Yang, Simon &
 Bernstein, A spectral condition for feature learning, arXiv:2310.17813 (2023), for Muon.
+
+How weights are moved along their gradients: what Adam (adam.py) and Muon (muon.py) have in common.
+
+PyTorch's own optimisers import its compiler when they are made, which takes two seconds; their arithmetic does not.
+
+Adam: steps along the mean of the gradient over the root of its mean square, by PyTorch's arithmetic.
+
+    m <- b1 m + (1 - b1) g,    v <- b2 v + (1 - b2) g^2,    w <- w - rate m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + 1e-8)
+
+Source: Kingma & Ba, Adam, ICLR (2015).
+
+Muon: steps along the orthogonal matrix nearest to the momentum of the gradient.
+
+    B <- mu B + (1 - mu) G,      U S V^T = mu B + (1 - mu) G,      W <- W - rate U V^T
+
+U V^T comes from five steps of a Newton-Schulz iteration of fifth order, which leave its singular values in 0.7 to 1.2.
+On a CPU they are in float32: without AVX512-BF16, products in bf16 take 14 to 40 times as long.
+
+Source: Jordan et al., Muon (2024), kellerjordan.github.io/posts/muon.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 
+import torch
+from jaxtyping import Float
 from torch import Tensor
+from torch.optim.adam import adam
 
 from nerif.common.conventions import InputError
 from nerif.fields.network import Network, NetworkShape, encoded_width
-from nerif.reconstruction.adam import Adam
-from nerif.reconstruction.muon import Muon
-from nerif.reconstruction.update import Update
 
-__all__ = ["OPTIMISERS", "NetworkOptimiser"]
+__all__ = ["OPTIMISERS", "Adam", "Muon", "NetworkOptimiser", "Update"]
+
+NEWTON_SCHULZ = 5
+A, B, C = 3.4445, -4.7750, 2.0315  # of the polynomial a s + b s^3 + c s^5 of the singular values
+
+
+class Muon(Update):
+    """Muon for weight matrices.
+
+    Parameters
+    ----------
+    weights, shares : see Update
+    momentum : mu
+    """
+
+    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], momentum: float) -> None:
+        super().__init__(weights, shares)
+        self.momentum = momentum
+
+    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
+        if not memory:
+            memory["momentum_buffer"] = torch.zeros_like(weight)
+        kept = memory["momentum_buffer"]
+        kept.lerp_(gradient, 1 - self.momentum)
+        weight.add_(orthogonal(gradient.lerp(kept, self.momentum)).to(weight), alpha=-rate)
+
+
+def orthogonal(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
+    """Return nearly U V^T, where U S V^T is the matrix."""
+    wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
+    x = wide.bfloat16() if matrix.is_cuda else wide.float()
+    x = x / x.norm().clamp_min(1e-7)
+    for _ in range(NEWTON_SCHULZ):
+        gram = x @ x.T
+        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=B, alpha=C), x, beta=A)
+    return x if wide is matrix else x.T
+
+
+class Adam(Update):
+    """Adam.
+
+    Parameters
+    ----------
+    weights, shares : see Update
+    betas : decay rates b1 and b2
+    """
+
+    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], betas: tuple[float, float]) -> None:
+        super().__init__(weights, shares)
+        self.betas = betas
+
+    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
+        if not memory:
+            memory |= {"step": torch.tensor(0.0), "exp_avg": torch.zeros_like(weight)}
+            memory["exp_avg_sq"] = torch.zeros_like(weight)
+        adam(
+            [weight], [gradient], [memory["exp_avg"]], [memory["exp_avg_sq"]], [], [memory["step"]], amsgrad=False,
+            beta1=self.betas[0], beta2=self.betas[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
+        )  # fmt: skip
+
+
+class Update(ABC):
+    """A rule that moves weights, with a memory of each.
+
+    Parameters
+    ----------
+    weights : to move
+    shares : of the rate of a step, one for each
+    """
+
+    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float]) -> None:
+        self.weights, self.shares = list(weights), list(shares)
+        self.memory: list[dict[str, Tensor]] = [{} for _ in self.weights]
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for weight in self.weights:
+            weight.grad = None
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """Move all weights that have a gradient."""
+        for weight, share, memory in zip(self.weights, self.shares, self.memory, strict=True):
+            if weight.grad is not None:
+                self.move(weight, weight.grad, memory, rate * share)
+
+    @abstractmethod
+    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
+        """Move one weight in place, and remember what the next step asks for; the memory is empty at first."""
+
 
 OPTIMISERS = ("muon", "adam")
 REFERENCE = NetworkShape(width=128, directions=3)

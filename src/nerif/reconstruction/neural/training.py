@@ -24,8 +24,8 @@ from nerif.fields.base import Field
 from nerif.fields.network import UNBOUNDED
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import check_resumed
-from nerif.reconstruction.device import float32_products, peak_memory
-from nerif.reconstruction.fingerprint import check_fingerprint
+from nerif.reconstruction.device import Cores, float32_products, peak_memory
+from nerif.reconstruction.files import check_fingerprint
 from nerif.reconstruction.neural.losses import DATA
 from nerif.reconstruction.neural.objective import Objective, Piece
 from nerif.reconstruction.neural.optimiser import NetworkOptimiser
@@ -33,11 +33,9 @@ from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.schedule import Budget
 from nerif.reconstruction.neural.settings import TrainingSettings
-from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.neural.training_data import TrainingData, shuffled
 from nerif.reconstruction.neural.warm_start import adopt, fit_network
 from nerif.reconstruction.neural.watch import Watch
-from nerif.reconstruction.order import shuffled
-from nerif.reconstruction.threads import Cores
 
 __all__ = ["Training"]
 

@@ -16,8 +16,8 @@ from torch import nn
 from nerif.fields.base import Field
 from nerif.fields.network import UNBOUNDED, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
-from nerif.reconstruction.adam import Adam
 from nerif.reconstruction.neural.losses import Evaluator
+from nerif.reconstruction.neural.optimiser import Adam
 
 __all__ = ["adopt", "fit_network"]
 

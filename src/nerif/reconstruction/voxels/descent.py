@@ -28,8 +28,8 @@ from nerif.geometry import Rays
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds
-from nerif.reconstruction.device import available_memory, peak_memory, resolve_device
-from nerif.reconstruction.fingerprint import check_fingerprint, fingerprint
+from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
+from nerif.reconstruction.files import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import ambient_faces, check_gauge
 from nerif.reconstruction.neural.some_pixels import some_pixels
 from nerif.reconstruction.rig.refined import kept_of, take_up
@@ -37,7 +37,6 @@ from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, drawn
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target
-from nerif.reconstruction.threads import Cores
 from nerif.reconstruction.voxels.layout import layout_of
 from nerif.reconstruction.voxels.levels import Level, coarser, levels
 from nerif.reconstruction.voxels.problem import Iterate, Problem

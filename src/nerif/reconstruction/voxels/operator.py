@@ -14,7 +14,7 @@ from nerif.common.conventions import InputError
 from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.forward.base import ForwardModel
 from nerif.geometry import Grid, Rays
-from nerif.reconstruction.threads import share_threads
+from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.voxels.planes import Bundle
 
 __all__ = ["STEPS", "VoxelOperator", "check_step", "made_of", "operator_norm", "rays_through"]

@@ -15,7 +15,7 @@ from nerif.fields.symmetric import SymmetricVoxels
 from nerif.forward.base import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.geometry.symmetry import Symmetry
-from nerif.reconstruction.threads import share_threads
+from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.voxels.operator import VoxelOperator, made_of
 from nerif.reconstruction.voxels.planes import is_even, tabulated
 

@@ -25,7 +25,7 @@ from nerif.geometry import Rays
 from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.bounds import in_units
 from nerif.reconstruction.device import resolve_device
-from nerif.reconstruction.fingerprint import digest
+from nerif.reconstruction.files import digest
 from nerif.reconstruction.neural.settings import TrainingSettings
 from nerif.reconstruction.neural.training import LEVEL_POINTS
 from nerif.reconstruction.neural.training_data import FrameData, TrainingData
