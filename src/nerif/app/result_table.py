@@ -13,11 +13,10 @@ from nerif.analysis.verdict import verdict
 from nerif.app.project import Contents, Project
 from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.glance import glance
 from nerif.reconstruction.files import FIELD
 from nerif.report.movie import frames_there
 from nerif.report.summary import trust_figures
-from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result
+from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, glance
 
 __all__ = ["Row", "result_table", "rows_of"]
 

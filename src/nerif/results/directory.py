@@ -1,4 +1,7 @@
-"""A result directory: the names of its files, how each is written and read, and what is told where one is missing."""
+"""A result directory: the names of its files, how each is written and read, and what is told where one is missing.
+
+A quick look at a result directory, for a list of many.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +34,18 @@ from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
 
 __all__ = [
-    "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Missing", "Result", "ResultDirectory", "versions",
-]  # fmt: skip
+    "CALIBRATION",
+    "FIGURES",
+    "METRICS",
+    "REPORT",
+    "RUN",
+    "VOLUME",
+    "Missing",
+    "Result",
+    "ResultDirectory",
+    "glance",
+    "versions",
+]
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
@@ -418,3 +431,31 @@ def _number(text: str | None) -> float:
         return float(text) if text else math.nan
     except ValueError:
         return math.nan
+
+
+def glance(path: str | os.PathLike[str]) -> Result:
+    """Return what a verdict rests on: settings, figures, and the volumes where there are standard deviations.
+
+    Views and curves are left out, which makes it quick; what cannot be read is told in the Result.
+    """
+    directory, missing = ResultDirectory(path), []
+    run: dict[str, Any] = {}
+    metrics: dict[str, Any] = {}
+    volumes: dict[str, Volume] = {}
+    try:
+        run = directory.settings()
+        metrics = directory.metrics() if directory.has(METRICS) else {}
+        if {"uncertainty", "ensemble"} & set(metrics) and directory.has(VOLUME):
+            volumes = directory.volumes()
+    except UNREADABLE as error:
+        missing.append(Missing(RUN, " ".join(str(error).split())))
+    if not directory.has(FIELD):
+        missing.append(Missing(FIELD, f"The run has not ended: there is no {FIELD}."))
+    return Result(
+        directory=directory.path,
+        settings={k: v for k, v in run.items() if k != "about"},
+        about=run.get("about", {}),
+        metrics=metrics,
+        volumes=volumes,
+        missing=tuple(missing),
+    )
