@@ -8,14 +8,12 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from nerif.analysis.consistency import check_consistency
+from nerif.analysis.consistency import binned, check_consistency, fit, open_faces, without_spikes
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring, paper_rig
-from nerif.quick_views import binned, fit, without_spikes
 from nerif.simulation.simulate import simulate
-from nerif.symptoms import open_faces
 
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))
 

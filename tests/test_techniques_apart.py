@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerif.analysis.consistency import binned, open_faces
 from nerif.analysis.evaluation import evaluate
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import predict
@@ -19,11 +20,9 @@ from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.absorption import Absorption
 from nerif.forward.emission import Emission
 from nerif.geometry import Box, Ring
-from nerif.quick_views import binned
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import REPROJECTION, ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
-from nerif.symptoms import open_faces
 from nerif.workflow.pipeline import Run, reconstruct_into
 
 RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)

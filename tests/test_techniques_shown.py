@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from nerif.analysis.consistency import everywhere, looks, of_one_view
 from nerif.analysis.evaluation import score_lines
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
@@ -19,14 +20,12 @@ from nerif.data.volume import INDEX, Volume, field_of
 from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid
-from nerif.mistakes import everywhere, of_one_view
 from nerif.physics.quantities import GasSettings
 from nerif.plotting import drawing
 from nerif.report import packing
 from nerif.report.pages import error_of, figures_of, residuals_over_sigma, view
 from nerif.report.view_images import view_images
 from nerif.results.directory import ResultDirectory
-from nerif.symptoms import looks
 from nerif.workflow.sequence.plan import SequenceSettings
 
 RIG = ["--image-size", "14", "17", "--pixel-pitch", "0.26", "--views", "3", "--steps", "20", "--truth-voxels", "8"]

@@ -8,15 +8,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerif.analysis.consistency import check_consistency
+from nerif.analysis.consistency import (
+    Change,
+    Correction,
+    check_consistency,
+    compare,
+    of_one_view,
+    orders,
+    predicted_by_others,
+)
 from nerif.analysis.residuals import CAUSES
 from nerif.analysis.unrelated_views import repeatable, unrelated, unrelated_finding
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring
-from nerif.mistakes import Change, Correction, of_one_view, orders
-from nerif.quick_views import compare, predicted_by_others
 from nerif.simulation.simulate import simulate
 
 BOX = Box.cube(50.0)

@@ -14,12 +14,11 @@ from dataclasses import replace
 
 import torch
 
+from nerif.analysis.consistency import compare, orders, predicted_by_others, values_of, with_values
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement
 from nerif.geometry.plausibility import suspects
-from nerif.mistakes import orders
-from nerif.quick_views import compare, predicted_by_others, values_of, with_values
 
 __all__ = ["NOISY", "repeatable", "unrelated", "unrelated_finding"]
 

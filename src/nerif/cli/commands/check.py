@@ -8,12 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from nerif.analysis.consistency import Consistency, check_consistency
+from nerif.analysis.consistency import Consistency, check_consistency, corrected
 from nerif.analysis.rig_check import RigCheck, check_rig
 from nerif.cli.commands.output import MONITOR, check_file, counting_bar, say
 from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
-from nerif.corrected import corrected
 from nerif.data.measurement import Measurement
 
 __all__ = ["Check", "main", "run"]
