@@ -18,8 +18,6 @@ from torch import Tensor
 from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces, unit_shown
 from nerif.common.files import atomic
 from nerif.common.netcdf import opened
-from nerif.data import measurement_file
-from nerif.data.measurement_summary import as_html, summary
 from nerif.forward.base import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
@@ -511,19 +509,25 @@ class Measurement:
 
     def summary(self, held_out: int = 0) -> list[tuple[str, str]]:
         """Return what was measured as names and values with units; `held_out` of the views were not used."""
+        from nerif.data.measurement_summary import summary
+
         return summary(self, held_out)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the maps of the views, and the summary."""
+        from nerif.data.measurement_summary import as_html
+
         return as_html(self)
 
     # -- files ---------------------------------------------------------------------------------------------------
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file of docs/formats.md, atomically."""
+        from nerif.data.measurement_file import encoding
+
         dataset = self.to_dataset()
         with atomic(path) as part:
-            dataset.to_netcdf(part, engine="h5netcdf", encoding=measurement_file.encoding(dataset))
+            dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding(dataset))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Measurement:
@@ -534,12 +538,16 @@ class Measurement:
         InputError
             If the file is missing, foreign, truncated, or breaks the contract; the message names the variable.
         """
-        with opened(path, f"a measurement (NetCDF-4, {measurement_file.CONVENTIONS})") as dataset:
+        from nerif.data.measurement_file import CONVENTIONS
+
+        with opened(path, f"a measurement (NetCDF-4, {CONVENTIONS})") as dataset:
             return cls.from_dataset(dataset)
 
     def to_dataset(self) -> xr.Dataset:
         """Return the variables and attributes of the file."""
-        return measurement_file.to_dataset(self)
+        from nerif.data.measurement_file import to_dataset
+
+        return to_dataset(self)
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> Measurement:
@@ -550,7 +558,9 @@ class Measurement:
         InputError
             If they break the contract; the message names the variable.
         """
-        return cls(**measurement_file.from_dataset(dataset))
+        from nerif.data.measurement_file import from_dataset
+
+        return cls(**from_dataset(dataset))
 
 
 def measurement_of(

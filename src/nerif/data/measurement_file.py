@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
 from nerif.common.netcdf import reading, values
+from nerif.data.measurement import Measurement
 from nerif.forward.base import ForwardModel
 from nerif.forward.deflection import Deflection
 from nerif.forward.registry import TECHNIQUES, technique
@@ -22,8 +23,6 @@ from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, pr
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from nerif.data.measurement import Measurement
 
 __all__ = [
     "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "known_conventions", "map_names", "to_dataset", "variables",

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
 from nerif.common.conventions import with_unit
-from nerif.data.measurement import Observation
+from nerif.data.measurement import Measurement, Observation
 from nerif.forward.deflection import Deflection
 from nerif.plotting.notebook import PIXELS, number, panel, show_views
-
-if TYPE_CHECKING:
-    from nerif.data.measurement import Measurement
 
 __all__ = ["as_html", "summary"]
 

@@ -49,6 +49,36 @@ from nerif.fields.network import Network, NetworkShape, encoded_width
 
 __all__ = ["OPTIMISERS", "Adam", "Muon", "NetworkOptimiser", "Update"]
 
+class Update(ABC):
+    """A rule that moves weights, with a memory of each.
+
+    Parameters
+    ----------
+    weights : to move
+    shares : of the rate of a step, one for each
+    """
+
+    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float]) -> None:
+        self.weights, self.shares = list(weights), list(shares)
+        self.memory: list[dict[str, Tensor]] = [{} for _ in self.weights]
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for weight in self.weights:
+            weight.grad = None
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """Move all weights that have a gradient."""
+        for weight, share, memory in zip(self.weights, self.shares, self.memory, strict=True):
+            if weight.grad is not None:
+                self.move(weight, weight.grad, memory, rate * share)
+
+    @abstractmethod
+    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
+        """Move one weight in place, and remember what the next step asks for; the memory is empty at first."""
+
+
 NEWTON_SCHULZ = 5
 A, B, C = 3.4445, -4.7750, 2.0315  # of the polynomial a s + b s^3 + c s^5 of the singular values
 
@@ -106,36 +136,6 @@ class Adam(Update):
             [weight], [gradient], [memory["exp_avg"]], [memory["exp_avg_sq"]], [], [memory["step"]], amsgrad=False,
             beta1=self.betas[0], beta2=self.betas[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
         )  # fmt: skip
-
-
-class Update(ABC):
-    """A rule that moves weights, with a memory of each.
-
-    Parameters
-    ----------
-    weights : to move
-    shares : of the rate of a step, one for each
-    """
-
-    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float]) -> None:
-        self.weights, self.shares = list(weights), list(shares)
-        self.memory: list[dict[str, Tensor]] = [{} for _ in self.weights]
-
-    def zero_grad(self) -> None:
-        """Forget the gradients."""
-        for weight in self.weights:
-            weight.grad = None
-
-    @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """Move all weights that have a gradient."""
-        for weight, share, memory in zip(self.weights, self.shares, self.memory, strict=True):
-            if weight.grad is not None:
-                self.move(weight, weight.grad, memory, rate * share)
-
-    @abstractmethod
-    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        """Move one weight in place, and remember what the next step asks for; the memory is empty at first."""
 
 
 OPTIMISERS = ("muon", "adam")
