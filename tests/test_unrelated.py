@@ -16,9 +16,11 @@ from nerif.analysis.consistency import (
     of_one_view,
     orders,
     predicted_by_others,
+    repeatable,
+    unrelated,
+    unrelated_finding,
 )
 from nerif.analysis.residuals import CAUSES
-from nerif.analysis.unrelated_views import repeatable, unrelated, unrelated_finding
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
