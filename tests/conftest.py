@@ -21,27 +21,13 @@ import pytest
 import torch
 from jaxtyping import install_import_hook
 
-CHECKED = ("conventions", "geometry", "measurement", "volume", "vti", "fields", "physics", "metrics", "simulation")
-CHECKED += (
-    "reprojection",
-    "evaluation",
-    "report",
-    "imaging",
-    "rendering",
-    "experiment",
-    "consistency",
-    "mistakes",
-    "quick_views",
-    "symptoms",
-    "resolution",
-    "measurement_sequence",
-    "volume_sequence",
-    "sequence",
-)
-# what Numba compiles stays as it is written; budget and watch hold no array, and are asked many times a step
-UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "budget", "watch")
-SOLVERS = Path(__file__).parents[1] / "src" / "nerif" / "reconstruction"
-CHECKED += tuple(f"reconstruction.{p.stem}" for p in SOLVERS.glob("[!_]*.py") if p.stem not in UNCHECKED)
+CHECKED = ("common.conventions", "geometry", "fields", "data", "physics", "imaging", "simulation", "analysis", "report")
+CHECKED += ("forward.path_integral", "forward.ray_tracing", "workflow.sequence")
+# what Numba compiles stays as it is written; schedule and watch hold no array, and are asked many times a step
+UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "schedule", "watch")
+SOURCE = Path(__file__).parents[1] / "src" / "nerif"
+SOLVERS = [p for p in (SOURCE / "reconstruction").rglob("[!_]*.py") if p.stem not in UNCHECKED]
+CHECKED += tuple(".".join(p.relative_to(SOURCE).with_suffix("").parts) for p in SOLVERS)
 # shapes in annotations are checked on every call; the hook must be there before nerif is imported
 install_import_hook([f"nerif.{part}" for part in CHECKED], "typecheck.check")
 
