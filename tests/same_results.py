@@ -56,11 +56,12 @@ def commands(folder: Path) -> list[list[str]]:
 def run(source: Path, folder: Path) -> None:
     """Make all measurements and reconstructions with the package in `source`."""
     folder.mkdir()
-    threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")}
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     environment = os.environ | threads | {name: str(folder / to) for name, to in WRITTEN.items()}
     environment["PYTHONPATH"] = str(source)
     for arguments in commands(folder):
-        done = subprocess.run([sys.executable, "-m", "nerif", *arguments], env=environment, capture_output=True, text=True)
+        command = [sys.executable, "-m", "nerif", *arguments]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
         if done.returncode:
             sys.exit(f"{source}: nerif {' '.join(arguments)}\n{done.stderr}")
 
