@@ -98,6 +98,7 @@ def test_truth_is_beside_the_pictures(experiment):
     assert read_volume(experiment / "pictures" / "truth" / "volume.nc").values.shape == (20, 20, 20)
 
 
+@pytest.mark.slow
 def test_field_from_pictures_alone_is_that_which_was_rendered(experiment):
     """Four views are few; examples/from_images.py does nine (test_examples.py, slow)."""
     words = ["reconstruct", str(experiment / "m.nc"), "-o", str(experiment / "r"), "--method", "tikhonov"]

@@ -111,6 +111,7 @@ def test_links_of_a_page_lead_somewhere_on_a_forge_too(page: str) -> None:
             assert not file or (ROOT / "docs" / file).exists(), link
 
 
+@pytest.mark.slow
 def test_the_page_of_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every block in order, in one namespace, as in a notebook."""
     page = (ROOT / "docs" / "python.md").read_text()

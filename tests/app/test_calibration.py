@@ -65,6 +65,7 @@ def test_settings_beside_the_pictures_are_the_defaults():
     assert {"distance", "background_distance"} <= {f.name for f in form_of(True).fields}
 
 
+@pytest.mark.slow
 @needs_browser
 def test_corners_are_found_and_a_picture_is_left_out_by_a_click(browser, server):
     visit(browser, server)

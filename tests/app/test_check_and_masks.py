@@ -101,6 +101,7 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     assert errors(browser) == []
 
 
+@pytest.mark.slow
 def test_what_is_typed_for_a_run_survives_a_reload(browser, server):
     opened(browser, server, "check", LINE)
     put(browser, "voxels", "16")

@@ -92,6 +92,7 @@ def test_a_single_pixel_is_held_back_of_a_few_and_none_of_single_ones(measuremen
     assert torch.equal(rest.usable.flatten(1).sum(dim=1), torch.ones(len(measurement.names), dtype=torch.long))
 
 
+@pytest.mark.slow
 def test_a_run_without_a_limit_converges_and_goes_on_where_it_was(measurement, ball, tmp_path, monkeypatch):
     monkeypatch.setattr(convergence, "MOST", 3)
     measurement, states = add_noise(measurement, 0.3, seed=3), {}
@@ -134,6 +135,7 @@ def test_more_time_goes_on_with_the_next_cycle(measurement):
     assert first["step"] == 30
 
 
+@pytest.mark.slow
 def test_the_best_cycle_is_kept_with_the_rig_it_had(measurement, monkeypatch):
     errors, rigs = itertools.chain([2.0], itertools.repeat(3.0)), []
     monkeypatch.setattr(objective.Objective, "held_back", lambda self: next(errors))

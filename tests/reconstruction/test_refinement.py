@@ -137,6 +137,7 @@ def test_what_is_not_told_stays_at_the_prior(measured):
     assert float(refinement.values.abs().max()) == 0
 
 
+@pytest.mark.slow
 def test_nothing_is_moved_before_the_data_show_that_the_rig_is_off(measured):
     right = Refinement.asked(measured, ["cameras"])
     wrong = Refinement.asked(spoiled(measured)[0], ["cameras", "shift"], 0.5, 0.03, 0.03)

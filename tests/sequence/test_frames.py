@@ -64,6 +64,7 @@ def test_every_frame_is_written_with_what_it_came_from(undisturbed):
     assert "5 of 5 frames done" in outcome_table(store)
 
 
+@pytest.mark.slow
 def test_frames_of_a_symmetric_film_share_an_axis_and_are_read_back_as_they_were(short, tmp_path):
     settings = SequenceSettings(warm_steps=3, voxels=8, quantities=("index_excess",))
     cold = replace(COLD, symmetry="axis+1", max_steps=5)

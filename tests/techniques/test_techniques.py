@@ -111,6 +111,7 @@ class Knife(ForwardModel):
         return Weights(torch.exp(-depth) * step, value=value, slope=slope)
 
 
+@pytest.mark.slow
 def test_a_technique_of_ones_own_runs_through_everything(balls, monkeypatch, tmp_path):
     monkeypatch.setitem(registry.TECHNIQUES, "knife", Knife)
     field = Scaled(balls, 1e-3)
