@@ -1,5 +1,5 @@
 # make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo (two minutes)
-# make test   set up, run the tests, lint and types among them (five minutes on 2 cores; make test-all: the long ones too)
+# make test   set up, run the tests, with lint, types and the order of the rooms beside them (make test-all: the long ones too)
 # make app    set up, and work on out/demo (make demo) in the browser
 # make docs   the documentation site: open docs/_build/html/index.html
 # make study  the paper's numerical study (hours; benchmarks/study): out/study; make study-quick: a small one, out/study-quick
@@ -8,7 +8,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo app test test-all lint docs study study-quick clean
+.PHONY: demo app test test-all short-tests all-tests lint docs study study-quick clean
 
 demo: .venv/.run
 	$(BIN)/nerif demo --out out/demo --force
@@ -18,13 +18,20 @@ app: .venv/.app
 	$(BIN)/nerif app out/demo
 
 test: .venv/.dev
-	$(PYTEST) -m "not slow"
+	$(MAKE) --no-print-directory --keep-going --jobs 2 lint short-tests
 
 test-all: .venv/.dev
+	$(MAKE) --no-print-directory --keep-going --jobs 2 lint all-tests
+
+short-tests: .venv/.dev
+	$(PYTEST) -m "not slow"
+
+all-tests: .venv/.dev
 	$(PYTEST)
 
 lint: .venv/.dev
 	$(BIN)/ruff check .
+	$(BIN)/lint-imports
 	$(BIN)/mypy
 
 docs: .venv/.dev

@@ -22,8 +22,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
-from nerif.geometry import Box, Camera, Grid, Lens, Ring
 from nerif.forward.images import References
+from nerif.geometry import Box, Camera, Grid, Lens, Ring
 
 __all__ = ["DRAWINGS", "draw_all"]
 

@@ -35,7 +35,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
-from nerif.reconstruction.neural import schedule as budget
+from nerif.reconstruction.neural import schedule
 from nerif.reconstruction.neural.training import Training
 from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.simulation.simulate import simulate
@@ -45,19 +45,19 @@ torch.set_num_threads(1)  # tests run side by side
 
 GROUPS = {"whole": "report", "experiment": "pictures", "five": "films", "film": "films"}
 """Fixtures of more than one file, by the group of the tests that use them."""
-LONGEST = ("test_style", "pictures", "films", "report", "test_cluster", "test_consistency", "test_neural", "test_joint")
+LONGEST = ("pictures", "films", "report", "test_cluster", "test_consistency", "test_neural", "test_joint")
 """Groups to begin with, so that both processes end at about the same time."""
 
 
-WHOLE = ("test_cli", "test_docs", "test_examples", "test_workflow", "sequence", "mutation", "benchmarks", "report")
-WHOLE += ("app", "test_first_look", "test_halves", "test_convergence", "test_refined_rig", "test_residuals")
+WHOLE = ("cli", "workflow", "sequence", "mutation", "benchmarks", "report", "app")
+WHOLE += ("test_docs", "test_examples", "test_asymmetry", "test_convergence", "test_refined_rig", "test_residuals")
 """Files and folders of tests that run whole commands: what these call is checked call by call in the other tests."""
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Check shapes by annotation, but not where whole commands run: that takes a sixth of their time."""
-    whole = item.path.stem.startswith(WHOLE) or item.path.parent.name in WHOLE
+    whole = item.path.stem in WHOLE or item.path.parent.name in WHOLE
     jaxtyping.config.update("jaxtyping_disable", whole)
     return (yield)
 
@@ -150,7 +150,7 @@ def slow_clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
 
     def set_to(seconds: float) -> None:
         ticks = itertools.count()
-        monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: seconds * next(ticks)))
+        monkeypatch.setattr(schedule, "time", SimpleNamespace(perf_counter=lambda: seconds * next(ticks)))
 
     return set_to
 

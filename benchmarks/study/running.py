@@ -44,8 +44,9 @@ SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 PRELOADED = [
     # of the study's own modules forkserver knows no path before Python 3.12.8; they are small
-    *("nerif.analysis.evaluation", "nerif.analysis.resolution", "nerif.simulation.simulate", "nerif.reconstruction.neural.neural"),
-    *("nerif.reconstruction.voxels.landweber", "nerif.reconstruction.voxels.tikhonov", "nerif.reconstruction.voxels.total_variation"),
+    *("nerif.analysis.evaluation", "nerif.analysis.resolution", "nerif.simulation.simulate"),
+    *(f"nerif.reconstruction.voxels.{name}" for name in ("landweber", "tikhonov", "total_variation")),
+    "nerif.reconstruction.neural.neural",
     *("xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.voxels.kernels_numba"),
     # every optimiser imports it; with CUDA a process must not inherit what the import found out of the GPU
     *(() if torch.backends.cuda.is_built() else ("torch._dynamo",)),

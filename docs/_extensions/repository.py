@@ -28,15 +28,15 @@ INTERNAL = {"nerif.cli.cli", "nerif.reconstruction.voxels.kernels_numba", "nerif
 def api_pages(docs: Path) -> dict[str, str]:
     """The pages of the API reference by name.
 
-    Modules are named there in an order that reads well; a line `% modules nerif.imaging` stands for those of the
-    package that no page names.
+    A line `% modules nerif.imaging` stands for the modules of the package that no page names.
     """
     pages = {path.stem: path.read_text() for path in sorted((docs / "api").glob("*.md"))}
     named = {m for text in pages.values() for m in re.findall(r"automodule:: (\S+)", text)} | INTERNAL
 
     def rest(match: re.Match[str]) -> str:
         folder = docs.parent / "src" / match[1].replace(".", "/")
-        modules = [f"{match[1]}.{path.stem}" for path in sorted(folder.glob("*.py")) if not path.stem.startswith("_")]
+        paths = [path for path in sorted(folder.rglob("*.py")) if not path.stem.startswith("_")]
+        modules = [".".join([match[1], *path.relative_to(folder).with_suffix("").parts]) for path in paths]
         return "\n".join(MODULE.format(m) for m in modules if m not in named)
 
     return {name: re.sub(r"^% modules (\S+)\n", rest, text, flags=re.MULTILINE) for name, text in pages.items()}

@@ -41,7 +41,7 @@ def test_repeats_tell_the_noise_of_a_flickering_lamp(repeats):
 @pytest.mark.parametrize("references", [6, 12, 40])
 def test_the_noise_does_not_change_with_the_number_of_references(references, monkeypatch):
     """Of many only some are compared with the mean of all."""
-    monkeypatch.setattr("nerif.imaging.displacement.displacement._repeat_sigma", lambda *_: None)  # which takes its time
+    monkeypatch.setattr("nerif.imaging.displacement.displacement._repeat_sigma", lambda *_: None)  # it is slow
     light, draw = scene(), np.random.default_rng(0)
     pictures = [light + np.sqrt(variance(light)) * draw.standard_normal(light.shape) for _ in range(references)]
     noise = AtRest.of(pictures, DisplacementSettings()).camera

@@ -1,4 +1,4 @@
-"""The command line: `nerif VERB ...`. One module of nerif.commands a verb, loaded only when it is asked for."""
+"""The command line: `nerif VERB ...`. One module of nerif.cli.commands a verb, loaded only when it is asked for."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MENTIONED = 4
 """Files that are named of those an interrupted command has written."""
 
 ELSEWHERE = {"app": "nerif.app.command"}
-"""Modules of verbs that are no file of nerif.commands."""
+"""Modules of verbs that are no file of nerif.cli.commands."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -92,7 +92,7 @@ def _run(words: list[str]) -> int:
     if warning := stranger():
         print(f"nerif: {warning}", file=sys.stderr)
     try:
-        command = importlib.import_module(ELSEWHERE.get(verb, f"nerif.commands.{verb}"))
+        command = importlib.import_module(ELSEWHERE.get(verb, f"nerif.cli.commands.{verb}"))
         importlib.import_module("nerif.reconstruction.device").keep_freed_memory()
         on_free_cores = importlib.import_module("nerif.reconstruction.device").on_free_cores
         on_free_cores(command.main)(words[1:])

@@ -143,8 +143,8 @@ def render(
     field, box : what lies between, of index excess, and where; None is the reference
     n_ambient : refractive index around the field
     samples : points along each edge of a pixel over which the texture is averaged. Rays are bent at pixel centres and
-        their movement on the plane interpolated between them by cubic splines (tests/test_rendering.py: the difference
-        to bending every one)
+        their movement on the plane interpolated between them by cubic splines (tests/simulation/test_rendering.py: the
+        difference to bending every one)
     steps : Runge-Kutta steps through the box
     """
     if samples < 1:

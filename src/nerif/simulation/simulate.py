@@ -35,7 +35,7 @@ __all__ = ["Simulation", "add_noise", "add_quantum_noise", "simulate", "view_dis
 MOVING = ("flame", "2", "3", "4", "5", "6", "7")
 PEAK_VOXELS = 64  # along the longest edge, on which the largest value of a phantom is looked for
 VIEW_CHUNK = 2048  # rays that are integrated at a time
-STEPS = 120  # Runge-Kutta steps through the box: 2e-4 of the rms displacement on the flame (tests/test_simulation.py)
+STEPS = 120  # Runge-Kutta steps through the box: 2e-4 of the rms displacement on the flame (test_simulate.py)
 
 
 def view_displacement(

@@ -250,7 +250,7 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     monkeypatch.syspath_prepend(tmp_path)  # workers get it
     deadly.write_text(
         "import os\nfrom nerif.workflow.sequence.run import _in_worker as real\n"
-        "from nerif.sequence import frames\n"
+        "from nerif.workflow.sequence import frames\n"
         "before = frames._frame\n"
         "def _frame(plan, settings, measurement, *rest):\n"
         "    if abs(float(measurement.displacement.abs().sum()) - TOTAL) < 1e-6 * TOTAL:\n        os._exit(9)\n"

@@ -14,7 +14,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.fields.grid import VoxelField
 
-RIGS = Path(__file__).parents[2] / "shared" / "data" / "rigs"
+RIGS = Path(__file__).parents[3] / "shared" / "data" / "rigs"
 SHAPE, SIGMA = (96, 80), 0.05
 
 

@@ -28,7 +28,7 @@ from nerif.geometry import Box, Camera, Ring
 from nerif.simulation.simulate import simulate
 
 BOX = Box.cube(50.0)
-RIGS = sorted(Path(__file__).parents[2].glob("shared/data/rigs/*.nc"))
+RIGS = sorted(Path(__file__).parents[3].glob("shared/data/rigs/*.nc"))
 VOXELS = 12
 
 

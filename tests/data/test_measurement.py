@@ -255,7 +255,7 @@ def test_rows_and_corners_without_a_wanted_pixel_are_passed_over(measurement, mo
         assert len(mine) == int(expected.crosses.sum()) > 0
 
 
-RIGS = Path(__file__).parents[2] / "shared" / "data" / "rigs"
+RIGS = Path(__file__).parents[3] / "shared" / "data" / "rigs"
 
 
 @pytest.mark.skipif(not RIGS.is_dir(), reason="the measurements of others are not beside the project (shared/data)")

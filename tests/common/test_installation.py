@@ -13,7 +13,7 @@ import pytest
 from nerif.cli.cli import main
 from nerif.common.installation import DISTRIBUTION, install, stranger
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FOLDERS = ("src", "docs", "examples", "benchmarks", "tests")
 ENDINGS = (".py", ".pyi", ".md", ".html", ".js", ".ipynb", ".toml", ".txt", ".cff")
 TEXTS = sorted(
@@ -85,5 +85,6 @@ def test_a_verb_says_it_in_one_line(monkeypatch, capsys):
 
 
 def test_help_does_not_look_for_it():
-    code = "import sys; from nerif.cli.cli import main; main(['--help']); sys.exit('nerif.common.installation' in sys.modules)"
+    code = "import sys; from nerif.cli.cli import main; main(['--help'])\n"
+    code += "sys.exit('nerif.common.installation' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0

@@ -475,7 +475,7 @@ def test_help_is_quick_and_whole(capsys):
         assert main([verb, "--help"]) == 0
         assert "TOML file of settings" in " ".join(capsys.readouterr().out.split())
     loaded = subprocess.run(
-        [sys.executable, "-c", "import sys, nerif.cli.cli; nerif.cli.cli.main(['--help']); print('torch' in sys.modules)"],
+        [sys.executable, "-c", "import sys; from nerif.cli.cli import main; main(['--help']); print('torch' in sys.modules)"],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert loaded.stdout.strip().endswith("False")

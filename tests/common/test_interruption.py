@@ -36,7 +36,7 @@ def test_what_is_nearest_to_the_work_speaks():
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "app"])
 def test_every_command_ends_in_one_line(verb, monkeypatch, capsys):
-    module = __import__(f"nerif.commands.{verb}", fromlist=["main"])
+    module = __import__(f"nerif.cli.commands.{verb}", fromlist=["main"])
     monkeypatch.setattr(module, "main", broken_off)
     written.clear()
     assert main([verb]) == 130
