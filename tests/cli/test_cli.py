@@ -474,8 +474,9 @@ def test_help_is_quick_and_whole(capsys):
     for verb in VERBS:
         assert main([verb, "--help"]) == 0
         assert "TOML file of settings" in " ".join(capsys.readouterr().out.split())
+    code = "import sys; from nerif.cli.cli import main; main(['--help']); print('torch' in sys.modules)"
     loaded = subprocess.run(
-        [sys.executable, "-c", "import sys; from nerif.cli.cli import main; main(['--help']); print('torch' in sys.modules)"],
+        [sys.executable, "-c", code],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert loaded.stdout.strip().endswith("False")
