@@ -682,14 +682,14 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
         return None
     results = []
     for correction in [*likely, *alike]:
-        results.append((fit(_without(correction, small), voxels, 1e-4)[1] / before, correction))
+        gain = fit(_without(correction, small), voxels, 1e-4)[1] / before
+        limit = BETTER_EVERYWHERE if len(correction.views) == len(views) else BETTER
+        results.append((gain / limit, gain, correction))  # what all views have must gain more than what a few have
         step(len(views) + len(likely) + len(alike))
     enough = UNLIKE * float(torch.tensor(agreements).median())
-    for gain, correction in sorted(results, key=lambda r: r[0]):
-        if gain > BETTER:
+    for over_limit, gain, correction in sorted(results, key=lambda r: r[0]):
+        if over_limit > 1:
             return None
-        if len(correction.views) == len(views) and gain > BETTER_EVERYWHERE:
-            continue
         if correction.change is None and len(correction.views) == 2:
             clear = len(views) >= FEW or gain < BETTER_OF_FEW
             expected = predicted_by_others(small, correction.views, voxels)
