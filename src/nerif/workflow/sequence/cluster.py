@@ -175,7 +175,7 @@ def _local_cluster(workers: int, dashboard: bool = False) -> Any:
                 "env": environment,
                 "memory_limit": 0,
                 "dashboard": False,
-                "silence_logs": logging.ERROR,
+                "silence_logs": logging.CRITICAL,  # errors of work come back with it; a heartbeat may fail at the end
             },
         }
     scheduler = {"cls": Scheduler, "options": {**common, "dashboard": dashboard}}
