@@ -1,4 +1,4 @@
-"""Frame by frame from nothing, frame by frame from the one before, and one network over space and time: error, seconds.
+"""Frame by frame from nothing, and frame by frame from the one before: error, seconds.
 
     python benchmarks/sequence.py --write benchmarks/results/sequence-cpu.md
     python benchmarks/sequence.py --device cuda --preset best --pixels 200 --write benchmarks/results/sequence-gpu.md
@@ -34,7 +34,6 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.simulation.simulate import Simulation
 from nerif.workflow.sequence.frames import reconstruct_frames
-from nerif.workflow.sequence.joint import reconstruct_jointly
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.store import DONE, Frame, SequenceStore
 
@@ -60,18 +59,15 @@ def run(
 ) -> tuple[float, float, float, float]:
     """Reconstruct a film; seconds a frame, and mean L2, L2 of the variation and CC of the last frames."""
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
-    steps, rate, joint = (changes.get(k, 0) for k in ("warm_steps", "warm_rate", "joint_steps"))
-    octaves = int(changes.get("time_octaves", 3))
+    steps, rate = (changes.get(k, 0) for k in ("warm_steps", "warm_rate"))
     settings = SequenceSettings(
-        chunk=len(sequence), temporal="joint" if joint else "frames", joint_steps=int(joint) or 1, time_octaves=octaves,
-        warm_steps=int(steps) or 1, warm_rate=rate or 0.7, voxels=voxels, quantities=("index_excess",),
+        chunk=len(sequence), warm_steps=int(steps) or 1, warm_rate=rate or 0.7, voxels=voxels,
+        quantities=("index_excess",),
     )  # fmt: skip
     plan = SequencePlan(film, out, cold, settings)
     store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
     last = range(len(sequence) - compared, len(sequence))
-    if joint:
-        reconstruct_jointly(plan, 0, len(sequence))
-    elif first is not None:
+    if first is not None:
         store.write_frame(0, Frame(first.field(0), [first.volume(0, "index_excess")], [], 0.0, 0))
         reconstruct_frames(plan, 0, len(sequence))
     else:
@@ -133,8 +129,6 @@ def main() -> None:
     parser.add_argument("--cold", type=int, nargs="*", default=[250, 500, 1000], help="steps of a frame from nothing")
     parser.add_argument("--warm", type=int, nargs="*", default=[80, 160, 320], help="steps of a frame from the last")
     parser.add_argument("--warm-rate", type=float, nargs="*", default=[0.7])
-    parser.add_argument("--joint", type=int, nargs="*", default=[120, 240], help="steps a frame of a joint network")
-    parser.add_argument("--time-octaves", type=int, nargs="*", default=[3])
     add_write(parser)
     arguments = parser.parse_args()
     keep_freed_memory()
@@ -146,11 +140,6 @@ def main() -> None:
     for n, rate in itertools.product(arguments.warm, arguments.warm_rate):
         changes = {"warm_steps": n, "warm_rate": rate}
         kinds.append((f"from the one before, rate {rate:g}", n, replace(base, max_steps=best), changes))
-    kinds += [
-        (f"jointly, {k} octaves of time", n, base, {"joint_steps": n, "time_octaves": k})
-        for n in arguments.joint
-        for k in arguments.time_octaves
-    ]
     with tempfile.TemporaryDirectory() as folder:
         for views, interval in itertools.product(arguments.views, arguments.interval):
             path = film(

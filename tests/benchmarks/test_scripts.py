@@ -19,7 +19,7 @@ SMALLEST = {
     "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",
     "one_camera": "--phantom gaussian-jet --noise 0.1 --half-angle 5 --pixels 16 --seeds 1 --only peers",
     "particles": "--per-pixel 0.05 --pixels 48 --depth 12 --displacement 1 --window 12 --seeds 1",
-    "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5 --joint 5",
+    "sequence": "--views 3 --frames 2 --compared 1 --interval 1e-4 --pixels 12 --voxels 12 --cold 5 --warm 5",
     "verdicts": "--cases 1 --method tv",
     "voxel_cost": "--voxels 8 --basis linear --iterations 1 --pixels 12",
     "watching": "--pixels 12 --seconds 3 --turns 1",

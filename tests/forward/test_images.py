@@ -27,7 +27,7 @@ from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.training import Training
-from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.operator import VoxelOperator
@@ -263,7 +263,7 @@ def test_a_run_tells_where_pictures_take_over_and_its_pace_goes_on(balls, taken)
     flow[:, ::2] = torch.nan
     both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05), maps={**taken.maps, "flow": flow})
     settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
-    Training(settings, FrameData(settings, both)).run(steps.append)
+    Training(settings, TrainingData(settings, both)).run(steps.append)
     assert [(s.step, s.note) for s in steps if s.note] == [
         (5, "the loss is of pictures from here on, of displacements before: it jumps")
     ]
@@ -274,11 +274,11 @@ def test_shifts_of_pictures_are_refined_of_the_displacements_that_are_there(ball
     d = predict(balls, taken.cameras, BOX, 1.00027).displacements
     both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05))
     shifted = replace(NETWORK, refine=("cameras,shift",))
-    data = FrameData(shifted, both)
+    data = TrainingData(shifted, both)
     assert [[o.technique.name for o in stage.measurement().observations] for stage in data.stages] == [["deflection"]]
     assert data.refinement is not None
     with pytest.raises(InputError, match="give --from displacements"):
-        FrameData(replace(shifted, source="pictures"), both)
+        TrainingData(replace(shifted, source="pictures"), both)
 
 
 def test_what_is_measured_by_other_techniques_stays(balls, taken):
@@ -313,8 +313,8 @@ def test_a_run_from_pictures_resumes_bit_for_bit(taken):
             states.append(step.capture())
         return False
 
-    once = Training(whole, FrameData(whole, taken)).run(keep)
-    again = Training(whole, FrameData(whole, taken), states[0]).run()
+    once = Training(whole, TrainingData(whole, taken)).run(keep)
+    again = Training(whole, TrainingData(whole, taken), states[0]).run()
     a, b = (dict(r.field.network.state_dict()) for r in (once, again))
     assert all(torch.equal(a[name], b[name]) for name in a)
 
@@ -324,7 +324,7 @@ def test_without_a_limit_a_run_is_judged_by_pixels_held_back(taken):
     settings = replace(NETWORK, max_steps=0, first_cycle=120)
     result = settings(taken, lambda step: step.step > 121)
     held = [row["held_back"] for row in result.history if "held_back" in row]
-    judges = FrameData(settings, taken, judged=True).held_back
+    judges = TrainingData(settings, taken, judged=True).held_back
     assert judges is not None
     assert len(judges) > 200
     assert held[-1] < 0.5 * math.sqrt(judges.chi_square)  # of what is left of them without a field

@@ -119,8 +119,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     reconstruction = NETWORK(m)
     excess = Volume(reconstruction.field.sample(grid), grid)
     film = MeasurementSequence.read(folder / "m.zarr")
-    about = {"temporal": "warm"}
-    result = SequenceStore.begin(folder / "r.zarr", film, grid, ("index_excess",), NETWORK.network, about)
+    result = SequenceStore.begin(folder / "r.zarr", film, grid, ("index_excess",), NETWORK.network, {})
     for i in range(2):
         result.write_frame(i, Frame(reconstruction.field, [excess], [], seconds=1.0, steps=2))
     return folder

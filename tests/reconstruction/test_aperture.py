@@ -28,7 +28,7 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Draw, Objective
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.precision import MixedPrecision
-from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.voxels.operator import VoxelOperator, rays_through
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
@@ -197,7 +197,7 @@ def test_rays_of_a_pixel_that_miss_the_box_leave_every_term_and_its_slope_finite
     shape = NetworkShape(depth=2, width=8, octaves=1, gradient_head=True)
     weights = LossWeights(consistency=1, numerical=1, head=1, automatic=1)
     settings = NeRIF(network=shape, weights=weights, model=model, device="cpu", lens_rays=4, norm="l2")
-    data = FrameData(settings, measurement, coarsest=1)
+    data = TrainingData(settings, measurement, coarsest=1)
     torch.manual_seed(0)
     field, generator = data.untrained(), torch.Generator().manual_seed(0)
     network = MixedPrecision(field.network, data.device, "float32", "off")

@@ -23,7 +23,7 @@ from nerif.reconstruction.neural import convergence, objective
 from nerif.reconstruction.neural.convergence import Cycles
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.some_pixels import hold_back
-from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.simulation.simulate import add_noise
 
 ENDLESS = NeRIF(
@@ -73,9 +73,9 @@ def test_pixels_held_back_are_of_most_views_and_in_no_batch(measurement):
     assert not bool((taken & rest.usable).any())
     assert bool(rest.usable.flatten(1).any(dim=1).all())
     assert 0.02 < taken.sum() / measurement.usable.sum() < 0.2
-    data = FrameData(ENDLESS, measurement, judged=True)
+    data = TrainingData(ENDLESS, measurement, judged=True)
     assert data.held_back is not None
-    assert len(data) + len(data.held_back) == len(FrameData(ENDLESS, measurement))
+    assert len(data) + len(data.held_back) == len(TrainingData(ENDLESS, measurement))
 
 
 @pytest.mark.slow

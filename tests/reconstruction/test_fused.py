@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from nerif.fields.network import UNBOUNDED, Network, NetworkShape
-from nerif.fields.space_time import SpaceTimeNetwork
 from nerif.reconstruction.neural import fused
 from nerif.reconstruction.neural.precision import MixedPrecision
 
@@ -31,17 +30,6 @@ def test_value_gradient_and_derivatives_are_those_of_the_plain_network(depth, bo
     for ours, plain in zip(derivatives(network, p, True), derivatives(network, p, False), strict=True):
         assert ours.shape == plain.shape
         assert float((ours - plain).abs().max()) <= 2e-5 * float(plain.abs().max())
-
-
-def test_a_drift_is_learnt_through_the_layers():
-    torch.manual_seed(0)
-    network = SpaceTimeNetwork(NetworkShape(depth=2, width=16, octaves=1), 2)
-    p = 2 * torch.rand(90, 4) - 1
-    ours, plain = derivatives(network, p, True), derivatives(network, p, False)
-    assert network.drift.grad is not None
-    assert float(network.drift.grad.abs().max()) > 0
-    for a, b in zip(ours, plain, strict=True):
-        assert float((a - b).abs().max()) <= 2e-5 * float(b.abs().max())
 
 
 @pytest.mark.parametrize(

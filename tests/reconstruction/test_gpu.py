@@ -16,10 +16,7 @@ from nerif.forward.deflection import LeverArm
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Lens
 from nerif.reconstruction.neural.presets import PRESETS
-from nerif.reconstruction.neural.training import Training
-from nerif.reconstruction.neural.training_data import FrameData
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.workflow.sequence.chunk_data import ChunkData
 
 pytestmark = pytest.mark.filterwarnings("ignore:User provided device_type of 'cuda'")
 
@@ -167,16 +164,3 @@ def test_a_step_waits_for_nothing(measurement, gpu, name):
             replace(RUNS[name], max_steps=steps)(measurement)
             counts.append(len(gpu.waits))
     assert counts[1] <= counts[0]
-
-
-def test_frames_trained_together_are_moved_once(measurement, gpu):
-    counts = []
-    with gpu:
-        for steps in (3, 7):
-            settings = replace(RUNS["fast"], max_steps=steps, network=replace(SHAPE, gradient_head=False))
-            frames = [FrameData(replace(settings, device="cpu"), measurement, coarsest=1) for _ in range(2)]
-            data = ChunkData(settings, frames, torch.tensor([-1.0, 1.0]), 1)
-            gpu.waits.clear()
-            assert not Training(settings, data).run().outcome.failed
-            counts.append(len(gpu.waits))
-    assert counts[0] == counts[1]

@@ -24,7 +24,7 @@ from nerif.reconstruction.neural import bins, objective, training
 from nerif.reconstruction.neural.losses import LossWeights, by_differences
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
 
@@ -192,7 +192,7 @@ def test_a_field_that_is_lost_is_taken_back(measurement, monkeypatch):
             for weight in run.field.network.parameters():
                 weight.data.zero_()
 
-    runs = [training.Training(replace(SMALL, max_steps=200), FrameData(SMALL, measurement))]
+    runs = [training.Training(replace(SMALL, max_steps=200), TrainingData(SMALL, measurement))]
     result = runs[0].run(sabotage)
     assert sum("taken_back" in record for record in result.history) == 1
     assert result.history[-1]["loss"] < 0.1
@@ -283,8 +283,8 @@ def test_the_rule_of_the_loss_ends_a_run_that_goes_on_from_a_field(measurement, 
 
 def test_a_small_learning_rate_is_given_the_steps_it_needs(measurement):
     """Preset paper stays at the empty field for about 450 steps of 2048 points, and finds it then."""
-    slow = training.Training(replace(SMALL, learning_rate=1e-3), FrameData(SMALL, measurement))
-    assert slow.watch.patience == 15 * training.Training(SMALL, FrameData(SMALL, measurement)).watch.patience
+    slow = training.Training(replace(SMALL, learning_rate=1e-3), TrainingData(SMALL, measurement))
+    assert slow.watch.patience == 15 * training.Training(SMALL, TrainingData(SMALL, measurement)).watch.patience
 
 
 def test_ambient_is_ambient_on_the_faces(measurement, trained):

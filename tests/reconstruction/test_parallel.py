@@ -20,7 +20,7 @@ from nerif.reconstruction.neural.objective import Draw, Objective
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.settings import LossWeights
-from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.neural.training_data import TrainingData
 
 SMALL = [
     "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "30",
@@ -81,7 +81,7 @@ def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_and_counts_fo
     both = replace(m, maps={"fringes": fringes, "fringes_sigma": torch.ones(m.shape)}, wavelength_nm=532.0)
     weights, heads = LossWeights(1.0, 1.0, 1.0, 1.0), NetworkShape(width=24, depth=2, gradient_head=True)
     settings = NeRIF(device="cpu", precision="float32", weights=weights, network=heads)
-    data = FrameData(settings, both, coarsest=1)
+    data = TrainingData(settings, both, coarsest=1)
     torch.manual_seed(0)
     field = data.untrained()
     network = MixedPrecision(field.network, data.device, settings.precision, settings.compile)

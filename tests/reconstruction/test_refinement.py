@@ -21,7 +21,7 @@ from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.training_data import FrameData
+from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.rig.numbers import NAMES, displaced
 from nerif.reconstruction.rig.refined import moved_lines, with_corrections
 from nerif.reconstruction.rig.refinement import Refinement
@@ -247,7 +247,7 @@ def test_every_technique_tells_whether_a_view_is_off(measured):
 
 def test_without_a_limit_the_rays_held_back_are_seen_by_the_refined_rig(measured):
     wrong, _ = spoiled(measured)
-    data = FrameData(NeRIF(refine=("cameras",), device="cpu"), wrong, judged=True)
+    data = TrainingData(NeRIF(refine=("cameras",), device="cpu"), wrong, judged=True)
     held = data.held_back.parts[0]
     data.refinement.restore({**data.refinement.kept(), "values": torch.ones(5, 14).double() * data.refinement.sigma})
     moved = data.refined(held, held_back=True)

@@ -15,7 +15,6 @@ import torch
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.network import Network, NetworkShape, NeuralField
-from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid
@@ -51,9 +50,8 @@ class Elsewhere(Field):
         return 1e-4 * points[..., 0], 1e-4 * torch.ones_like(points)
 
 
-@pytest.mark.parametrize("at_time", [False, True])
-def test_a_network_goes_to_the_device_and_the_field_stays_where_it_is(at_time):
-    field = SpaceTimeField(SpaceTimeNetwork(SHAPE, 2), BOX, 0.5, 1e-4) if at_time else neural()
+def test_a_network_goes_to_the_device_and_the_field_stays_where_it_is():
+    field = neural()
     moved = field.to("meta")
     value, gradient = moved.value_and_gradient(torch.rand(5, 3, device=META))
     assert value.device.type == gradient.device.type == "meta"

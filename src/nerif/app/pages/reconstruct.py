@@ -31,7 +31,7 @@ MAIN = ("time_limit", "hold_out", "uncertainty", "voxels")
 FILM = ".zarr"
 VALUES = {False: "values", True: "film_values"}  # of what is not a film, and of one
 FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine")
-FILM_MAIN = ("cluster", "workers", "chunk", "temporal", "hold_out", "voxels")
+FILM_MAIN = ("cluster", "workers", "chunk", "hold_out", "voxels")
 LABELS = {
     "nerif": "NeRIF: a neural field", "tikhonov": "Tikhonov, on voxels", "landweber": "Landweber, on voxels",
     "tv": "Total variation, on voxels", "mlem": "MLEM, never negative", "mart": "MART, never negative",
@@ -49,7 +49,7 @@ def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
 def form_of_film(preset_name: str) -> Form[Sequence]:
     """Return the form of a film: where its frames are reconstructed, and how."""
     record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))
-    return Form(record, without=FILM_WITHOUT, choices={"temporal": ("frames", "joint")})
+    return Form(record, without=FILM_WITHOUT)
 
 
 class ReconstructPage:

@@ -11,10 +11,9 @@ from jaxtyping import Int
 from torch import Tensor
 
 from nerif.fields.network import NeuralField
-from nerif.fields.space_time import AtTimes, with_time
 from nerif.forward.path_integral import LENS_RAYS, PathIntegral, project
 from nerif.geometry import Rays
-from nerif.reconstruction.neural.losses import DATA, Evaluator, loss_terms, reduce
+from nerif.reconstruction.neural.losses import DATA, loss_terms, reduce
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.precision import MixedPrecision
 from nerif.reconstruction.neural.sampling import SamplingDensity, sample_count, sample_rays
@@ -70,7 +69,6 @@ class Piece:
     ----------
     part : pixels, what they measured, and the forward model
     rays : theirs, or several through the lens in a row for each
-    tau : (n,) instants of the rays, or None
     s, interval : (n, m) path lengths of the samples, and the length that each stands for, mm
     numbers : measured numbers of this process; 0 where it has no ray of the technique, and one of another process
         stands in, which counts for nothing: all processes average the same terms, and gradients of the same weights
@@ -78,7 +76,6 @@ class Piece:
 
     part: Part
     rays: Rays
-    tau: Tensor | None
     s: Tensor
     interval: Tensor
     numbers: int
@@ -132,10 +129,10 @@ class Objective:
         processes have.
         """
         batch = self.data.batch(index)
-        pieces = [self._piece(part, tau, draw) for part, tau in batch]
-        return pieces, sum(part.measured.numel() for part, _ in batch)
+        pieces = [self._piece(part, draw) for part in batch]
+        return pieces, sum(part.measured.numel() for part in batch)
 
-    def _piece(self, part: Part, tau: Tensor | None, draw: Draw) -> Piece:
+    def _piece(self, part: Part, draw: Draw) -> Piece:
         """This process's share of a part, with its samples."""
         rays, mine = draw.rays_of(part, self.generator), self.ranks.share
         numbers = part.measured[mine].numel()
@@ -146,8 +143,7 @@ class Objective:
             chosen = torch.arange(len(part), device=rays.near.device)[mine]
             own = (chosen[:, None] * each + torch.arange(each, device=chosen.device)).flatten()
             rays, s, interval = rays[own], s[own], interval[own]
-        own_tau = None if tau is None else tau[mine].repeat_interleave(each)
-        return Piece(part[mine], rays, own_tau, s, interval, numbers)
+        return Piece(part[mine], rays, s, interval, numbers)
 
     def terms(self, pieces: list[Piece]) -> dict[str, Tensor]:
         """Return the terms of the loss, each the mean over all measured numbers of the pieces."""
@@ -155,7 +151,7 @@ class Objective:
         terms: dict[str, Tensor] = {}
         for piece, share in zip(pieces, shares([piece.numbers for piece in pieces]), strict=True):
             found = loss_terms(
-                self.field, self._at(piece.tau), piece.part, piece.rays, piece.s, piece.interval, settings.weights,
+                self.field, self.network, piece.part, piece.rays, piece.s, piece.interval, settings.weights,
                 settings.norm,
             )  # fmt: skip
             for name, term in found.items():
@@ -182,13 +178,13 @@ class Objective:
         """Return the loss of the ambient field, near which a network begins, over as many rays as EMPTY_RAYS."""
         data, weights = self.data, self.settings.weights
         index = shuffled(0, min(EMPTY_RAYS, len(data)), len(data), self.settings.seed)
-        parts = [part for part, _ in data.batch(index)]
+        parts = data.batch(index)
         term = self.of_nothing(parts, [part.measured.numel() for part in parts])
         return float(term) * sum(getattr(weights, name) for name in DATA)
 
     def look(self) -> None:
         """Look at where the field varies."""
-        self.density.update(*(self._at(tau) for tau in self.data.instants))
+        self.density.update(self.network)
 
     @torch.no_grad()
     def settle(self) -> None:
@@ -229,11 +225,8 @@ class Objective:
 
     def at_ambient(self, count: int, generator: torch.Generator) -> Tensor | None:
         """Return what the network gives where it should give 0, in full precision; None where no place is known."""
-        found = self.data.ambient_points(count, generator)
-        if found is None:
-            return None
-        points, tau = found
-        return self.field.network(with_time(self.field.normalise(points), tau))
+        points = self.data.ambient_points(count, generator)
+        return None if points is None else self.field.network(self.field.normalise(points))
 
     @torch.no_grad()
     def held_back(self) -> float:
@@ -256,10 +249,6 @@ class Objective:
                 total += mean * some.measured.numel()
         self.network.low = low
         return total / held.numbers * held.chi_square
-
-    def _at(self, tau: Tensor | None) -> Evaluator:
-        """The network as a function of space, at the instants given."""
-        return self.network if tau is None else AtTimes(self.network, tau)
 
 
 def shares(numbers: Sequence[int]) -> list[float]:

@@ -37,14 +37,14 @@ class SamplingDensity:
         self.values: Float[Tensor, "z y x"] | None = None  # nothing known yet
 
     @torch.no_grad()
-    def update(self, *networks: Evaluator) -> None:
-        """Look at a network as it is now, or at several (instants) that are to be sampled alike."""
+    def update(self, network: Evaluator) -> None:
+        """Look at a network as it is now."""
         device = next(self.field.network.parameters()).device
         axis = (torch.arange(RESOLUTION, device=device) + 0.5) / RESOLUTION * 2 - 1
         z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
         points = torch.stack([x, y, z], dim=-1).reshape(-1, 3)
-        slopes = torch.stack([n.value_and_gradient(points, False)[1].float().norm(dim=-1) for n in networks])
-        self.values = functional.max_pool3d(slopes.amax(dim=0).reshape(1, 1, *x.shape), 3, 1, 1)[0, 0]
+        slopes = network.value_and_gradient(points, False)[1].float().norm(dim=-1)
+        self.values = functional.max_pool3d(slopes.reshape(1, 1, *x.shape), 3, 1, 1)[0, 0]
 
     def along(self, rays: Rays) -> Float[Tensor, "n bins"]:
         """Return the density of samples in equal bins along each ray; its mean along a ray is 1."""

@@ -1,8 +1,5 @@
 """What a network is trained on: rays with what they measured, and points where the index is known to be ambient.
 
-A frame is one measurement at one instant. Data of several frames (sequence/chunk_data.py) tell the instant of each ray
-and of each point as well: tau in [-1, 1].
-
 A random order without a list of it: a permutation that is computed where it is asked.
 
 A Feistel network on pairs of numbers below a = ceil(sqrt(count)) exchanges the two, each time adding a hash of one to
@@ -15,7 +12,6 @@ Source: Black & Rogaway, Ciphers with arbitrary finite domains, CT-RSA (2002).
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from contextlib import suppress
 
 import numpy as np
@@ -26,11 +22,9 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.forward.base import ForwardModel
-from nerif.geometry import Box
-from nerif.geometry.symmetry import Axis
 from nerif.reconstruction.aperture import lens_rays, seen_through
 from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
@@ -46,7 +40,7 @@ from nerif.reconstruction.sources import chosen_source, of_source, stages
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
 
-__all__ = ["FrameData", "TrainingData", "shuffled"]
+__all__ = ["TrainingData", "shuffled"]
 
 ROUNDS = 6
 MULTIPLIER = 0x9E3779B1  # 2^32 / golden ratio, odd
@@ -92,117 +86,11 @@ def _hash(x: int) -> int:
     return (x >> 33) & 0x7FFFFFFF
 
 
-class TrainingData(ABC):
-    """Rays and ambient points, at one instant or at several.
-
-    Parameters
-    ----------
-    device : where batches are given
-    box : Box, mm
-    n_ambient : refractive index that the excess is counted from
-    fingerprint : a digest of each part of the data, by its name
-    open : whether the data leave a constant of the field open
-    quantity : what the field is
-    """
-
-    bounds: tuple[float, float]
-    """Lowest and highest value of the field."""
-
-    def __init__(
-        self, device: torch.device, box: Box, n_ambient: float, fingerprint: dict[str, str], open: bool, quantity: str
-    ) -> None:
-        self.device, self.box, self.n_ambient, self.fingerprint = device, box, n_ambient, fingerprint
-        self.open, self.quantity = open, quantity
-
-    coarsest: int = 1
-    """Edge of the largest bins that the data can be given in, px."""
-    noise: float = 0.0
-    """Mean square of the noise over that of what was measured; 0 where it is not known."""
-
-    shape: NetworkShape
-    """Of the network: without the waves that pixels cannot tell from longer ones."""
-    samples: tuple[int, int]
-    """Of a ray at the start and at the end of a run."""
-    lens_rays: int = 1
-    """Rays through the lens of a pixel at the end of a run; 1 for a thin one."""
-
-    held_back: Target | None = None
-    """Rays that are in no batch, to judge by them; None where there are none."""
-
-    stage: int = 0
-    """Part of the run that the data are given for."""
-
-    met: str = "what was measured"
-    """What the loss is of in this part."""
-
-    axis: Axis | None = None
-    """Of a symmetric flow."""
-    refinement: Refinement | None = None
-    """Of the rig, or None where it is as calibrated."""
-    sigma_known: bool = False
-
-    def refined_by(self, seed: int) -> list[Part]:
-        """Draw pixels that the rig is refined by, with their calibrated rays, residuals in units of sigma."""
-        raise NotImplementedError("these data refine no rig")
-
-    def refined(self, part: Part, held_back: bool = False) -> Part:
-        """Return a part, of the rays held back or of the others, as the refined rig has it."""
-        return part
-
-    def advance(self, progress: float) -> bool:
-        """Give what is to be met at that share of a run, or of its first cycle; return whether a new part began."""
-        return False
-
-    @property
-    def unsettled(self) -> list[Part]:
-        """Some rays of whatever has to be fitted beside the field (ForwardModel.settle)."""
-        return []
-
-    def kept(self) -> dict[str, Tensor]:
-        """Return what has been fitted beside the field, as a checkpoint keeps it."""
-        return {}
-
-    def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
-        """Go on in that part of a run with what was fitted beside the field."""
-        assert stage == 0, "these data have one part only"
-
-    def judge_alike(self) -> None:
-        """Let rays that are held back be judged by what was fitted beside the field."""
-        return
-
-    def refine(self, edge: int) -> None:
-        """Give bins of another edge, px, from now on."""
-        assert edge == 1, "these data are pixels always"
-
-    @abstractmethod
-    def __len__(self) -> int:
-        """Rays of all instants."""
-
-    @abstractmethod
-    def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
-        """Return the rays of those numbers with what they measured, technique by technique, and their instants."""
-
-    @abstractmethod
-    def ambient_points(
-        self, count: int, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"] | None] | None:
-        """Draw about `count` points at which the field is ambient, mm, and their instants; None if none is known."""
-
-    @property
-    @abstractmethod
-    def instants(self) -> list[Float[Tensor, " 1"] | None]:
-        """A few instants that stand for all."""
-
-    @abstractmethod
-    def untrained(self) -> NeuralField:
-        """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
-
-
 SETTLED_BY = 1024  # pixels a view
 
 
-class FrameData(TrainingData):
-    """One measurement.
+class TrainingData:
+    """The rays of a measurement with what they measured, and points at which its field is ambient.
 
     Parameters
     ----------
@@ -210,7 +98,24 @@ class FrameData(TrainingData):
     measurement : Measurement
     coarsest : edge of the bins to begin with, px; None for what a picture of its size can do with
     judged : whether some of the rays are held back
+
+    Attributes
+    ----------
+    fingerprint : a digest of each part of the data, by its name
+    open : whether the data leave a constant of the field open
+    bounds : lowest and highest value of the field
+    shape, samples : of the network, and of a ray at the start and at the end of a run
+    lens_rays : rays through the lens of a pixel at the end of a run; 1 for a thin one
+    held_back : rays that are in no batch, to judge by them; None where there are none
+    stage, met : part of the run that the data are given for, and what the loss is of in it
+    axis : of a symmetric flow
+    refinement : of the rig, or None where it is as calibrated
+    noise : mean square of the noise over that of what was measured; 0 where it is not known
     """
+
+    held_back: Target | None = None
+    stage: int = 0
+    refinement: Refinement | None = None
 
     def __init__(
         self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, judged: bool = False
@@ -220,10 +125,9 @@ class FrameData(TrainingData):
         source = chosen_source(measurement, settings.source, preferred)
         final = of_source(measurement, source)
         check_target(final, settings.model)
-        super().__init__(
-            resolve_device(settings.device), measurement.box, measurement.n_ambient,
-            fingerprint(final, settings.open_faces), is_open(measurement), measurement.quantity,
-        )  # fmt: skip
+        self.device, self.fingerprint = resolve_device(settings.device), fingerprint(final, settings.open_faces)
+        self.box, self.n_ambient, self.quantity = measurement.box, measurement.n_ambient, measurement.quantity
+        self.open = is_open(measurement)
         settings = settings.resolved_by(measurement)
         self.shape, self.samples = settings.network, settings.samples
         self.settings, self.measurement = settings, measurement
@@ -250,6 +154,7 @@ class FrameData(TrainingData):
         self.refine(self.coarsest)
 
     def refine(self, edge: int) -> None:
+        """Give bins of another edge, px, from now on."""
         settings, self.edge = self.settings, edge
         seen, self.met = self.stages[self.stage].measurement(), self.stages[self.stage].words
         self.target = Target.of(seen, settings.open_faces, edge, settings.model).to(self.device)
@@ -258,6 +163,7 @@ class FrameData(TrainingData):
         self.sigma_known = self.target.sigma_known
 
     def advance(self, progress: float) -> bool:
+        """Give what is to be met at that share of a run, or of its first cycle; return whether a new part began."""
         reached = max(i for i, stage in enumerate(self.stages) if stage.begin <= progress)
         if reached <= self.stage:
             return False
@@ -269,16 +175,19 @@ class FrameData(TrainingData):
 
     @property
     def unsettled(self) -> list[Part]:
+        """Some rays of whatever has to be fitted beside the field (ForwardModel.settle)."""
         generator = torch.Generator().manual_seed(self.stage)
         parts = [part for part in self.target.parts if part.model.settles]
         some = [torch.randperm(len(part), generator=generator)[: SETTLED_BY * len(self.names)] for part in parts]
         return [self.refined(part[index.to(self.device)]) for part, index in zip(parts, some, strict=True)]
 
     def kept(self) -> dict[str, Tensor]:
+        """Return what has been fitted beside the field, as a checkpoint keeps it."""
         kept = {str(i): model.settled.clone() for i, model in enumerate(_settling(self.target))}
         return kept | kept_of(self.refinement)
 
     def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
+        """Go on in that part of a run with what was fitted beside the field."""
         if stage != self.stage:
             self.stage = stage
             self.refine(self.edge)
@@ -295,28 +204,29 @@ class FrameData(TrainingData):
     def __len__(self) -> int:
         return len(self.target)
 
-    def batch(self, index: Int[Tensor, " b"]) -> list[tuple[Part, Float[Tensor, " n"] | None]]:
-        return [(self.refined(part), None) for part in self.target[index].parts if len(part)]
+    def batch(self, index: Int[Tensor, " b"]) -> list[Part]:
+        """Return the rays of those numbers with what they measured, technique by technique."""
+        return [self.refined(part) for part in self.target[index].parts if len(part)]
 
     def refined(self, part: Part, held_back: bool = False) -> Part:
+        """Return a part, of the rays held back or of the others, as the refined rig has it."""
         if self.refinement is None:
             return part
         names = self.judging if held_back else self.names
         return self.refinement.of(part, [self.refinement.names.index(name) for name in names])
 
     def refined_by(self, seed: int) -> list[Part]:
+        """Draw pixels that the rig is refined by, with their calibrated rays, residuals in units of sigma."""
         if self.refinement is None or self.names != self.refinement.names:
             return []  # a part of the run that has not all views
         return drawn(self.target, len(self.names), seed)
 
-    def ambient_points(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], None] | None:
-        return None if self.ambient is None else (sent(self.ambient.sample(count, generator), self.device), None)
-
-    @property
-    def instants(self) -> list[Float[Tensor, " 1"] | None]:
-        return [None]
+    def ambient_points(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"] | None:
+        """Draw about `count` points at which the field is ambient, mm; None if none is known."""
+        return None if self.ambient is None else sent(self.ambient.sample(count, generator), self.device)
 
     def untrained(self) -> NeuralField:
+        """Return a field with random weights, drawn from torch's own generator, that cannot leave its bounds."""
         bounds = in_units(self.bounds, self.target.scale)
         if self.axis is None:
             network = Network(self.shape, bounds=bounds)

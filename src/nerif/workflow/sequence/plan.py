@@ -19,9 +19,9 @@ __all__ = ["Event", "SequencePlan", "SequenceSettings"]
 WARM_UP = 10  # steps over which the learning rate rises from weights that are good already
 
 Event = Callable[[dict[str, object]], None]
-"""Told {"frame", "what": "begun" | "share" | "done" | "failed", ...} as a frame goes along."""
+"""Told {"frame", "what": "begun" | "done" | "failed", ...} as a frame goes along."""
 
-LEAST = {"chunk": 1, "warm_steps": 1, "joint_steps": 1, "time_octaves": 0, "voxels": 1}
+LEAST = {"chunk": 1, "warm_steps": 1, "voxels": 1}
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,6 @@ class SequenceSettings:
     """Steps of a frame that starts from the one before."""
     warm_rate: float = 0.7
     """Share of the learning rate such a frame begins with."""
-    temporal: str = "frames"
-    """A network for each frame ("frames"), or one over space and time for each chunk ("joint")."""
-    joint_steps: int = 300
-    """Steps for each frame of a joint network."""
-    time_octaves: int = 3
-    """Of the encoding of time in a joint network."""
     hold_out: tuple[str, ...] = ()
     """Views kept out of the reconstruction, and compared with it."""
     voxels: int = 100
@@ -77,8 +71,6 @@ class SequenceSettings:
         for quantity in self.quantities:
             if quantity not in QUANTITIES:
                 raise InputError(f"quantities: expected some of {', '.join(QUANTITIES)}, got '{quantity}'")
-        if self.temporal not in ("frames", "joint"):
-            raise InputError(f"temporal: expected frames or joint, got '{self.temporal}'")
 
 
 @dataclass(frozen=True)

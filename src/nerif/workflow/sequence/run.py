@@ -14,7 +14,6 @@ import torch
 from nerif.common.conventions import with_unit
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.workflow.sequence.frames import ATTEMPTS, reconstruct_frames
-from nerif.workflow.sequence.joint import reconstruct_jointly
 from nerif.workflow.sequence.plan import SequencePlan
 from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 
@@ -32,14 +31,12 @@ class Progress:
     ----------
     total : frames to be done in this run
     done, failed : of them, so far
-    parts : of chunks that are done as a whole, how many frames' work is behind them
     seconds : since the run began
     """
 
     total: int
     done: int = 0
     failed: int = 0
-    parts: dict[int, float] = field(default_factory=dict)
     begun: float = field(default_factory=time.monotonic)
 
     @property
@@ -48,9 +45,9 @@ class Progress:
         return time.monotonic() - self.begun
 
     @property
-    def settled(self) -> float:
-        """Frames done or failed, with the share of those under way."""
-        return self.done + self.failed + sum(self.parts.values())
+    def settled(self) -> int:
+        """Frames done or failed."""
+        return self.done + self.failed
 
     @property
     def frames_per_minute(self) -> float:
@@ -96,10 +93,6 @@ def run_sequence(
         if told["what"] == "begun":
             begun[told["frame"]] = begun.get(told["frame"], 0) + 1
             return
-        if told["what"] == "share":
-            progress.parts[told["frame"]] = told["share"]
-        else:  # the chunk's frames are counted one by one now
-            progress.parts.pop(told["frame"] // length * length, None)
         progress.done += told["what"] == "done"
         progress.failed += told["what"] == "failed"
         on_progress(progress)
@@ -149,8 +142,7 @@ def _in_worker(plan: SequencePlan, first: int, last: int, topic: str) -> None:
     worker = get_worker()
     torch.set_num_threads(plan.threads or max(1, CPU_COUNT // worker.state.nthreads))
     keep_freed_memory()
-    work = reconstruct_jointly if plan.settings.temporal == "joint" else reconstruct_frames
-    work(plan, first, last, lambda told: worker.log_event(topic, told))
+    reconstruct_frames(plan, first, last, lambda told: worker.log_event(topic, told))
 
 
 def outcome_table(store: SequenceStore) -> str:

@@ -20,18 +20,16 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
-from nerif.common.written_files import OwnFiles, remove_empty
 from nerif.data.measurement_sequence import MeasurementSequence, add_frames, check_store
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import FIELDS, VolumeSequence, score_names
 from nerif.fields.network import Network, NetworkShape, NeuralField
-from nerif.fields.space_time import SpaceTimeField, SpaceTimeNetwork
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.bounds import in_units
 
-__all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore", "chunk_tau"]
+__all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore"]
 
 KIND = "nerif sequence 1"  # attribute `kind` of the store
 MISSING, DONE, FAILED = 0, 1, 2
@@ -102,9 +100,6 @@ class SequenceStore(VolumeSequence):
         """
         like, frames = sequence.fullest(), len(sequence)
         check_store(path, FIELDS)
-        for kept in _checkpoints(path).glob("*"):
-            OwnFiles(kept).remove()
-        remove_empty(_checkpoints(path))
         names = [kind.name for kind in like.techniques]
         about = {"kind": KIND, "network": vars(network), "views": list(like.names), "techniques": names, **attributes}
         with atomic(path) as part:
@@ -131,11 +126,6 @@ class SequenceStore(VolumeSequence):
         return cls(path)
 
     # -- frames --------------------------------------------------------------------------------------------------
-
-    @property
-    def checkpoints(self) -> Path:
-        """Where joint networks in training are kept, beside the store."""
-        return _checkpoints(self.path)
 
     @property
     def symmetry(self) -> Symmetry | None:
@@ -188,7 +178,6 @@ class SequenceStore(VolumeSequence):
             raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
         with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
             network = _network(self.attributes, self.grid.box, float(self.read("index_scale", index)))
-            length = int(self.attributes["chunk"]) if isinstance(network, SpaceTimeNetwork) else 1
         weights, at = torch.from_numpy(self.read("weights", index)), 0
         scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
         parameters = list(network.parameters())
@@ -201,11 +190,7 @@ class SequenceStore(VolumeSequence):
                 parameter.copy_(weights[at : at + parameter.numel()].reshape(parameter.shape))
                 at += parameter.numel()
         network.eval().requires_grad_(False)
-        if not isinstance(network, SpaceTimeNetwork):
-            return NeuralField(network, self.grid.box, scale, offset)
-        first = index // length * length
-        tau = chunk_tau(self.times, index, first, min(first + length, len(self)))
-        return SpaceTimeField(network, self.grid.box, tau, scale, offset)
+        return NeuralField(network, self.grid.box, scale, offset)
 
     def check_same(self, attributes: dict[str, Any]) -> None:
         """Refuse to go on with other settings than the store was begun with.
@@ -228,24 +213,12 @@ class SequenceStore(VolumeSequence):
                 )
 
 
-def _checkpoints(path: Path) -> Path:
-    return path.with_name(path.name + ".joint")
-
-
 def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0) -> Network:
     """An empty network of the kind that a store was made with, for a field in a box in units of `scale`."""
     shape = NetworkShape.of(attributes["network"])
     low, high = attributes.get("bounds", (None, None))  # JSON knows no infinity
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
-    if attributes.get("temporal") == "joint":
-        return SpaceTimeNetwork(shape, int(attributes["time_octaves"]), bounds)
     if attributes.get("symmetry"):
         own = Symmetry.kept(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
         return SymmetricNetwork(shape, own, bounds)
     return Network(shape, bounds=bounds)
-
-
-def chunk_tau(times: Sequence[float], index: int, first: int, last: int) -> float:
-    """Return the instant of a frame in [-1, 1], the first and the last frame of its chunk at the ends."""
-    span = times[last - 1] - times[first]
-    return 2 * (times[index] - times[first]) / span - 1 if span > 0 else 0.0
