@@ -6,7 +6,6 @@ import base64
 import os
 import zlib
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,39 +18,60 @@ from nerif.geometry import Box, Grid
 
 __all__ = ["read_vti", "write_vti"]
 
+BLOCK = 1 << 20  # bytes that are compressed at a time
+LEVEL = 5  # of zlib, that of VTK
+
 
 def write_vti(
     path: str | os.PathLike[str], arrays: dict[str, Tensor], grid: Grid, attributes: dict[str, float | str]
 ) -> None:
-    """Write (z, y, x) arrays as point data of a VTK image, x fastest, atomically; lengths in mm."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkStringArray
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+    """Write (z, y, x) arrays as point data of a VTK image, x fastest, atomically; lengths in mm.
 
+    Source: VTK XML file formats, docs.vtk.org (ImageData, appended raw data in blocks packed by zlib).
+    """
     nz, ny, nx = grid.shape
-    image = vtkImageData()
-    image.SetDimensions(nx, ny, nz)
-    image.SetSpacing(*grid.spacing)
-    image.SetOrigin(*(float(grid.axis(a)[0]) for a in "xyz"))
-    for quantity, values in arrays.items():
-        array = numpy_to_vtk(values.cpu().contiguous().numpy().ravel(), deep=True)
-        array.SetName(quantity)
-        image.GetPointData().AddArray(array)
-    image.GetPointData().SetActiveScalars(next(iter(arrays)))
+    extent = f"0 {nx - 1} 0 {ny - 1} 0 {nz - 1}"
+    root = ElementTree.Element(
+        "VTKFile", type="ImageData", version="1.0", byte_order="LittleEndian", header_type="UInt64",
+        compressor="vtkZLibDataCompressor",
+    )  # fmt: skip
+    first = [grid.axis(a)[0] for a in "xyz"]
+    origin, spacing = (" ".join(repr(float(x)) for x in numbers) for numbers in (first, grid.spacing))
+    image = ElementTree.SubElement(root, "ImageData", WholeExtent=extent, Origin=origin, Spacing=spacing)
+    packed: list[bytes] = []
+
+    def add(parent: ElementTree.Element, tag: str, kind: str, name: str, content: bytes, **more: str) -> None:
+        where = {"format": "appended", "offset": str(sum(map(len, packed)))}
+        ElementTree.SubElement(parent, tag, type=kind, Name=name, **more, **where)
+        packed.append(_pack(content))
+
+    about = ElementTree.SubElement(image, "FieldData")
     for name, value in attributes.items():
-        entry: Any = vtkStringArray() if isinstance(value, str) else vtkDoubleArray()
-        entry.SetName(name)
-        entry.InsertNextValue(value if isinstance(value, str) else float(value))
-        image.GetFieldData().AddArray(entry)
-    writer = vtkXMLImageDataWriter()
-    with atomic(path) as part:
-        writer.SetFileName(str(part))
-        writer.SetInputData(image)
-        writer.SetDataModeToAppended()
-        writer.EncodeAppendedDataOff()
-        if not writer.Write():
-            raise InputError(f"{path}: could not be written; is the folder there, and the disk not full?")
+        if isinstance(value, str):
+            add(about, "Array", "String", name, value.encode() + b"\0", NumberOfTuples="1")
+        else:
+            add(about, "DataArray", "Float64", name, np.array(value, "<f8").tobytes(), NumberOfTuples="1")
+    piece = ElementTree.SubElement(image, "Piece", Extent=extent)
+    points = ElementTree.SubElement(piece, "PointData", Scalars=next(iter(arrays)))
+    for quantity, values in arrays.items():
+        numbers = values.cpu().contiguous().numpy()
+        kind = {"f4": "Float32", "f8": "Float64"}[numbers.dtype.str[1:]]
+        add(points, "DataArray", kind, quantity, numbers.astype(f"<{numbers.dtype.str[1:]}").tobytes())
+    ElementTree.SubElement(root, "AppendedData", encoding="raw").text = "_"
+    before, after = ElementTree.tostring(root).split(b"_</AppendedData>")
+    with atomic(path) as part, part.open("wb") as file:
+        file.write(before + b"_")
+        for content in packed:
+            file.write(content)
+        file.write(b"</AppendedData>" + after)
+
+
+def _pack(content: bytes) -> bytes:
+    """Compress by zlib in blocks, behind the header of VTK: number of blocks, size of each and of the last, sizes."""
+    blocks = [content[at : at + BLOCK] for at in range(0, len(content), BLOCK)]
+    packed = [zlib.compress(block, LEVEL) for block in blocks]
+    header = [len(blocks), BLOCK, len(content) % BLOCK, *map(len, packed)]
+    return np.array(header, "<u8").tobytes() + b"".join(packed)
 
 
 def read_vti(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
