@@ -1,23 +1,13 @@
-"""Do the views of a measurement agree with one another? And if not, which one is it, and what happened to it?
+"""Consistency of the views of a measurement: does each agree with the others, and if not, what is wrong with it?
 
-Each view is predicted by a quick reconstruction from the others. Mistakes that happen (mistakes.py) are undone one at a
-time: the one that lets a reconstruction from all views fit clearly better is reported, then looked for another. What
-fits equally well either way cannot be found: a flipped sign of everything, a mirrored picture of a symmetric flow.
+Each view is predicted by a quick reconstruction from the others. Common mistakes (components swapped, signs, mirrored
+or exchanged images, ...) are undone one at a time; the one whose removal clearly improves a fit to all views is
+reported, then the next is searched. What fits equally well either way cannot be detected: all signs flipped, or a
+mirrored image of a symmetric flow.
 
-Mistakes that happen between a camera and a measurement, each as the change that undoes it.
-
-What is wrong with a measurement as a whole: rims that are not at rest, and flow that goes on beyond the box.
-
-Small pictures of a measurement by one technique, quick reconstructions from them, and what those predict.
-
-A measurement without the mistakes that were found in it (consistency.py).
-
-Is any view predicted by the others at all? And if none is, which error of the whole rig explains it?
-
-The agreement of a view with what the others predict cannot be more than that of its pixels with their neighbours, which
-noise lowers alike. Where it is a small part of that in most views, the rig is wrong as a whole. Errors that are common
-in calibrations (geometry/plausibility.py), and pictures under the names of other cameras, are undone one at a time, and
-the one without which views agree is the likely cause.
+Where most views are not predicted at all, the rig as a whole is wrong. The limit is a share of the correlation of
+neighbouring pixels, which noise lowers alike. Common errors of calibrations (geometry/plausibility.py) and images under
+the names of other cameras are undone one at a time, and the one that restores agreement is the likely cause.
 """
 
 from __future__ import annotations

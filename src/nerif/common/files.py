@@ -1,8 +1,6 @@
-"""Files and stores that appear whole or not at all.
+"""Files that appear whole or not at all: atomic writes, TOML and JSON.
 
-TOML files, written whole, read, and refused in words; and the keys that people mistype in them.
-
-JSON files: written whole or not at all, with null for numbers that are none.
+TOML is checked for misspelled keys when read; JSON has null for numbers that are not finite.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A Measurement: cameras, and what each of them saw by one technique or by several.
-
-What cameras saw by one technique, and whether it can be.
-"""
+"""A measurement: cameras, and the maps that they recorded by one or several techniques."""
 
 from __future__ import annotations
 

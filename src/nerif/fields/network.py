@@ -1,13 +1,9 @@
-"""The paper's network (App. A): encoding, fully connected layers with a skip, four heads for n and grad(n).
+"""The paper's network (App. A): sinusoidal encoding, fully connected layers with a skip, heads for n and grad(n).
 
-The gradient of the n head by automatic differentiation is the reverse pass *written out as forward operations*:
-one more pass through the transposed layers. So the training loss, which holds this gradient, needs a single call of
-autograd, and the whole can be compiled (`torch.compile` cannot differentiate twice).
-
-Sinusoidal encoding of coordinates, octave by octave along several directions, with its derivative written out.
-
-The paper's (Eq. (postionencode)) runs along the axes; waves along the diagonals as well let a network meet fronts that
-lie askew.
+The encoding runs along the axes, as in the paper (Eq. (postionencode)), and along the diagonals, so that oblique
+fronts are represented too. The gradient of the n head is the reverse pass written out as forward operations, one more
+pass through the transposed layers. The training loss, which contains this gradient, then needs a single call of
+autograd and can be compiled (`torch.compile` cannot differentiate twice).
 """
 
 from __future__ import annotations

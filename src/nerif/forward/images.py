@@ -1,20 +1,14 @@
-"""Pictures: background-oriented schlieren without optical flow. The flow picture is compared with the reference, moved.
+"""Background-oriented schlieren from images, without optical flow: the flow image against the displaced reference.
 
     flow(p) = g(p) reference(p - d(p)) + o(p),     d the path integral of deflection (deflection.py)
 
-Every pixel counts as it was measured, with the noise of the camera. Around a displacement d_0 that is known, from
-windows or as 0, the difference is linear in the field:
+Every pixel has its measured value and the camera noise. The reference between pixels is its cubic B-spline. Gain g and
+offset o vary slowly over an image, because of flickering light and flame emission: polynomials of DEGREE, fitted for
+each view. About a known displacement d_0 (from correlation windows, or 0) the difference is linear in the field:
 
     g reference(p - d) = g reference(p - d_0) - g grad(reference)(p - d_0) . (d - d_0)
 
-Source: Grauer and Steinberg, Exp. Fluids 61 (2020) 80 (unified BOS, linear); the warped form is nonlinear.
-
-Reference pictures moved by a displacement, and made as bright as the flow pictures.
-
-    flow(p) = g(p) reference(p - d(p)) + o(p)
-
-The reference between pixels is the cubic B-spline through them. Gain g and offset o vary slowly over a picture, as
-light flickers and a flame shines of its own: polynomials of DEGREE, fitted view by view.
+Source: Grauer and Steinberg, Exp. Fluids 61 (2020) 80 (unified BOS, linear); the displaced form is nonlinear.
 """
 
 from __future__ import annotations

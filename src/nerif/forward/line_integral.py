@@ -1,8 +1,6 @@
-"""What absorption, emission and interferometry have in common: the integral of the field along the straight ray.
+"""The straight-ray integral shared by absorption, emission and interferometry.
 
     y = weight integral f ds
-
-Whether a map can be what a technique says it measures, within its noise.
 """
 
 from __future__ import annotations

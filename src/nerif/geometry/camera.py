@@ -1,18 +1,16 @@
-"""The camera: OpenCV's, perspective or telecentric, with five distortion coefficients, looking at a background plane.
+"""The camera: a perspective or telecentric projection with five distortion coefficients, looking at a background plane.
 
-x_cam = R x_world + t,   (x, y) = projection(x_cam) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
+    x_cam = R x_world + t,   (x, y) = projection(x_cam) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
 
-The two projections: where a point of the camera's frame is in the image plane, and the line that is seen there.
+    perspective    (x, y) = (X/Z, Y/Z)    rays through the optical centre; K holds focal lengths, px
+    telecentric    (x, y) = (X, Y)        rays parallel to the optical axis; K holds px per mm
 
-    perspective    (x, y) = (X/Z, Y/Z)    lines through the optical centre; K holds focal lengths, px
-    telecentric    (x, y) = (X, Y)        lines parallel to the optical axis; K holds px per mm
-
-Distortion and K act on (x, y) alike: pixel = K distorted(x, y, 1).
-
-Brown's distortion with OpenCV's five coefficients, and its inverse.
+Distortion, with r^2 = x^2 + y^2:
 
     x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
-    y_d = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y,        r^2 = x^2 + y^2
+    y_d = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+Source: D. C. Brown, Close-range camera calibration, Photogramm. Eng. 37 (1971); conventions of OpenCV.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""What a pixel gathers: the rays from all of a lens's disc that meet in one point in focus, of a window of pixels all.
+"""The ray bundle of a pixel: rays from the lens aperture that meet in the plane in focus, over a window of pixels.
 
-    L = O + r (x e_1 + y e_2),  |(x, y)| <= 1        a point of the disc about the camera's centre O, of radius r
+    L = O + r (x e_1 + y e_2),  |(x, y)| <= 1        a point of the aperture about the camera's centre O, radius r
     X_f = O + s_f t                                  in focus on the pixel's own ray, O + s t
-    p' = p + w (a, b),  |a|, |b| <= 1                a pixel of the window about p, of half the edge w
-
-Records of arrays that have one entry each for many things alike, such as rays.
+    p' = p + w (a, b),  |a|, |b| <= 1                a pixel of the window about p, w half its edge
 """
 
 from __future__ import annotations

@@ -1,17 +1,15 @@
-"""Fields that are alike around an axis or along a line: which places have the same value.
+"""Axisymmetric, nearly axisymmetric and planar fields: coordinates in which the field is constant.
 
 With w = F (x - p), F the frame (rows e1, e2, e3) and p a point,
 
     axis      (r, h) = (sqrt(w1^2 + w2^2 + d^2), w3)     e3 along the axis through p, d a length that rounds it
-    planar    (r, h) = (w1, w3)                           e2 along the line on which nothing changes
+    planar    (r, h) = (w1, w3)                           e2 along the direction in which the field is constant
 
-A nearly axisymmetric field has N harmonics of the angle around the axis beside: with u = (w1 + i w2) / r,
+A nearly axisymmetric field has N azimuthal harmonics as well: with u = (w1 + i w2) / r,
 
     f(x) = sum_k D_k(u) f_k(r, h),     D_k = (1 + 2 sum_m Re(u^m exp(-i m a_k))) / K,    a_k = 2 pi k / K,   K = 2 N + 1
 
-so that f_k is the field at the angle a_k, and nothing but its mean is left on the axis.
-
-The axis of a symmetric flow, as it was found near the one named.
+f_k is the field at the azimuth a_k; on the axis only the mean remains.
 """
 
 from __future__ import annotations

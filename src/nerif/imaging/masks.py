@@ -1,7 +1,4 @@
-"""Where the flow is in a picture, by threshold or drawn by hand; where that is not known, flow may be.
-
-Masks drawn by hand: polygons and strokes of a brush, one over the other, and the pictures that nerif mask reads.
-"""
+"""Flow masks: where there may be flow in an image, by threshold or drawn by hand as polygons and brush strokes."""
 
 from __future__ import annotations
 

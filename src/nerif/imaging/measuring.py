@@ -1,9 +1,7 @@
-"""From the pictures of an experiment to a measurement, of one instant or of many.
+"""From the images of an experiment to a measurement, of one instant or of many.
 
-What the pictures without flow say of a view is worked out once (RestingView); each instant is then measured against
-it. One measurement of an experiment is a film of one instant, whose views are looked at one after the other.
-
-What all views measured, put together as one measurement.
+What follows from the reference images of a view is computed once (RestingView); each instant is compared with it. A
+single measurement is a film of one instant.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""Backgrounds to print: random dots, wavelet noise, multi-scale noise.
+"""Backgrounds (random dots, wavelet noise, multi-scale noise) and calibration targets, printed at true size.
 
 A pattern is a raster of reflectance, 0 black to 1 white. The dot size is the length of its smallest features on paper;
-seen by the camera it should cover 2 to 5 px (Raffel, Background-oriented schlieren techniques, Exp. Fluids 56 (2015)).
-
-Backgrounds and calibration targets as files to print at true size.
+in the image it should cover 2 to 5 px (Raffel, Background-oriented schlieren techniques, Exp. Fluids 56 (2015)).
 """
 
 from __future__ import annotations

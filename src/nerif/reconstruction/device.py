@@ -1,10 +1,8 @@
-"""Where to compute, in which precision, and how much memory it took.
+"""Device, precision, memory and threads of a computation.
 
-How many threads compute: the same of torch and Numba, and no more than there are cores that nobody else uses.
-
-Threads that share a step wait for one another in a loop. Where one of them has to share its core with another program
-all of them wait for it, many times in a step: two threads on two cores, one of which is taken, are eight times slower
-than one (benchmarks/results/busy-cpu.md).
+Torch and Numba use the same number of threads, at most the number of cores that no other program uses. Threads that
+share a step wait for one another: two threads on two cores, one of them busy, take eight times as long as one thread
+(benchmarks/results/busy-cpu.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The field and the checkpoint on disk: weights in safetensors, the rest as plain JSON beside them.
-
-Whether two runs see the same data: a digest of each part of a measurement.
-"""
+"""The field and the checkpoint on disk: weights in safetensors, the rest as JSON; digests of the data of a run."""
 
 from __future__ import annotations
 

@@ -1,15 +1,13 @@
-"""The symmetry that a reconstruction is asked for, about the axis that is named or found.
+"""The symmetry axis of a reconstruction: as given, or estimated together with the field on a coarse grid.
 
-Where the axis of a symmetric flow is: found together with the field, on a coarse grid, held by what is known of it.
+    min  |A(t) c - y|^2 / sigma^2 + weight |L c|^2 + |t / t_sigma|^2,     t = (shift, tilt) towards e1 and e2
 
-    min  |A(t) c - y|^2 / sigma^2 + weight |L c|^2 + |t / t_sigma|^2,     t = (shift, lean) towards e1 and e2
-
-by Gauss-Newton steps in coefficients and axis at once, so that the field follows. With N the normal matrix,
+by Gauss-Newton steps in the coefficients c and the axis t. With N the normal matrix,
 covariance of t = (N_tt - N_tc N_cc^-1 N_ct)^-1.
 
-What is left of a picture by a field about a wrong axis is odd where the field is even, so the shift and the lean in the
-picture are found within a few steps. e1 is turned across the way the cameras look. Where they all look along e2, shift
-and lean towards them change the picture by no more than a field somewhat different does, and stay as they are given.
+An axis in the wrong place leaves an antisymmetric residual, so a few steps determine shift and tilt in the image plane.
+e1 is perpendicular to the viewing direction. Where all cameras look along e2, shift and tilt towards them cannot be
+determined and are kept as given.
 """
 
 from __future__ import annotations

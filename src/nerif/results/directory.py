@@ -1,7 +1,4 @@
-"""A result directory: the names of its files, how each is written and read, and what is told where one is missing.
-
-A quick look at a result directory, for a list of many.
-"""
+"""A result directory: the names of its files, how each is written and read, and the message where one is missing."""
 
 from __future__ import annotations
 

@@ -1,18 +1,13 @@
-"""A first guess of a whole rig, by the way that its projection needs, as a bundle to adjust.
+"""Initial cameras and target poses for bundle adjustment, perspective or telecentric.
 
-A first guess of telecentric cameras from flat targets.
+Perspective cameras are solved one at a time, then linked through the target poses they share.
 
-Along parallel lines a camera sees an affine picture of the target, whose larger singular value is the camera's scale,
-and whose ratio of singular values is the cosine of the target's tilt. The sign of the tilt does not show: each picture
-has two rotations. Two cameras that see the same poses decide between them, up to the mirror image of the whole rig
-(`mirrored`).
+A telecentric camera sees an affine image of a flat target: the larger singular value is the scale of the camera, the
+ratio of the singular values the cosine of the target's tilt. The sign of the tilt is ambiguous, so each image has two
+rotations. Two cameras with common poses resolve it, up to the mirror image of the whole rig (`mirrored`).
 
 Sources: Tomasi & Kanade, Shape and motion from image streams under orthography, Int. J. Comput. Vis. 9 (1992) 137;
 Collins & Bartoli, Infinitesimal plane-based pose estimation, Int. J. Comput. Vis. 109 (2014) 252.
-
-A first guess of perspective cameras: each one alone, then from camera to camera through the poses they share.
-
-A first guess of a rig, of either projection: what it holds, and why there is none.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""What a network is trained on: rays with what they measured, and points where the index is known to be ambient.
+"""Training data: rays with their measured values, and points at which the refractive index is ambient.
 
-A random order without a list of it: a permutation that is computed where it is asked.
-
-A Feistel network on pairs of numbers below a = ceil(sqrt(count)) exchanges the two, each time adding a hash of one to
-the other, modulo a; that is one-to-one whatever the hash. The few numbers that it carries to count or beyond are sent
-through it again until they are below.
+Rays are drawn in a random order computed on demand, by a Feistel network on pairs of numbers below
+a = ceil(sqrt(count)): each round exchanges the two and adds a hash of one to the other, modulo a, which is one-to-one.
+Numbers at or beyond count pass through it again.
 
 Source: Black & Rogaway, Ciphers with arbitrary finite domains, CT-RSA (2002).
 """
