@@ -57,8 +57,7 @@ def _reconstructed(number: int) -> dict[str, float | str]:
     from nerif.physics.quantities import GasSettings
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
-    from nerif.reconstruction.uncertainty.bootstrap import Trials
-    from nerif.reconstruction.uncertainty.repetition import VOXELS, Found
+    from nerif.reconstruction.uncertainty.bootstrap import VOXELS, Found, Trials
     from nerif.workflow.pipeline import Run, reconstruct_into
 
     torch.set_num_threads(1)

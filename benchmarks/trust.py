@@ -1,4 +1,4 @@
-"""What standard deviations are worth (nerif reconstruct --uncertainty, --ensemble): does the truth lie within them?
+"""What standard deviations are worth (nerif reconstruct --uncertainty): does the truth lie within them?
 
     python benchmarks/trust.py --write benchmarks/results/trust-cpu.md
 
@@ -35,8 +35,6 @@ AVERAGED = 0.04  # of the box edge
 KINDS: dict[str, dict[str, Any]] = {
     "fast": {"uncertainty": "fast"},
     "full": {"uncertainty": "full"},
-    "ensemble": {"ensemble": 6},
-    "left out": {"ensemble": 6, "leave_one_out": True},
 }
 GOALS = (0.63, 0.73), (0.93, 0.97)
 
@@ -88,7 +86,7 @@ def case(
     flow = truth.abs() > FLOW * truth.abs().max()
     width = AVERAGED * VOXELS
     local = np.sqrt(gaussian_filter(error.double().numpy() ** 2, width))[flow.numpy()]
-    coverage, repeated = metrics["coverage"], metrics.get("uncertainty") or metrics["ensemble"]
+    coverage, repeated = metrics["coverage"], metrics["uncertainty"]
     numbers = (
         found["l2_variation"], coverage["share_in_one_in_flow"], coverage["share_in_flow"], coverage["spearman"],
         float(spearmanr(local, std[flow].numpy()).statistic), float(std[flow].norm() / error[flow].norm()),

@@ -56,7 +56,6 @@ def judged(**metrics: Any) -> Any:
         ({"views": SMEARED, "first_look": FIRST}, "use with care"),
         ({"views": SEEN, "first_look": FIRST, "outcome": "interrupted"}, "use with care"),
         ({"views": SEEN, "first_look": FIRST, "outcome": "diverged"}, "do not use"),
-        ({"views": SEEN, "ensemble": {"members": 3, "left_out": [view("a", 0.09, True)]}}, "use"),
         ({"views": [{"name": "a", "held_out": False, "rms": 0.1, "measured": "displacement"}]}, "cannot tell"),  # older
     ],
 )  # fmt: skip

@@ -13,7 +13,6 @@ SMALLEST = {
     "calibration": "--views 2 --arc 20 --pixels 320 --poses 8 --backgrounds 2",
     "choices": "--points 256 --pixels 12 --time-limit 5",
     "displacement": "--pixels 64 --phantom gaussians --background dots --method correlation",
-    "ensemble": "--members 2 --steps 5 --phantoms gaussians --noise 0.05 --leave-one-out no",
     "flame": "--pixels 12 --noise 0.1 --preset fast --time-limit 5 --voxels 12",
     "paper_preset": "--phantom gaussians --seeds 1 --pixels 12 --points 300 --epochs 0.05",
     "methods": "--phantom gaussians --noise 0.1 --pixels 12 --voxels 12 --time-limit 5",

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import shutil
+import signal
 from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import xarray as xr
 
 from nerif.cli.cli import main
-from nerif.data.volume_file import read_volumes
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volumes, write_netcdf
+from nerif.fields.grid import VoxelField
+from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import Outcome
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
@@ -107,13 +114,75 @@ def test_trials_that_are_there_are_not_done_again(measured, tmp_path):
     assert main(["reconstruct", str(measured), "-o", str(out), *words, "--uncertainty", "fast"]) == 0
     with xr.open_dataset(out / "volume.nc") as volume:
         before = volume["index_excess_std"].values
-    stamps = {p: p.stat().st_mtime_ns for p in sorted((out / "ensemble").rglob("field.safetensors"))}
+    stamps = {p: p.stat().st_mtime_ns for p in sorted((out / "trials").rglob("field.safetensors"))}
     assert len(stamps) == 2
-    (out / "ensemble" / "02" / "field.safetensors").write_bytes(b"broken")
+    (out / "trials" / "02" / "field.safetensors").write_bytes(b"broken")
     assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
     with xr.open_dataset(out / "volume.nc") as volume:
         np.testing.assert_allclose(volume["index_excess_std"].values, before, rtol=1e-4)
     assert [p.stat().st_mtime_ns != stamp for p, stamp in stamps.items()] == [False, True]
+
+
+def test_a_trial_that_diverged_is_named(measured, tmp_path, capsys, monkeypatch):
+    calls, plain = [], Tikhonov.__call__
+
+    def third_diverges(self, *arguments, **named):
+        calls.append(1)
+        result = plain(self, *arguments, **named)
+        return replace(result, outcome=Outcome("diverged", "of itself")) if len(calls) == 3 else result
+
+    monkeypatch.setattr(Tikhonov, "__call__", third_diverges)
+    words = ["reconstruct", str(measured), "-o", str(tmp_path / "r"), *QUICK, "--uncertainty", "fast"]
+    assert main([*words, "--hold-out", "none"]) == 0
+    assert "trial 2 diverged" in capsys.readouterr().out
+    about = json.loads((tmp_path / "r/metrics.json").read_text())["uncertainty"]
+    assert (about["members"], about["diverged"]) == (1, [2])
+    assert "Trials 2 diverged" in (tmp_path / "r/report.html").read_text()
+
+
+def test_coverage_counts_the_voxels_of_the_truth(result, tmp_path):
+    """A truth of half the box is compared within it, not beyond."""
+    out = Path(shutil.copytree(result[0], tmp_path / "r"))
+    volumes = read_volumes(out / "volume.nc")
+    half = Grid(Box((-25.0, -25.0, 0.0), (25.0, 25.0, 25.0)), (5, 10, 10))
+    both = (volumes["index_excess"], volumes["index_excess_std"])
+    field, std = (VoxelField.through(v.values, v.grid).sample(half) for v in both)
+    shift = torch.full(half.shape, 1.0)
+    shift[:, :, ::2] = 3.0  # standard deviations off: half of the voxels lie within two
+    write_netcdf(tmp_path / "t.nc", [Volume(field + shift * std, half, attributes={"n_ambient": 1.00027})])
+    assert main(["evaluate", str(out), "--truth", str(tmp_path / "t.nc")]) == 0
+    coverage = json.loads((out / "metrics.json").read_text())["coverage"]
+    assert coverage["share"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_ctrl_c_in_the_second_trial_keeps_the_first_and_resume_goes_on(measured, result, tmp_path, capsys, monkeypatch):
+    from nerif.cli.commands import output
+
+    out, plain = tmp_path / "r", output.progress_bar
+
+    def interrupting(title):
+        if "trial 2" not in title:
+            return plain(title)
+
+        class Bar:
+            def __enter__(self):
+                return lambda step: os.kill(os.getpid(), signal.SIGINT)
+
+            def __exit__(self, *exception):
+                return None
+
+        return Bar()
+
+    monkeypatch.setattr(output, "progress_bar", interrupting)
+    words = ["reconstruct", str(measured), "-o", str(out), *QUICK, "--uncertainty", "fast", "--no-report"]
+    assert main(words) == 0
+    assert "interrupted after 1 of 2" in capsys.readouterr().out
+    assert (out / "volume.nc").is_file()
+    monkeypatch.setattr(output, "progress_bar", plain)
+    assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
+    with xr.open_dataset(out / "volume.nc") as a, xr.open_dataset(result[0] / "volume.nc") as b:
+        spread, undisturbed = a["index_excess_std"].values, b["index_excess_std"].values
+        assert abs(spread - undisturbed).max() < 0.01 * undisturbed.max()  # a solver begins anew, to the same end
 
 
 def test_a_run_that_failed_is_not_repeated(measured, tmp_path, monkeypatch):
@@ -138,7 +207,6 @@ def test_a_run_that_failed_is_not_repeated(measured, tmp_path, monkeypatch):
     ("more", "words"),
     [
         (["--uncertainty", "quick"], "uncertainty: expected one of off, fast, full, got 'quick'"),
-        (["--uncertainty", "fast", "--ensemble", "3"], "uncertainty: expected off together with --ensemble"),
     ],
 )
 def test_refusals(measured, tmp_path, capsys, more, words):

@@ -53,7 +53,7 @@ def contents(directory: Path) -> set[str]:
 
 
 def test_a_forced_run_removes_what_the_one_before_wrote_and_nothing_else(result, said):
-    own = ("figures/drawn_by_hand.svg", "ensemble/notes.txt", "ensemble/01/remark.txt", "notes.txt", "measurement.nc")
+    own = ("figures/drawn_by_hand.svg", "trials/notes.txt", "trials/01/remark.txt", "notes.txt", "measurement.nc")
     for name in own:
         put(result / name)
     result.begin({"seed": 2})

@@ -476,7 +476,7 @@ def test_where_no_quantum_is_left_the_absorbance_is_large():
 
 
 def test_noise_alone_is_not_an_offset(measured):
-    """A member of an ensemble has noise added to that of the measurement, and no sigma."""
+    """Noise added to that of the measurement is no offset."""
     noisy = measured["emission"].maps["radiance"]
     noise = torch.randn(noisy.shape, generator=torch.Generator().manual_seed(2))
     noisy = noisy + 0.06 * noisy.nan_to_num().max() * noise

@@ -143,8 +143,8 @@ def test_files_say_what_they_hold(absorption, both, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "reconstruction of extinction coefficient" in said
     assert "n_ambient" not in said
-    # of an ensemble the field is still found among its statistics
-    named = [replace(volume, quantity=f"extinction{ending}") for ending in ("", "_mean", "_std")]
+    # the field is found among its statistics
+    named = [replace(volume, quantity=f"extinction{ending}") for ending in ("", "_std")]
     write_netcdf(tmp_path / "e.nc", named)
     assert read_volume(tmp_path / "e.nc").quantity == "extinction"
     assert field_of(["density", "temperature"]) is None

@@ -64,7 +64,7 @@ def test_what_does_not_split_is_refused(measured, tmp_path, monkeypatch, capsys)
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), "--method", "tv"]) == 2
     assert "under torchrun" in capsys.readouterr().err
-    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), "--ensemble", "2"]) == 2
+    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), "--uncertainty", "fast"]) == 2
     assert "under torchrun" in capsys.readouterr().err
 
 

@@ -22,13 +22,13 @@ QUICK = [
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four views of balls in a box of three different edges, one held out, with an ensemble and a truth."""
+    """Four views of balls in a box of three different edges, one held out, with error bars and a truth."""
     folder = tmp_path_factory.mktemp("report")
     measurement, out = str(folder / "m.nc"), str(folder / "balls")
     box = ["--box", "50", "40", "30"]
     assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", measurement, *RIG, *box]) == 0
     run = ["reconstruct", measurement, "-o", out, "--hold-out", "170deg", *QUICK]
-    assert main([*run, "--ensemble", "2", "--leave-one-out", "--no-report"]) == 0
+    assert main([*run, "--uncertainty", "fast", "--no-report"]) == 0
     assert main(["evaluate", out, "--truth", str(folder / "m.truth.nc")]) == 0
     assert main(["report", out]) == 0
     return folder / "balls"

@@ -213,7 +213,7 @@ def test_colours_do_not_go_to_a_few_outliers(volume):
     [
         ("n", "n − 1 [1]"),
         ("density_std", "standard deviation of density [kg m⁻³]"),
-        ("temperature_mean", "mean of temperature [K]"),
+        ("temperature_std", "standard deviation of temperature [K]"),
         ("concentration", "concentration [1]"),
     ],
 )

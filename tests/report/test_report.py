@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,8 +47,9 @@ def test_page_is_whole_and_needs_no_network(whole):
     ]
     assert len(own_scripts) == 3
     assert not any(re.search(r"fetch\(|XMLHttpRequest|WebSocket|importScripts", s) for s in own_scripts)
-    for words in ("What was measured", "What came out", "Can it be trusted", "held out", "170deg", "Ensemble of",
-                  "Against the truth", "Gladstone-Dale", "101325 Pa", "arXiv:2409.14722"):  # fmt: skip
+    for words in ("What was measured", "What came out", "Can it be trusted", "held out", "170deg",
+                  "Error bars by 2 trials", "Against the truth", "Gladstone-Dale", "101325 Pa",
+                  "arXiv:2409.14722"):  # fmt: skip
         assert words in text, words
 
 
@@ -62,8 +62,7 @@ def test_figures_on_the_page_are_those_of_the_files(whole):
     assert f"CC {number(held['cc'], 5)}" in page
     assert f"{number(held['rms_px'], 3)} px = {held['rms_over_sigma']:.2f} σ" in page
     assert f"L2 {metrics['l2']:.2%}" in page
-    assert metrics["ensemble"]["members"] == 2
-    assert {v["name"] for v in metrics["ensemble"]["left_out"]} == {"0deg", "56.6667deg"}
+    assert metrics["uncertainty"]["members"] == 2
     assert 0 <= metrics["coverage"]["share"] <= 1
 
 
@@ -101,19 +100,18 @@ def test_statistics_are_masked_on_the_page_where_they_are_in_the_file(tmp_path):
     spread = Volume(torch.full(excess.grid.shape, 1e-6), excess.grid, "index_excess_std")
     std = Volume(torch.full(excess.grid.shape, 4e-3), excess.grid, "density_std", "kg m-3")
     std.values[1, 2, 3] = float("nan")
-    found = {v.quantity: v for v in (excess, density, spread, replace(spread, quantity="index_excess_mean"), std)}
+    found = {v.quantity: v for v in (excess, density, spread, std)}
     scene, arrays = scene_of(Result(tmp_path, volumes=found))
     assert scene is not None
     shown = unpack({**scene["arrays"]["density_std"], "text": arrays["density_std"]}, excess.grid.shape)
     np.testing.assert_array_equal(np.isnan(shown), np.isnan(std.values.numpy()))
-    assert "density_mean" not in scene["arrays"]  # nowhere masked: a function of the index excess
 
 
 def test_a_volume_of_128_stays_below_15_megabytes(tmp_path):
     excess = smooth((128, 128, 128))
     values = {q: derive(excess, q, GasSettings()) for q in ("n", "density", "temperature")}
-    more = {f"index_excess_{s}": excess for s in ("mean", "std")}
-    more |= {f"temperature_{s}": values["temperature"] for s in ("mean", "std")}
+    more = {f"index_excess_{s}": excess for s in ("std",)}
+    more |= {f"temperature_{s}": values["temperature"] for s in ("std",)}
     html.write(html.render(Result(tmp_path, volumes={"index_excess": excess, **values, **more})), tmp_path / "r.html")
     assert (tmp_path / "r.html").stat().st_size < 15e6
 
@@ -246,7 +244,7 @@ def test_leftovers_are_named_with_where_they_point(tmp_path):
         ({"views": [view(True, 0.99, None)]}, "note", "No training view"),
         ({}, "warning", "not compared with any view"),
         ({"views": [view(False, 0.99, 1.0), view(True, 0.99, 1.0)], "cc": 0.5, "l2_variation": 0.9}, "bad", "90.0%"),
-        ({"views": [view(False, 0.99, 1.0)], "ensemble": {"members": 3, "diverged": [2]}}, "warning", "Members 2"),
+        ({"views": [view(False, 0.99, 1.0)], "uncertainty": {"members": 3, "diverged": [2]}}, "warning", "Trials 2"),
         ({"outcome": "diverged", "message": "loss is NaN"}, "bad", "loss is NaN"),
         ({"outcome": "collapsed", "message": "nothing there"}, "bad", "found no field. nothing there"),
         ({"outcome": "interrupted"}, "warning", "--resume"),
@@ -284,7 +282,7 @@ def test_a_truth_that_moved_with_the_result_is_found(copy):
     ("name", "text", "words"),
     [
         ("metrics.json", '{"views": [1]}', "views"),
-        pytest.param("metrics.json", '{"ensemble": 2}', "ensemble", marks=pytest.mark.slow),
+        pytest.param("metrics.json", '{"uncertainty": 2}', "uncertainty", marks=pytest.mark.slow),
         pytest.param("metrics.json", '{"coverage": {}}', "coverage", marks=pytest.mark.slow),
         pytest.param("metrics.json", "[]", "table", marks=pytest.mark.slow),
         ("history.csv", "a,b\n1,2\n", "seconds"),

@@ -251,9 +251,7 @@ def _held_out(asked: Sequence[str] | None, settings: dict[str, Any], measurement
 
 
 def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
-    """How often the truth lies within the standard deviations, if there are any: from the ensemble's mean or, where
-    there is none, from the reconstruction.
-    """
+    """How often the truth lies within the standard deviations of the reconstruction, if there are any."""
     found = directory.volumes() if directory.has(VOLUME) else {}
     quantity = directory.quantity()
     if f"{quantity}_std" not in found:
@@ -264,7 +262,7 @@ def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
             return volume.values
         return VoxelField.through(volume.values, volume.grid).sample(truth.grid)
 
-    centre = on_its_grid(found.get(f"{quantity}_mean", found[quantity]))
+    centre = on_its_grid(found[quantity])
     std = on_its_grid(found[f"{quantity}_std"])
     flow = truth.values.abs() > FLOW * truth.values.abs().max()
     return {"coverage": coverage((truth.values - centre).numpy(), std.numpy(), flow.numpy())}

@@ -247,12 +247,10 @@ def _from_views(
     metrics = result.metrics
     first = metrics.get("first_look") or {}
     noise = _noise(fitted)
-    left_out = (metrics.get("ensemble") or {}).get("left_out") or []
     own = [v for v in first.get("fitted_views") or [] if _complete(v)]
     share = _explained(own, noise)
     for withheld, basis in (
         ([v for v in views if v["held_out"]], "cross-validated on a withheld view"),
-        (left_out, "cross-validated view by view"),
         (first.get("views") or [], "cross-validated in a first run without a view"),
     ):
         shown = [v for v in withheld if _complete(v) and v["measured"] in noise and v["measured"] in _kinds(withheld)]

@@ -45,7 +45,6 @@ AMBIENT_INDEX = 1.00027
 """Of air at 20 °C and one atmosphere, where nothing else is said."""
 
 STATISTICS = {
-    "mean": "mean",
     "std": "standard deviation",
     "p05": "5th percentile",
     "p95": "95th percentile",

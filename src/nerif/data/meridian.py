@@ -26,7 +26,7 @@ __all__ = ["Meridian"]
 
 AROUND = 12  # places of a ring
 FINER = 2  # points along an edge of a voxel
-FROM_ONE = ("n", "n_mean")  # of which single precision would keep too few digits of n - 1
+FROM_ONE = ("n",)  # of which single precision would keep too few digits of n - 1
 
 
 @dataclass(frozen=True)

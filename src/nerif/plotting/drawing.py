@@ -113,7 +113,7 @@ def label_of(quantity: str) -> str:
 def shown(volume: Drawable) -> np.ndarray:
     """Return the values as they are shown, (z, y, x): n as n - 1, the others as they are."""
     values = volume.values.double().numpy()
-    return values - 1 if volume.quantity in ("n", "n_mean") else values
+    return values - 1 if volume.quantity == "n" else values
 
 
 def draw_slice(

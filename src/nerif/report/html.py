@@ -22,7 +22,7 @@ from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_s
 from nerif.report.moves_figure import draw_moved_rig, draw_moves
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
-from nerif.report.summary import came_out, headline, looked, measured, repeated, trust, trust_figures
+from nerif.report.summary import came_out, headline, looked, measured, trust, trust_figures
 from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import colour_table, view_images
 from nerif.results.directory import Result
@@ -73,7 +73,6 @@ def render(result: Result) -> str:
         first_view=first,
         scales=scales,
         scores=metrics,
-        left_out=repeated(result).get("left_out") or [],
         kept_out=looked(result),
         plane=_plane(meridian),
         plane_title="Around the axis" if meridian is None or meridian.axial else "In the plane of the flow",
@@ -83,7 +82,6 @@ def render(result: Result) -> str:
             for q in drawn_of(result.volumes)
             if "assumption" in result.volumes[q].notes
         ],
-        ensemble=result.metrics.get("ensemble"),
         trials=result.metrics.get("uncertainty"),
         coverage=result.metrics.get("coverage"),
         settings=flat(result.settings),

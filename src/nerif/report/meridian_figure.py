@@ -22,14 +22,14 @@ HEIGHTS = (0.25, 0.5, 0.75)  # shares of the height of the box, of profiles
 def _shown(meridian: Meridian, quantity: str) -> np.ndarray:
     """The values as they are shown: n as n - 1."""
     values = meridian.quantities[quantity]
-    return values - 1 if quantity in ("n", "n_mean") else values
+    return values - 1 if quantity == "n" else values
 
 
 def _banded(meridian: Meridian, quantity: str) -> Meridian:
-    """The `line` of a quantity, of an ensemble its mean; `low` and `high`, which hold 90 %, where it has deviations."""
+    """The `line` of a quantity; `low` and `high`, which hold 90 %, where it has standard deviations."""
     known = meridian.quantities
-    mean, std = f"{quantity}_mean", f"{quantity}_std"
-    found = {"line": _shown(meridian, mean if mean in known else quantity)}
+    std = f"{quantity}_std"
+    found = {"line": _shown(meridian, quantity)}
     if std in known:
         for name, (percentile, deviations) in zip(("low", "high"), TAILS.items(), strict=True):
             end = known.get(f"{quantity}_{percentile}")

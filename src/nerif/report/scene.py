@@ -36,13 +36,12 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     error = error_of(result)
     if error is not None:
         sources["error"] = packing.coarsen(error)
-    for statistic in ("mean", "std"):
-        if f"{whole.quantity}_{statistic}" in result.volumes:
-            sources[statistic] = packing.coarsen(result.volumes[f"{whole.quantity}_{statistic}"])
-        for quantity in ("density", "temperature"):
-            volume = result.volumes.get(f"{quantity}_{statistic}")
-            if volume is not None and _own(quantity, volume):
-                sources[volume.quantity] = packing.coarsen(volume)
+    if f"{whole.quantity}_std" in result.volumes:
+        sources["std"] = packing.coarsen(result.volumes[f"{whole.quantity}_std"])
+    for quantity in ("density", "temperature"):
+        volume = result.volumes.get(f"{quantity}_std")
+        if volume is not None and _own(quantity, volume):
+            sources[volume.quantity] = packing.coarsen(volume)
     packed = {
         name: packing.pack(volume.values.double().numpy(), packing.FINE if name == "value" else packing.COARSE)
         for name, volume in sources.items()
@@ -127,8 +126,6 @@ def _own(quantity: str, volume: Volume) -> bool:
 def _variants(sources: dict[str, Volume]) -> dict[str, str]:
     """What can be switched to, and its button."""
     found = {"value": "Reconstruction"}
-    if "mean" in sources:
-        found["mean"] = "Ensemble mean"
     if "std" in sources:
         found["std"] = "Standard deviation"
     if "error" in sources:

@@ -29,7 +29,7 @@ def slice_picture(volume: Volume, normal: str, index: int, limits: tuple[float, 
     axis = "zyx".index(normal)
     index = min(max(index, 0), volume.grid.shape[axis] - 1)
     plane = np.take(volume.values.numpy(), index, axis=axis)
-    if volume.quantity in ("n", "n_mean"):  # as drawing.shown has it
+    if volume.quantity == "n":  # as drawing.shown has it
         plane = plane.astype(np.float64) - 1
     return picture_address(plane[::-1], limits, colours)
 

@@ -89,7 +89,7 @@ def _ambient_temperature(result: Result) -> float | None:
 
 
 def trust_figures(result: Result) -> list[tuple[str, str]]:
-    """Return the figures by which to trust it: held-out and training views, outcome, truth, ensemble."""
+    """Return the figures by which to trust it: held-out and training views, outcome, truth, error bars."""
     held, seen = _views(result, True), _views(result, False)
     rows = []
     for title, views in (("Held-out view", held), ("Training views", seen)):
@@ -134,8 +134,7 @@ def trust_figures(result: Result) -> list[tuple[str, str]]:
         size = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
         name, unit = LABELS.get(base, (base, spread.unit))
         text = f"σ of {name} rms {with_unit(number(size, 2), unit)}"
-        kind, count = result.metrics.get("ensemble"), repetitions.get("members")
-        rows.append((f"Ensemble of {count}" if kind else f"Error bars by {count} trials", text))
+        rows.append((f"Error bars by {repetitions.get('members')} trials", text))
     coverage = result.metrics.get("coverage")
     if isinstance(coverage, dict):
         flow = coverage.get("share_in_flow")
@@ -211,11 +210,8 @@ def _of_outcome(result: Result) -> list[Statement]:
 
 def _of_held_out(result: Result) -> list[Statement]:
     seen, held = _views(result, False), _views(result, True)
-    left_out = repeated(result).get("left_out") or []
     what = "The field predicts"
-    if not held and left_out:
-        held, what = left_out, "Repetitions without a view predict"
-    elif not held and looked(result):
+    if not held and looked(result):
         held, what = looked(result), "A first, short run predicts"
     if not held:
         if not seen:
@@ -323,8 +319,8 @@ def _of_gas(result: Result) -> list[Statement]:
 
 
 def repeated(result: Result) -> dict[str, Any]:
-    """Return what metrics.json tells of repetitions, of an ensemble or of trials; nothing where there are none."""
-    found = result.metrics.get("ensemble") or result.metrics.get("uncertainty")
+    """Return what metrics.json has of the trials of the bootstrap; nothing where there are none."""
+    found = result.metrics.get("uncertainty")
     return found if isinstance(found, dict) else {}
 
 
@@ -332,8 +328,8 @@ def _of_repetitions(result: Result) -> list[Statement]:
     diverged = repeated(result).get("diverged") or []
     if not diverged:
         return []
-    names, which = ", ".join(map(str, diverged)), "trials" if "uncertainty" in result.metrics else "ensemble"
-    return [Statement("warning", f"Members {names} of the {which} diverged and are left out of the deviations.")]
+    names = ", ".join(map(str, diverged))
+    return [Statement("warning", f"Trials {names} diverged and are left out of the standard deviations.")]
 
 
 def _of_rig(result: Result) -> list[Statement]:

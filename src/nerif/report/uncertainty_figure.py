@@ -33,7 +33,7 @@ def draw_bands(axes: Axes, volumes: Mapping[str, Volume], quantity: str) -> Axes
     volumes : of a result, the quantity and its standard deviation among them, and its percentiles if it has some
     quantity : one of `banded`
     """
-    volume = volumes.get(f"{quantity}_mean", volumes[quantity])  # an ensemble's deviations are about its mean
+    volume = volumes[quantity]
     values, std = shown(volume), volumes[f"{quantity}_std"].values.double().numpy()
     ends = [volumes.get(f"{quantity}_{name}") for name in ("p05", "p95")]
     low, high = (

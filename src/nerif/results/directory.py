@@ -47,7 +47,7 @@ __all__ = [
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
 MERIDIAN, LIVE, LIVE_LOOK = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
-ENSEMBLE, FIRST_LOOK, FIGURES, CALIBRATION = "ensemble", "first_look", "figures", "calibration.toml"
+TRIALS, FIRST_LOOK, FIGURES, CALIBRATION = "trials", "first_look", "figures", "calibration.toml"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
@@ -81,7 +81,7 @@ class Result:
     about : the table [about] of run.toml: versions, outcome
     metrics : of metrics.json; empty if missing
     history : records of history.csv, blanks as NaN
-    volumes : by quantity; with an ensemble also index_excess_mean, index_excess_std, ...
+    volumes : by quantity; with error bars also index_excess_std, density_std, ...
     reprojection : measured and predicted views, or None
     measurement : what was measured, or None
     truth : field it was compared with, an index relative to the ambient of the result, or None
@@ -174,10 +174,10 @@ class ResultDirectory:
         self.files.set_aside([name for name in of_a_run if name != CALIBRATION])
         if self.has(CALIBRATION):
             self.files.say(f"{self.path / CALIBRATION}: left as it is; this run did not write it")
-        ensemble = self.path / ENSEMBLE
-        for folder in (*sorted(ensemble.glob("[0-9]*")), self.path / FIRST_LOOK, self.path / FIGURES):
+        trials = self.path / TRIALS
+        for folder in (*sorted(trials.glob("[0-9]*")), self.path / FIRST_LOOK, self.path / FIGURES):
             OwnFiles(folder, self.files.say).remove()
-        remove_empty(ensemble)
+        remove_empty(trials)
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
@@ -282,8 +282,8 @@ class ResultDirectory:
         return Reprojection.read(self.path / REPROJECTION)
 
     def member(self, number: int) -> ResultDirectory:
-        """Return the directory of one member of an ensemble."""
-        return ResultDirectory(self.path / ENSEMBLE / f"{number:02d}", self.files.say)
+        """Return the directory of one trial of the bootstrap."""
+        return ResultDirectory(self.path / TRIALS / f"{number:02d}", self.files.say)
 
     @property
     def first_look(self) -> ResultDirectory:
@@ -409,15 +409,14 @@ def _checked(found: Any) -> dict[str, Any]:
         if not isinstance(rows, list) or not all(isinstance(row, dict) and known in row for row in rows):
             raise ValueError(f"'{name}' is not a list of tables with '{known}'")
     for name, known in (
-        ("ensemble", "members"), ("uncertainty", "members"), ("coverage", "share"), ("first_look", "views"),
+        ("uncertainty", "members"), ("coverage", "share"), ("first_look", "views"),
     ):  # fmt: skip
         table = found.get(name, {known: 0})
         if not isinstance(table, dict) or known not in table:
             raise ValueError(f"'{name}' is not a table with '{known}'")
-    repeated = found.get("ensemble") or found.get("uncertainty") or {}
     first = found.get("first_look", {}).get("views") or []
     # older files knew displacements only
-    for row in (*found.get("views", []), *(repeated.get("left_out") or []), *first):
+    for row in (*found.get("views", []), *first):
         for key, value in (("measured", "displacement"), ("unit", "px"), ("rms", row.get("rms_px"))):
             row.setdefault(key, value)
     return found
@@ -442,7 +441,7 @@ def glance(path: str | os.PathLike[str]) -> Result:
     try:
         run = directory.settings()
         metrics = directory.metrics() if directory.has(METRICS) else {}
-        if {"uncertainty", "ensemble"} & set(metrics) and directory.has(VOLUME):
+        if "uncertainty" in metrics and directory.has(VOLUME):
             volumes = directory.volumes()
     except UNREADABLE as error:
         missing.append(Missing(RUN, " ".join(str(error).split())))

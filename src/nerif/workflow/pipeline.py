@@ -38,8 +38,6 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import Trials
-from nerif.reconstruction.uncertainty.ensemble import Ensemble
-from nerif.reconstruction.uncertainty.repetition import Repetitions
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.reconstruction.voxels.settings import VoxelReconstructor
@@ -74,10 +72,6 @@ class Run:
     """Result directory of another reconstruction in the same box, of any method, to start from."""
     fit_gains: bool = False
     """Of emission: fit how bright each camera sees, beside the field; views held out are taken as they are."""
-    ensemble: int = 0
-    """Reconstruct so many times more with other seeds and noise, for mean and standard deviation of every quantity."""
-    leave_one_out: bool = False
-    """Let each member of the ensemble do without one view, in turn."""
     uncertainty: str = "off"
     """Reconstruct the field that was found twice (fast) or eight times (full) more, as it would be measured again, for
     standard deviations of every quantity."""
@@ -167,7 +161,7 @@ def _reconstruct_into(
     if gains:
         monitor.say("gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in gains.items()))
         measurement, training = with_gains(measurement, gains), with_gains(training, gains)
-    repetitions = _repetitions(run, training)
+    trials = _trials(run)
     run = replace(run, gas=run.gas.for_measurement(measurement))
     if measurement.bad_pixels:
         where = "the measurement" if path is None else path
@@ -181,9 +175,9 @@ def _reconstruct_into(
                 "inverted; calibrate it with pictures of a target that reaches into its corners"
             )
     slow = SlowRun(reconstructor, monitor.say)
-    look = _first_look(out, run, reconstructor, training, repetitions, not resume, monitor.telling(slow))
+    look = _first_look(out, run, reconstructor, training, not resume, monitor.telling(slow))
     state = out.state() if resume and (look is None or out.has(CHECKPOINT) or not look.begun) else None
-    start = _start(run, measurement) if repetitions is not None or not resume else None
+    start = _start(run, measurement) if trials is not None or not resume else None
     if not resume:
         out.check_free(force)
     ranks = Ranks.from_environment()
@@ -216,15 +210,13 @@ def _reconstruct_into(
     _write(out, measurement, result, run, settings, gains, voxels, monitor, {"first_look": scores} if scores else {})
     _tell_axis(out, result, whole, monitor)
     try:
-        if repetitions is not None and result.outcome.failed:
-            monitor.say(f"{repetitions.word}: none of a run that {result.outcome.reason}")
-        elif repetitions is not None and result.outcome.reason != "interrupted":
+        if trials is not None and result.outcome.failed:
+            monitor.say(f"uncertainty: none of a run that {result.outcome.reason}")
+        elif trials is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
             known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
             watched = monitor if looked is None else looked.watching(monitor, held_out=False, looks=False)
-            members = Members(
-                out, repetitions, reconstructor, known, start, made_of, run.checkpoint_every, watched
-            )
+            members = Members(out, trials, reconstructor, known, start, made_of, run.checkpoint_every, watched)
             members.add_to(result, run.gas, voxels)
     finally:  # the verdict and the page of the main result, whatever becomes of the members
         made = out.read()
@@ -351,25 +343,17 @@ def _tell_axis(out: ResultDirectory, result: Reconstruction, whole: Measurement,
         monitor.say(line)
 
 
-def _repetitions(run: Run, training: Measurement) -> Repetitions | None:
-    """What is repeated to tell how far off the result may be, if anything; a wrong wish is refused before the work."""
+def _trials(run: Run) -> Trials | None:
+    """The trials of the bootstrap, if any; a kind that does not exist is refused before the work."""
     trials = Trials(run.uncertainty)
-    if run.ensemble:
-        if trials.members:
-            raise InputError(f"uncertainty: expected off together with --ensemble K, got '{run.uncertainty}'")
-        if run.leave_one_out and len(training.cameras) < 2:
-            raise InputError("leave_one_out: expected two training views or more, got one, which cannot be left out")
-        return Ensemble(run.ensemble, run.leave_one_out)
-    if run.leave_one_out:
-        raise InputError("leave_one_out: expected together with --ensemble K, got no ensemble")
     return trials if trials.members else None
 
 
 def _first_look(
-    out: ResultDirectory, run: Run, reconstructor: Reconstructor, training: Measurement,
-    repetitions: Repetitions | None, afresh: bool, monitor: Monitor,
+    out: ResultDirectory, run: Run, reconstructor: Reconstructor, training: Measurement, afresh: bool,
+    monitor: Monitor,
 ) -> FirstLook | None:  # fmt: skip
-    """The short run without a view, unless other runs without one are asked for, or the start has seen them all."""
+    """The short run without a view, unless the field to start from has seen all views."""
     if run.hold_out != AUTO or AUTO[0] in training.names or run.start_from is not None:
         return None
     if Ranks.from_environment().size > 1:
@@ -380,8 +364,6 @@ def _first_look(
             return None
         assert isinstance(reconstructor, SharedSettings)
         reconstructor, training = with_axis(reconstructor, axis.symmetry), halved(training, axis.symmetry)
-    if repetitions is not None and repetitions.without_views:
-        return None
     return FirstLook(out, reconstructor, training, run.checkpoint_every, monitor, afresh)
 
 
@@ -390,9 +372,8 @@ def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:
     if not isinstance(reconstructor, NeRIF):
         method = _method(reconstructor)
         raise InputError(f"method: expected nerif under torchrun, got '{method}', which runs in one process")
-    if run.ensemble or run.uncertainty != "off":
-        name = "ensemble" if run.ensemble else "uncertainty"
-        raise InputError(f"{name}: expected none under torchrun; run it in one process")
+    if run.uncertainty != "off":
+        raise InputError("uncertainty: expected off under torchrun; run it in one process")
 
 
 def _start(run: Run, measurement: Measurement) -> Field | None:

@@ -1,26 +1,27 @@
-"""How far off a reconstruction may be, from more of them whose errors are known.
+"""Bootstrap estimate of the error of a reconstruction: trials on a known field, the one that was found.
 
     std(x) = rho exp(C sqrt(1 - k^2)) (G * mean_j (q'_j - q)^2)^(1/2) (x)
     k^2 = <(q'_j - g * q'_j)^2> / <(q - g * q)^2>,    rho^2 = <(d - F q)^2> / <(d_j - F q'_j)^2>
 
-Trial q'_j is of a field that is known, the one that was found, q, seen by the same cameras. What it looks like is
-predicted, with what the reconstruction left unexplained added in blocks of random sign: whatever noise there is, of the
-right size and correlated as it is. How far the reconstruction of it is off is an error as q may have it.
+Trial q'_j is a reconstruction of the field q that was found, from its projections in the same cameras. The residuals of
+the reconstruction are added to them in blocks of random sign: noise of the right size and spatial correlation. The
+error of q'_j is then a sample of the error of q.
 
-But q is smoother than the truth: what a reconstruction cannot take up, no trial of q can miss. Trials tell how much
-that is by the detail of q that they keep themselves, the share k^2 of its squares, with g as fine as pixels see. Where
-they keep all of it errors are those of noise; where they do not, q has lost more of the truth than they of q. C was
-fitted to random flows (benchmarks/deviations.py). And q may explain what it was made from, d, better than trials do
-what they were, d_j, if it was trained for longer; then its errors are as much smaller, rho.
+q is smoother than the truth, and detail that the reconstruction cannot resolve is absent from q. How much is lost is
+estimated from the share k^2 of the detail of q that the trials keep, with g as fine as the pixels. Where they keep all
+of it the errors are those of noise; where they do not, q has lost more of the truth than the trials of q. C was fitted
+to random flows (benchmarks/deviations.py). If the reconstruction was trained longer than the trials, it fits its data d
+better than they fit theirs, d_j, and its errors are smaller by rho.
 
-One error is noisy, so squares are averaged around each voxel by a Gaussian G, WIDTH wide. No trial sees a truth.
+A single error is noisy, so squares are averaged around each voxel by a Gaussian G of width WIDTH. No truth is used.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import mean
 
@@ -32,13 +33,96 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, describe
+from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera, Grid
 from nerif.physics.quantities import GasSettings, derive, deviation
-from nerif.reconstruction.base import Reconstruction
-from nerif.reconstruction.uncertainty.repetition import Found, Maps, Member, other_seed
+from nerif.reconstruction.base import Reconstruction, Reconstructor
 
-__all__ = ["KINDS", "Deviations", "Trials", "best_covered"]
+__all__ = [
+    "KINDS",
+    "VOXELS",
+    "Deviations",
+    "Found",
+    "Maps",
+    "Member",
+    "Trials",
+    "best_covered",
+    "certainty",
+    "other_seed",
+]
+
+VOXELS = 64
+
+Maps = Mapping[str, Float[Tensor, "view row column c"]]
+"""What views see, or its noise, by the name of the technique."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What there is to repeat.
+
+    Parameters
+    ----------
+    result : of the reconstruction
+    reconstructor : settings it was made by
+    measurement : that it was made from
+    seen : gives what the views would see of a field, and of them those that are named
+    """
+
+    result: Reconstruction
+    reconstructor: Reconstructor
+    measurement: Measurement
+    seen: Callable[[Field], Maps]
+
+    @cached_property
+    def sampled(self) -> Volume:
+        """The result on VOXELS voxels along the longest edge, on which errors are compared."""
+        return self.result.volume(Grid.of_resolution(self.result.box, VOXELS))
+
+    @cached_property
+    def predicted(self) -> Maps:
+        """What the views see of the result as it is sampled, by a spline through it."""
+        return self.seen(VoxelField.through(self.sampled.values.double(), self.sampled.grid))
+
+
+@dataclass(frozen=True)
+class Member:
+    """One repetition.
+
+    Parameters
+    ----------
+    reconstructor : settings
+    measurement : what it is reconstructed from
+    expected : what it would find if it made no error
+    about : what is particular to it, in words
+    """
+
+    reconstructor: Reconstructor
+    measurement: Measurement
+    expected: Volume
+    about: str = ""
+
+
+def certainty(field: Volume, std: Volume) -> Volume:
+    """Return how sure a field is, from 0 to 1: q^2 / (q^2 + std^2), 0 where there is nothing to be sure of.
+
+    As the opacity of a volume it leaves out what is ambient and fades what is in doubt.
+
+    Source: the gain of Wiener's filter, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
+    """
+    signal, noise = field.values.double().square(), std.values.double().square()
+    values = torch.where(signal + noise > 0, signal / (signal + noise), 0.0).nan_to_num(0.0)
+    label = f"{field.quantity}_certainty"
+    return Volume(values.float(), field.grid, label, *describe(label)[:1], field.attributes)
+
+
+def other_seed(reconstructor: Reconstructor, number: int) -> Reconstructor:
+    """Return settings with another seed, if they have one."""
+    if not any(f.name == "seed" for f in dataclasses.fields(reconstructor)):  # type: ignore[arg-type]
+        return reconstructor
+    return replace(reconstructor, seed=getattr(reconstructor, "seed") + number)  # type: ignore[type-var]  # noqa: B009
+
 
 KINDS = {"off": 0, "fast": 2, "full": 8}
 """How many trials."""
@@ -67,29 +151,15 @@ class Trials:
             raise InputError(f"uncertainty: expected one of {', '.join(KINDS)}, got '{self.kind}'")
 
     @property
-    def word(self) -> str:
-        return "uncertainty"
-
-    @property
     def members(self) -> int:
+        """How many."""
         return KINDS[self.kind]
-
-    @property
-    def fewest(self) -> int:
-        return 1
-
-    @property
-    def without_views(self) -> bool:
-        return False
 
     def member(self, number: int, found: Found) -> Member:
         """Return a trial: of the field that was found, and what was left of the measurement with other signs."""
         drawn = torch.Generator().manual_seed(2_000_003 + number)
         reconstructor, about = other_seed(found.reconstructor, number), ", of a field that is known"
-        return Member(reconstructor, _simulated(found, drawn), (), found.sampled, about)
-
-    def taken(self, found: Found, main: Volume, gas: GasSettings) -> Deviations:
-        return Deviations(main, gas, found)
+        return Member(reconstructor, _simulated(found, drawn), found.sampled, about)
 
 
 def best_covered(cameras: Sequence[Camera]) -> list[str]:
@@ -171,16 +241,15 @@ class Deviations:
         return len(self.squares)
 
     def add(self, member: Member, result: Reconstruction) -> None:
-        """Take in what one more has found, if it is known what it should have."""
-        if member.expected is not None:
-            self.grid = member.expected.grid
-            both = result.volume(self.grid).values.double(), member.expected.values.double()
-            self.squares.append((both[0] - both[1]).square())
-            fine = [float((v - _blurred(v, self.grid, DETAIL * self.pixel)).square().mean()) for v in both]
-            if fine[1] > NONE * float(both[1].square().mean()):
-                self.detail.append((fine[0], fine[1]))
-            left = _left(member.measurement, self.found.seen(result.field))
-            self.left += [j / q for j, q in zip(left, self._left_by_it, strict=True) if q > 0]
+        """Add the error of one more trial."""
+        self.grid = member.expected.grid
+        both = result.volume(self.grid).values.double(), member.expected.values.double()
+        self.squares.append((both[0] - both[1]).square())
+        fine = [float((v - _blurred(v, self.grid, DETAIL * self.pixel)).square().mean()) for v in both]
+        if fine[1] > NONE * float(both[1].square().mean()):
+            self.detail.append((fine[0], fine[1]))
+        left = _left(member.measurement, self.found.seen(result.field))
+        self.left += [j / q for j, q in zip(left, self._left_by_it, strict=True) if q > 0]
 
     @cached_property
     def _left_by_it(self) -> list[float]:

@@ -65,7 +65,6 @@ async function main() {
     const own = arrays[chosen.quantity + "_" + chosen.variant];  // no linear function of the excess, or masked somewhere
     if (own) values.set(own);
     else if (chosen.variant === "std") for (let i = 0; i < count; i++) values[i] = arrays.std[i] * r.factor;
-    else if (chosen.variant === "mean") for (let i = 0; i < count; i++) values[i] = quantityOf(r, arrays.mean[i]);
     else if (chosen.variant === "truth") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i] - e[i]);
     else if (chosen.variant === "error") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i]) - quantityOf(r, v[i] - e[i]);
     else for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i]);
@@ -80,14 +79,12 @@ async function main() {
     let colours = q.colours, ambient = quantityOf(r, 0), level = q.level;
     if (chosen.variant === "error") { high = Math.max(-low, high); low = -high; colours = scene.diverging; }
     if (chosen.variant === "std") { low = 0; colours = "cividis"; }
-    if (chosen.variant === "value" || chosen.variant === "mean" || chosen.variant === "truth") {
-      // the same colours for all three, so that they can be compared
-      if (chosen.variant !== "value") ({ low, high } = display({ quantity: chosen.quantity, variant: "value" }));
-    }
+    // the truth in the colours of the field, so that they can be compared
+    if (chosen.variant === "truth") ({ low, high } = display({ quantity: chosen.quantity, variant: "value" }));
     if (spread) { ambient = 0; level = high / 2; }
     if (high === low) high = low + (Math.abs(low) || 1);
-    const what = { std: "standard deviation of ", mean: "mean of ", truth: "true ", error: "error of " }[chosen.variant] || "";
-    const borrowed = chosen.variant === "mean" || chosen.variant === "truth";
+    const what = { std: "standard deviation of ", truth: "true ", error: "error of " }[chosen.variant] || "";
+    const borrowed = chosen.variant === "truth";
     cache[key] = { borrowed, values, low, high, lowest, highest, ambient, level, table: scene.tables[colours], label: what + q.label, unit: q.unit };
     return cache[key];
   }
