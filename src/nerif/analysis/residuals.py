@@ -146,7 +146,7 @@ def _tested(residual: Map, predicted: Map | None, mask: Bool[np.ndarray, "row co
     return _Test(math.sqrt(energy), alike, shares, row, column)
 
 
-def _blocks(values: Map, edge: int) -> Map:
+def _blocks(values: Map, edge: int) -> Float[np.ndarray, "rows columns c"]:
     """Sums over blocks; a rim that fills none is left out."""
     rows, columns, channels = values.shape
     high, wide = rows // edge, columns // edge
