@@ -80,7 +80,7 @@ def test_a_technique_is_one_file():
     importing = [
         (path.relative_to(PACKAGE), node.module)
         for path in PACKAGE.rglob("*.py")
-        if path.relative_to(PACKAGE).parts[0] not in ("forward", "imaging")  # pictures become measurements of one technique
+        if path.relative_to(PACKAGE).parts[0] not in ("forward", "imaging")  # images become a measurement of one
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.ImportFrom) and node.module in others
     ]
