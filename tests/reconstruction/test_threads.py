@@ -23,7 +23,8 @@ from nerif.simulation.simulate import view_displacement
 NUMBA_STARTS = """
 import torch
 torch.set_num_threads(1)
-from nerif.reconstruction import fused, operator
+from nerif.reconstruction.neural import fused
+from nerif.reconstruction.voxels import operator
 operator._compiled()
 print(torch.get_num_threads())
 """

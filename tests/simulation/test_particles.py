@@ -98,6 +98,7 @@ def test_four_cameras_see_the_whole_box_from_30_degrees_aside():
     assert box.edges[1] > 5.0
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_quality_is_one_for_the_ideal_volume_whatever_its_scale():
     volume = Particles.draw(BOX, 30).volume(GRID).values
     assert quality_factor(3 * volume, volume) == pytest.approx(1)

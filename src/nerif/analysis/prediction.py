@@ -284,7 +284,7 @@ class SampledViews:
         return bent - straight
 
     def accuracy(
-        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Sequence[Float[Tensor, "row column c"]]
+        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Float[Tensor, "view row column c"]
     ) -> Accuracy:
         """Compare what was predicted with the path integral through the network, on pixels picked at random."""
         generator = torch.Generator().manual_seed(0)
