@@ -46,7 +46,7 @@ def test_views_by_way_of_voxels_are_near_the_integral_and_say_how_near(empty, mo
     near = torch.stack([views(camera) for camera in empty.cameras])
     apart, rms = (float(d[seen].square().mean().sqrt()) for d in (near - exact, exact))
     assert apart < 0.03 * rms
-    accuracy = views.accuracy(Deflection, empty.cameras, near)
+    accuracy = views.accuracy(Deflection, empty.cameras, list(near))
     assert accuracy.error == pytest.approx(apart, rel=0.25)
     assert accuracy.compared > 300
     assert "10 voxels" in accuracy.how

@@ -284,9 +284,9 @@ class SampledViews:
         return bent - straight
 
     def accuracy(
-        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Float[Tensor, "view row column c"]
+        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Sequence[Tensor]
     ) -> Accuracy:
-        """Compare what was predicted with the path integral through the network, on pixels picked at random."""
+        """Compare predicted views, (row, column, c) each, with the path integral through the field, on some pixels."""
         generator = torch.Generator().manual_seed(0)
         apart = []
         for camera, view in zip(cameras, predicted, strict=True):
