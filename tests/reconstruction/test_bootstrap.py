@@ -91,7 +91,7 @@ def test_what_trials_lose_of_the_detail_tells_what_was_lost_before(found):
         deviations = Deviations(bare, GasSettings(), found)
         for _ in range(2):
             trial = result_of(VoxelField.through(kept * bare.values.double(), grid), box)
-            deviations.add(Member(NeRIF(), found.measurement, (), bare), trial)
+            deviations.add(Member(NeRIF(), found.measurement, bare), trial)
         assert deviations.lost == pytest.approx(max(1 - kept**2, 0), abs=1e-4)
         ratio = float(deviations.std().values.norm() / (abs(1 - kept) * bare.values.norm()))
         assert ratio == pytest.approx(deviations.better * math.exp(LOST * deviations.lost**0.5), rel=0.02)
@@ -107,7 +107,7 @@ def test_errors_are_as_much_smaller_as_the_data_are_met_better_than_by_trials(fo
     assert deviations.better == 1.0  # of no trial
     for share in (worse, worse):
         data = replace(found.measurement, displacement=seen + share * left)
-        deviations.add(Member(NeRIF(), data, (), known), trial)
+        deviations.add(Member(NeRIF(), data, known), trial)
     assert deviations.better == pytest.approx(1 / worse if worse else 1.0, rel=1e-3)
 
 
@@ -117,7 +117,7 @@ def test_a_field_without_detail_has_lost_none(found):
     main = Volume.of(torch.full(grid.shape, -1e-4, dtype=torch.float64), grid, "index_excess", AMBIENT)
     deviations = Deviations(main, GasSettings(), found)
     flat = result_of(VoxelField.through(torch.full(grid.shape, -1.05e-4).double(), grid), box)
-    deviations.add(Member(NeRIF(), found.measurement, (), main), flat)
+    deviations.add(Member(NeRIF(), found.measurement, main), flat)
     std = deviations.std().values
     torch.testing.assert_close(std, torch.full_like(std, deviations.better * 5e-6), rtol=1e-3, atol=0)
 
@@ -140,8 +140,7 @@ def test_standard_deviations_average_the_squares_of_known_errors_around_each_vox
         error = size * torch.randn(coarse.shape, generator=drawn, dtype=torch.float64)
         expected = Volume.of(torch.full(coarse.shape, -1e-4).double(), coarse, "index_excess", AMBIENT)
         plain = result_of(VoxelField.through(expected.values + error, coarse), box)
-        deviations.add(Member(NeRIF(), found.measurement, (), expected), plain)
-    deviations.add(Member(NeRIF(), found.measurement, ("a",)), plain)  # of which no error is known
+        deviations.add(Member(NeRIF(), found.measurement, expected), plain)
     told = {v.quantity: v for v in deviations.volumes()}
     assert deviations.count == 2
     std = told["index_excess_std"].values
@@ -168,7 +167,7 @@ def test_temperatures_beyond_the_relation_are_masked_and_counted(found):
     deviations = Deviations(main, GasSettings(), found)
     plain = result_of(VoxelField.through(torch.full(grid.shape, -2.6e-4).double(), grid), box)
     expected = Volume.of(torch.full(grid.shape, -2.3e-4), grid, "index_excess", AMBIENT)
-    deviations.add(Member(NeRIF(), found.measurement, (), expected), plain)
+    deviations.add(Member(NeRIF(), found.measurement, expected), plain)
     told = {v.quantity: v for v in deviations.volumes()}
     assert told["temperature_p95"].notes["masked_voxels"] == grid.shape[0] ** 3
     k = told["density_std"].attributes["gladstone_dale_m3_kg-1"]

@@ -72,7 +72,7 @@ def test_the_short_run_has_not_seen_the_view(measurement, tmp_path):
 @pytest.mark.parametrize(
     "asked",
     [{"hold_out": ("none",)}, {"hold_out": ("72deg",)}],
-    ids=["none", "named", "left-out"],
+    ids=["none", "named"],
 )
 def test_none_is_kept_out_first_where_that_is_asked_or_told_otherwise(measurement, tmp_path, asked):
     out = ResultDirectory(tmp_path / "r")
