@@ -72,7 +72,7 @@ def _reconstructed(number: int) -> dict[str, float | str]:
         reconstruct_into(out, measurement, method, run, voxels=VOXELS)
         result = ResultDirectory(out)
         main = _read(result)
-        found = Found(main, method, measurement, dict, lambda field: reproject(field, measurement).maps)
+        found = Found(main, method, measurement, lambda field: reproject(field, measurement).maps)
         deviations = Deviations(found.sampled, GasSettings(), found)
         trials = Trials("fast")
         for trial in range(1, trials.members + 1):

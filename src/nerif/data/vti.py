@@ -41,8 +41,8 @@ def write_vti(
     packed: list[bytes] = []
 
     def add(parent: ElementTree.Element, tag: str, kind: str, name: str, content: bytes, **more: str) -> None:
-        where = {"format": "appended", "offset": str(sum(map(len, packed)))}
-        ElementTree.SubElement(parent, tag, type=kind, Name=name, **more, **where)
+        where = {"type": kind, "Name": name, **more, "format": "appended", "offset": str(sum(map(len, packed)))}
+        ElementTree.SubElement(parent, tag, where)
         packed.append(_pack(content))
 
     about = ElementTree.SubElement(image, "FieldData")
