@@ -25,7 +25,7 @@ class TotalVariation(WeightedVoxelReconstructor):
 
     Each round weights the squared gradient by 1 / |grad x| of the round before and takes a few conjugate-gradient
     iterations. A primal-dual method (Chambolle & Pock) was tried beside it and came down more slowly
-    (docs/architecture.md).
+    (docs/decisions/011).
 
     Source: Rudin, Osher & Fatemi, Physica D 60 (1992); Rodriguez & Wohlberg, IEEE Trans. Image Process. 18 (2009).
     """
