@@ -3,7 +3,7 @@
 Pictures are met only where the pattern is already at the right dot. So a network begins with the displacements, where
 there are some, else with pictures blurred by several pixels, and goes on with pictures that are SOFT. Between pixels a
 sharp pattern is not known: that much blur takes more from what cubic splines get wrong than from the pattern
-(docs/decisions/030).
+(docs/decisions/028).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ REFINED_FROM, REFINED_EVERY, REFINED_UNTIL, SLOWED_FROM = 0.1, 0.04, 0.94, 0.75 
 SHOWN_EARLY, SHOWN_UNTIL = 0.26, 0.5  # shares by which data have shown that a rig is off: clearly, or at all
 CLEARLY = 1.7
 FEWEST = 4  # samples of a ray through a lens
-MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (docs/decisions/027)
+MORE = 5  # rays through a lens, beyond two, that ask for as many samples as a thin ray has (docs/decisions/025)
 
 
 @dataclass(frozen=True)
