@@ -16,8 +16,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = (
     "index", "tutorial", "images", "sequences", "particles", "python", "choosing", "limits", "conventions", "method",
-    "pixels",
-    "formats", "benchmarks", "api", "contributing", "architecture", "decisions/index", "changelog", "api/geometry", "api/reconstruction",
+    "pixels", "decisions/index",
+    "formats", "benchmarks", "api", "contributing", "architecture", "changelog", "api/geometry", "api/reconstruction",
     "repository/benchmarks/results/methods-cpu", "repository/examples/own_data",
 )  # fmt: skip
 DRAWINGS = ("axes", "displacement", "volume", "lever_arm", "cone")
