@@ -64,6 +64,7 @@ def run(
         chunk=len(sequence), warm_steps=int(steps) or 1, warm_rate=rate or 0.7, voxels=voxels,
         quantities=("index_excess",),
     )  # fmt: skip
+    cold = replace(cold, network=cold.resolved_by(sequence.fullest()).network, wave_pixels=0)
     plan = SequencePlan(film, out, cold, settings)
     store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
     last = range(len(sequence) - compared, len(sequence))
@@ -89,6 +90,7 @@ def first_frame(film: Path, out: Path, cold: NeRIF, voxels: int) -> SequenceStor
     """The frame that the warm starts begin with: from nothing."""
     sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
     settings = SequenceSettings(chunk=len(sequence), voxels=voxels, quantities=("index_excess",))
+    cold = replace(cold, network=cold.resolved_by(sequence.fullest()).network, wave_pixels=0)
     plan = SequencePlan(film, out, cold, settings)
     store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
     reconstruct_frames(plan, 0, 1)
