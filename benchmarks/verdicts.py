@@ -132,6 +132,8 @@ def judge(table: Table, records: Sequence[Record]) -> None:
     table.text("", f'Error below {GOOD:.0%}: "do not use" in {share(good, WORDS[2])}; "use" in {good.count("use")}.')
     table.text("", f"Estimates within a factor of {FACTOR:g} of the error: {close(judged)} (goal: {NINE_IN_TEN:.0%}).")
     ratios = sorted(v.error / r.error for r, v in judged if v.error is not None)
+    if len(ratios) < 2:
+        return
     tenths = statistics.quantiles(ratios, n=10)
     spread = f"eight in ten {tenths[0]:.2f} to {tenths[-1]:.2f}"
     table.text(f"Estimate over error: median {statistics.median(ratios):.2f}, {spread}.")

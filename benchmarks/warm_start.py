@@ -13,7 +13,6 @@ from dataclasses import replace
 
 from bench import N_AMBIENT, Table, add_write
 from nerif.analysis.evaluation import evaluate_volume
-from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
@@ -61,7 +60,7 @@ def main() -> None:
         table.row([*cells, f"{m['cc']:.5f}"])
 
     tv = TotalVariation(voxels=arguments.voxels, basis="linear", device=arguments.device)
-    tv(Measurement(**vars(measurement)))  # compiles what is compiled once
+    tv(replace(measurement))  # compiles what is compiled once
     start = tv(measurement)
     add(f"TV {arguments.voxels}³ alone", "-", "-", start.seconds, start.seconds, start.field, start.device)
     for seconds in arguments.seconds:
