@@ -142,7 +142,7 @@ def _agreement(small: Measurement, voxels: int) -> float:
     return float(torch.tensor(reached).median())
 
 
-OF_GRADIENTS, OF_INTEGRALS = 3e-3, 3e-4  # weights by which views left out are predicted at their size, to some 10 %
+OF_GRADIENTS, OF_INTEGRALS = 3e-3, 3e-4  # weights with which withheld views are predicted at their size, to about 10 %
 SPIKE = 6.0  # times the 95th percentile: rays along a sharp edge, which no coarse reconstruction follows
 
 
@@ -352,7 +352,7 @@ class Change:
     code : of its Finding
     words : for people
     undo : the change that undoes it
-    everywhere : what it is called where it happened to all views; nothing where that cannot be told
+    everywhere : its name if all views have it; empty if that cannot be detected
     square : whether it can happen to square pictures only
     """
 
@@ -407,7 +407,7 @@ OF_SCALARS = (
 """Of maps with one number a pixel."""
 
 SIGN = Change("flipped", "the sign is flipped", lambda d: -d)
-"""Of one number a pixel that may be negative. A flipped sign of everything cannot be told."""
+"""Of one value per pixel that may be negative. A flipped sign of all values cannot be detected."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The command line: `nerif VERB ...`. One module of nerif.cli.commands a verb, loaded only when it is asked for."""
+"""The command line: `nerif VERB ...`. One module of nerif.cli.commands a verb, loaded on demand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the pixels see of a field: the path integral of a forward model (techniques/) along each ray."""
+"""The path integral of a forward model along each ray: what the pixels measure of a field."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class Reconstruction:
     device : where it ran
     state : to resume from, or None
     rig : what was refined of each view (refinement.py)
-    axis : of a symmetric flow, as it was found (axis.py); None where no symmetry was asked for
+    axis : of a symmetric flow, as it was found (symmetry.py); None where no symmetry was asked for
     """
 
     field: Field

@@ -432,7 +432,7 @@ def _number(text: str | None) -> float:
 def glance(path: str | os.PathLike[str]) -> Result:
     """Return what a verdict rests on: settings, figures, and the volumes where there are standard deviations.
 
-    Views and curves are left out, which makes it quick; what cannot be read is told in the Result.
+    Views and curves are not read, which makes it quick; files that cannot be read are listed in the Result.
     """
     directory, missing = ResultDirectory(path), []
     run: dict[str, Any] = {}

@@ -3,7 +3,7 @@
 1. a first guess of all poses in the world, which is the frame of one target pose (first_guess.py);
 2. bundle adjustment of everything (bundle.py), after which pictures that do not fit are left out, once;
 3. a plane through each camera's targets that lay on its background, and a look at what came out
-   (calibration_result.py).
+   (result.py).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ a loss whose derivatives in v and c_0 are given as g and e_0 has
     e_i = f'(a_i) (W_i e_{i-1}),   k_i = f'(a_i) d_i + f''(a_i) c_i (W_i e_{i-1}),   d_{i-1} = W_i^T k_i,   d_L = g w
     dW_i = u_i e_{i-1}^T + k_i h_{i-1}^T,   db_i = k_i,   dw = e_L + g h_L.
 
-The plain twin is in fields/mlp.py; tests compare the two.
+The plain twin is in fields/network.py; tests compare the two.
 """
 
 from __future__ import annotations

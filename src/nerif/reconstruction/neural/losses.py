@@ -4,7 +4,7 @@
 
 d_ND integrates central differences of n, d_net the gradient heads, d_AD the exact gradient of n; the first three
 terms are the paper's. The last but one is its noise-free twin, the last the gauge. What is integrated, and how the
-samples count, is the forward model's (techniques/); one that sees the field and not its gradient has one prediction,
+samples count, is the forward model's (forward/); one that sees the field and not its gradient has one prediction,
 weighed by w_n + w_h + w_a.
 """
 
@@ -56,7 +56,7 @@ class LossWeights:
 
 @runtime_checkable
 class Evaluator(Protocol):
-    """What the loss asks of a network; see fields/mlp.py."""
+    """What the loss asks of a network; see fields/network.py."""
 
     def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the n head."""

@@ -1,36 +1,26 @@
 """The optimiser of a network: Muon for the weight matrices and Adam for the rest, or Adam for all.
 
-Muon steps along the matrix U V^T nearest to the momentum U S V^T, so that each direction of a layer moves alike,
-however small its gradient. What that is worth: benchmarks/results/choices-cpu.md.
+Muon steps along the orthogonal matrix U V^T nearest to the momentum U S V^T, so that all directions of a layer move
+equally, however small their gradients (docs/decisions/003).
+
+    Muon   B <- mu B + (1 - mu) G,      U S V^T = mu B + (1 - mu) G,      W <- W - rate U V^T
+    Adam   m <- b1 m + (1 - b1) g,      v <- b2 v + (1 - b2) g^2,
+           w <- w - rate m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + 1e-8)
+
+U V^T comes from five steps of a Newton-Schulz iteration of fifth order, which leave its singular values in 0.7 to 1.2;
+on a CPU in float32, since products in bf16 take 14 to 40 times as long without AVX512-BF16. The optimisers of PyTorch
+import its compiler when they are made, which takes two seconds; its arithmetic does not (docs/decisions/017).
 
 A rate is that of the reference, a network of 4 x 128 and five octaves along the axes. In another shape each weight has
-a share of it, such that a step changes what a layer gives as much as in the reference, whatever the width
+a share of it, such that a step changes the output of a layer as much as in the reference, whatever the width
 (maximal-update parametrisation):
 
     Muon   |dW|_2 ~ sqrt(fan_out / fan_in)
     Adam   |dW_ij| ~ 1 / fan_in,      biases and first layer ~ 1
 
-Source: Kingma & Ba, Adam, ICLR (2015); Yang et al., Tensor Programs V, arXiv:2203.03466 (2022), for Adam; Yang, Simon &
-Bernstein, A spectral condition for feature learning, arXiv:2310.17813 (2023), for Muon.
-
-How weights are moved along their gradients: what Adam (adam.py) and Muon (muon.py) have in common.
-
-PyTorch's own optimisers import its compiler when they are made, which takes two seconds; their arithmetic does not.
-
-Adam: steps along the mean of the gradient over the root of its mean square, by PyTorch's arithmetic.
-
-    m <- b1 m + (1 - b1) g,    v <- b2 v + (1 - b2) g^2,    w <- w - rate m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + 1e-8)
-
-Source: Kingma & Ba, Adam, ICLR (2015).
-
-Muon: steps along the orthogonal matrix nearest to the momentum of the gradient.
-
-    B <- mu B + (1 - mu) G,      U S V^T = mu B + (1 - mu) G,      W <- W - rate U V^T
-
-U V^T comes from five steps of a Newton-Schulz iteration of fifth order, which leave its singular values in 0.7 to 1.2.
-On a CPU they are in float32: without AVX512-BF16, products in bf16 take 14 to 40 times as long.
-
-Source: Jordan et al., Muon (2024), kellerjordan.github.io/posts/muon.
+Source: Jordan et al., Muon (2024), kellerjordan.github.io/posts/muon; Kingma & Ba, Adam, ICLR (2015); Yang et al.,
+Tensor Programs V, arXiv:2203.03466 (2022), for Adam; Yang, Simon & Bernstein, A spectral condition for feature
+learning, arXiv:2310.17813 (2023), for Muon.
 """
 
 from __future__ import annotations

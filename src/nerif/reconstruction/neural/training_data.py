@@ -161,7 +161,7 @@ class TrainingData:
         self.sigma_known = self.target.sigma_known
 
     def advance(self, progress: float) -> bool:
-        """Give what is to be met at that share of a run, or of its first cycle; return whether a new part began."""
+        """Switch to the data of that share of a run, or of its first cycle; return whether a new part began."""
         reached = max(i for i, stage in enumerate(self.stages) if stage.begin <= progress)
         if reached <= self.stage:
             return False

@@ -24,7 +24,7 @@ __all__ = ["MOVED", "UNTOLD", "check_table", "kept_of", "moved_lines", "take_up"
 MOVED = 3.0  # sigma, by which a view counts as moved
 STILL = 1e-6  # sigma: rounding
 FEW = 3  # views, of which a field can be found that fits them wherever they stand, but for their heights
-UNTOLD = 0.3  # of what data tell of a view (rig_posterior.py): below it, next to nothing
+UNTOLD = 0.3  # of what data tell of a view (posterior.py): below it, next to nothing
 
 
 def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) -> Measurement:

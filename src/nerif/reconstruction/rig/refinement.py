@@ -1,6 +1,6 @@
 """A rig refined together with the field: where cameras stand and look, and what shifts their pictures.
 
-    d = A(theta_v) f + c_v + C_v x        theta_v: corrections of camera v (geometry/correction.py), x in the picture
+    d = A(theta_v) f + c_v + C_v x        theta_v: corrections of camera v (geometry/pose.py), x in the picture
     min  sum |d - measured|^2 / sigma^2 + sum theta^2 / sigma_theta^2
 
 Every number is held by its standard deviation. A step is one of Gauss and Newton against the field as it is, camera by

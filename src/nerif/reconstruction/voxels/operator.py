@@ -31,7 +31,7 @@ class VoxelOperator:
 
         (A c)_r = sum_m w_rm [A_r f(x_rm) + B_r grad f(x_rm)],    f(x) = sum_ijk c_ijk b_ijk(x)
 
-    Profile w, A and B are the model's (techniques/base.py); samples stand where rays cross evenly spaced planes
+    Profile w, A and B are the model's (forward/base.py); samples stand where rays cross evenly spaced planes
     (planes.py). `A(c)` applies the operator, `A.T(y)` its exact adjoint. On a CPU it runs on all cores (Numba), on CUDA
     in PyTorch. What a ray with a lens sees is the mean over thin rays through it, the more the wider they spread.
 
