@@ -35,9 +35,7 @@ def main() -> None:
     asked = parser.parse_args()
     size = (asked.pixels, asked.pixels)
     cameras = Ring(views=asked.views, image_size=size, pixel_pitch=0.02 * 200 / asked.pixels).cameras()
-    network = NeRIF(
-        network=NetworkShape(width=64), points_per_batch=4096, max_steps=asked.steps, device="cpu"
-    )
+    network = NeRIF(network=NetworkShape(width=64), points_per_batch=4096, max_steps=asked.steps, device="cpu")
     title = f"Extinction of a flame, {asked.views} views of {asked.pixels}² px, {asked.steps} steps"
     columns = ("counts", "largest absorbance", *(f"L2, {name}" for name in MODELS))
     table = Table(title, columns, asked.write)

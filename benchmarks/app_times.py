@@ -2,9 +2,9 @@
 
     python benchmarks/app_times.py out/demo --write benchmarks/results/app-times-cpu.md
 
-FOLDER is a project. --pictures 12 adds a project of its own with so many views of 2048 x 2048 px, 16 bit, in TIFF, each
-with reference and flow: thumbnails are made on the first visit of Pictures. A page is there when nothing of it changes
-any more: words, pictures, canvases. The first visit is that of a server that has just started.
+FOLDER is a project. --images 12 adds a project of its own with so many views of 2048 x 2048 px, 16 bit, in TIFF, each
+with reference and flow: thumbnails are made on the first visit of Images. A page is there when nothing of it changes
+any more: words, images, canvases. The first visit is that of a server that has just started.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from nerif.app.pages import PAGES
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 from browser_screenshots import chromium, served
 
-EDGE = 2048  # px of a large picture
+EDGE = 2048  # px of a large image
 STATE = """
 return [window.socket?.connected, document.querySelector('main')?.textContent,
         [...document.querySelectorAll('main img')].map((i) => i.complete && i.naturalWidth),
@@ -35,17 +35,17 @@ QUIET, LONGEST = 1.5, 60.0  # seconds in which nothing changes any more; that ar
 VISITS = 4
 
 
-def large_pictures(folder: Path, views: int) -> None:
+def large_images(folder: Path, views: int) -> None:
     """Write reference and flow of so many views of noise."""
     import tifffile
 
     drawn = np.random.default_rng(0)
     for view in range(views):
         for kind in ("reference", "flow"):
-            place = folder / "pictures" / f"cam{view:02d}" / kind
+            place = folder / "images" / f"cam{view:02d}" / kind
             place.mkdir(parents=True)
-            picture = drawn.integers(0, 4095, (EDGE, EDGE), dtype=np.uint16)
-            tifffile.imwrite(place / "0001.tif", picture)
+            image = drawn.integers(0, 4095, (EDGE, EDGE), dtype=np.uint16)
+            tifffile.imwrite(place / "0001.tif", image)
 
 
 def seconds_of(driver: Any, address: str) -> float:
@@ -83,16 +83,16 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="a project, such as out/demo")
-    parser.add_argument("--pictures", type=int, default=0, help="views of a project of large pictures; 0 for none")
+    parser.add_argument("--images", type=int, default=0, help="views of a project of large images; 0 for none")
     add_write(parser)
     asked = parser.parse_args()
     columns = ("project", "page", "first visit, s", f"median of {VISITS} more, s")
     table = Table("Start and pages of nerif app", columns, asked.write)
     measure(table, asked.folder.name, asked.folder)
-    if asked.pictures:
+    if asked.images:
         with tempfile.TemporaryDirectory() as place:
-            large_pictures(Path(place), asked.pictures)
-            measure(table, f"{asked.pictures} views of {EDGE}² px", Path(place))
+            large_images(Path(place), asked.images)
+            measure(table, f"{asked.images} views of {EDGE}² px", Path(place))
 
 
 if __name__ == "__main__":

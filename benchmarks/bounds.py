@@ -28,9 +28,7 @@ LOWEST = -2.7e-4
 
 def methods(steps: int, voxels: int) -> dict[str, Callable[[int], Reconstructor]]:
     """The methods by name, each for a seed."""
-    network = NeRIF(
-        network=NetworkShape(width=64), points_per_batch=4096, max_steps=steps, device="cpu"
-    )
+    network = NeRIF(network=NetworkShape(width=64), points_per_batch=4096, max_steps=steps, device="cpu")
     tv = TotalVariation(voxels=voxels, device="cpu")
     return {
         "NeRIF": lambda seed: replace(network, seed=seed),

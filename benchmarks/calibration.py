@@ -1,11 +1,11 @@
-"""How well a rig is found from target pictures alone: nine rendered cameras with mild distortion, none quite in place.
+"""How well a rig is found from target images alone: nine rendered cameras with mild distortion, none quite in place.
 
     python benchmarks/calibration.py --write benchmarks/results/calibration.md
 
 The rig: 640 x 512 px, lens of 50 mm on a 20 mm sensor, 700 mm to the middle, backgrounds 500 mm behind it; each
 camera is turned by about a degree, moved by some mm, its principal point off by some px, its background oblique.
 Errors are taken against the rig rendered: angle of rotation, largest component of the translation, largest distance
-between the planes anywhere in the picture. `stated` is what nerif calibrate itself says of rotation and position.
+between the planes anywhere in the image. `stated` is what nerif calibrate itself says of rotation and position.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate
 from nerif.imaging.readers.views import find_targets, find_views
 from nerif.simulation.experiment import Experiment, background_scale, world_axes
 
-COLUMNS = ("camera", "pictures", "rms [px]", "rotation [deg]", "stated", "translation [mm]", "stated", "position [mm]",
+COLUMNS = ("camera", "images", "rms [px]", "rotation [deg]", "stated", "translation [mm]", "stated", "position [mm]",
            "plane [mm]", "plane, rms [mm]")  # fmt: skip
 
 
@@ -73,10 +73,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--views", type=int, default=9)
     parser.add_argument("--arc", type=float, default=170.0, help="from the first camera to the last, degrees")
-    parser.add_argument("--pixels", type=int, default=640, help="width of the pictures")
+    parser.add_argument("--pixels", type=int, default=640, help="width of the images")
     parser.add_argument("--sensor", type=float, default=20.0, help="width of the sensor, mm")
     parser.add_argument("--poses", type=int, default=40, help="target poses free in space")
-    parser.add_argument("--backgrounds", type=int, default=5, help="pictures of the target on each background")
+    parser.add_argument("--backgrounds", type=int, default=5, help="images of the target on each background")
     parser.add_argument("--target", default="charuco")
     parser.add_argument("--seed", type=int, default=0)
     add_write(parser)

@@ -1,8 +1,8 @@
-"""Which optical flow: every method on rendered pairs of pictures, displacements up to 3 px, 12-bit noise.
+"""Which optical flow: every method on rendered pairs of images, displacements up to 3 px, 12-bit noise.
 
     python benchmarks/displacement.py --write benchmarks/results/displacement-cpu.md
 
-The truth is the displacement of the pinhole camera by curved rays; errors are taken 8 px inside the picture's edge.
+The truth is the displacement of the pinhole camera by curved rays; errors are taken 8 px inside the image's edge.
 `e / sigma` is the rms error in units of the sigma that the method itself states (five reference frames).
 """
 
@@ -46,7 +46,7 @@ class Scaled(Field):
 
 
 def pair(phantom: str, kind: str, pixels: int, dot: float) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Reference pictures, flow picture, true displacement; the phantom scaled so that the largest is LARGEST."""
+    """Reference images, flow image, true displacement; the phantom scaled so that the largest is LARGEST."""
     cameras, box = paper_rig(pixels)
     camera = cameras[0]
     field = make_phantom(phantom, box, 0)
@@ -65,7 +65,7 @@ def pair(phantom: str, kind: str, pixels: int, dot: float) -> tuple[list[np.ndar
 def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--pixels", type=int, nargs="+", default=[200, 1024], help="of an edge of the pictures")
+    parser.add_argument("--pixels", type=int, nargs="+", default=[200, 1024], help="of an edge of the images")
     parser.add_argument("--phantom", nargs="+", default=["gaussians", "flame"])
     parser.add_argument("--background", nargs="+", default=list(KINDS))
     parser.add_argument("--method", nargs="+", default=list(FLOWS))

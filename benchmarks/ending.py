@@ -2,7 +2,7 @@
 
     python benchmarks/ending.py --write benchmarks/results/ending-cpu.md
 
-The flame on the paper's rig in pictures of several sizes (full_size.py). The run without a limit ends when rays that
+The flame on the paper's rig in images of several sizes (full_size.py). The run without a limit ends when rays that
 no step is given are met no better, or after its longest time; the other has one schedule over all of its steps, and no
 rays held back. Each is a process of its own.
 """

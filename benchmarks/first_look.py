@@ -1,6 +1,6 @@
-"""What it costs to keep a view out first (nerif reconstruct --hold-out auto, the default), and what it does to fields.
+"""What it costs to keep a view out first (nerif reconstruct --withhold auto, the default), and what it does to fields.
 
-    python benchmarks/first_look.py ../shared/data/rigs --write benchmarks/results/first-look-cpu.md
+    python benchmarks/cross_validation.py ../shared/data/rigs --write benchmarks/results/cross-validation-cpu.md
 
 Each file is reconstructed without it and with it; everything is counted in that the command does.
 """
@@ -16,7 +16,7 @@ from bench import Table, add_write, alone
 from nerif.common.conventions import InputError
 
 
-def run(path: Path, truth: Path, method: str, limit: float, hold_out: str) -> tuple[float, float, float, float]:
+def run(path: Path, truth: Path, method: str, limit: float, withhold: str) -> tuple[float, float, float, float]:
     """Return L2, seconds, and how far off the view was predicted, before and in the end, in sigma; NaN where not."""
     from nerif.analysis.evaluation import evaluate
     from nerif.reconstruction.base import Reconstructor
@@ -32,11 +32,11 @@ def run(path: Path, truth: Path, method: str, limit: float, hold_out: str) -> tu
         settings = NeRIF(time_limit=limit, device="cpu")
     with tempfile.TemporaryDirectory() as folder:
         out, started = Path(folder) / "r", time.perf_counter()
-        reconstruct_into(out, path, settings, Run(hold_out=(hold_out,), report=False), voxels=64)
+        reconstruct_into(out, path, settings, Run(withhold=(withhold,), report=False), voxels=64)
         seconds = time.perf_counter() - started
         metrics = ResultDirectory(out).metrics()
         found = evaluate(out, truth=truth)
-    views = (metrics.get("first_look") or {}).get("views") or []
+    views = (metrics.get("cross_validation") or {}).get("views") or []
     before = views[0]["rms_over_sigma"] if views else float("nan")
     after = [v["rms_over_sigma"] for v in metrics["views"] if views and v["name"] == views[0]["name"]]
     return found["l2"], seconds, before, after[0] if after else float("nan")

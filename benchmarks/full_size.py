@@ -83,7 +83,7 @@ def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--pixels", type=int, nargs="+", default=[100, 1000], help="of an edge of each view")
-    parser.add_argument("--fewest", type=int, nargs="+", default=[0], help="bins along a picture at least; 0 as it is")
+    parser.add_argument("--fewest", type=int, nargs="+", default=[0], help="bins along an image at least; 0 as it is")
     parser.add_argument("--noise", type=float, default=0.05)
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds; 0: until it ends by itself")
@@ -92,9 +92,7 @@ def main() -> None:
     add_write(parser)
     arguments = parser.parse_args()
 
-    settings = replace(
-        preset(arguments.preset), time_limit=arguments.time_limit, epochs=0, device=arguments.device
-    )
+    settings = replace(preset(arguments.preset), time_limit=arguments.time_limit, epochs=0, device=arguments.device)
     more = f"; flame, 9 views, noise {arguments.noise:g}"
     table = Table("Cameras of full size", COLUMNS, arguments.write, more)
     with tempfile.TemporaryDirectory() as temporary:

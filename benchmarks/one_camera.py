@@ -147,7 +147,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--phantom", nargs="+", default=list(AXISYMMETRIC), choices=list(AXISYMMETRIC))
     parser.add_argument("--noise", type=float, nargs="+", default=[0.02, 0.05, 0.15], help="share of the rms")
     parser.add_argument("--half-angle", type=float, nargs="+", default=[1.0, 5.0, 10.0], help="degrees")
-    parser.add_argument("--pixels", type=int, default=100, help="of an edge of the picture")
+    parser.add_argument("--pixels", type=int, default=100, help="of an edge of the image")
     parser.add_argument("--seeds", type=int, default=3, help="of noise and training, whose median is shown")
     parser.add_argument("--only", nargs="+", default=["peers", "ours"], choices=["peers", "ours"])
     parser.add_argument("--methods", nargs="+", default=list(OURS), choices=OURS, help="of ours")

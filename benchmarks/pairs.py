@@ -1,10 +1,10 @@
-"""Real pairs of pictures: what optical flow leaves of the flow picture, and what a smooth displacement does.
+"""Real pairs of images: what optical flow leaves of the flow image, and what a smooth displacement does.
 
     python benchmarks/pairs.py ../shared/data/bos_pairs --write benchmarks/results/pairs-cpu.md
 
 The folder holds NAME_reference.tif and NAME_flow.tif. A displacement that is a function of the pixel alone, cubic
 B-splines of some spacing, is fitted to the grey values by the model of the reconstruction (gain and offset that vary
-slowly, pictures first blurred, then less). The residual is that of the unblurred pictures, in grey values, a margin
+slowly, images first blurred, then less). The residual is that of the unblurred images, in grey values, a margin
 of 20 px left out, each displacement with the gain and offset that suit it best.
 """
 
@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench import Table, add_write
-from nerif.forward.images import Pictures, References
+from nerif.forward.images import Images, References
 from nerif.imaging.displacement.displacement import DisplacementSettings, displacement
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.readers.open import open_frames
@@ -31,12 +31,12 @@ ROUNDS = 15  # of L-BFGS at each blur
 
 
 class Pair:
-    """A pair of pictures, as the reconstruction sees one."""
+    """A pair of images, as the reconstruction sees one."""
 
     def __init__(self, reference: np.ndarray, flow: np.ndarray, blur: float) -> None:
         size = [(flow.shape[0], flow.shape[1])]
         maps = {"reference": torch.tensor(reference)[None].float(), "flow": torch.tensor(flow)[None].float()}
-        maps = Pictures.softened(maps, size, blur) if blur else maps
+        maps = Images.softened(maps, size, blur) if blur else maps
         self.references = References(maps["reference"], size)
         self.references.match(maps["flow"])
         row, column = torch.meshgrid(*(torch.arange(n) for n in flow.shape), indexing="ij")
@@ -52,7 +52,7 @@ class Pair:
         self.references.fit(self.view[inner], self.pixel[inner], d[inner], self.flow[inner], one)
 
     def left(self, d: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
-        """Return the difference to the flow picture, grey values."""
+        """Return the difference to the flow image, grey values."""
         return self.references.seen(self.view, self.pixel, d) - self.flow
 
     def rms(self, d: Float[Tensor, "n 2"]) -> float:
@@ -62,7 +62,7 @@ class Pair:
 
 
 class Smooth:
-    """Displacements by cubic B-splines, which are the shape of a picture's own spline."""
+    """Displacements by cubic B-splines, which are the shape of an image's own spline."""
 
     def __init__(self, shape: tuple[int, ...], spacing: float) -> None:
         self.knots = [int(np.ceil((n - 1) / spacing)) + 4 for n in shape]
@@ -111,7 +111,7 @@ def main() -> None:
     add_write(parser)
     asked = parser.parse_args()
     columns = ["pair", "displacement", "rms [px]", "residual [grey values]", "without any", "s"]
-    table = Table("Real pairs of pictures", columns, asked.write)
+    table = Table("Real pairs of images", columns, asked.write)
     for path in sorted(asked.pairs.glob("*_reference.tif")):
         name = path.name.removesuffix("_reference.tif")
         reference, flow = (open_frames(asked.pairs / f"{name}_{what}.tif")[0] for what in ("reference", "flow"))

@@ -19,7 +19,7 @@ from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.presets import preset
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.simulation.particles.cloud import Particles, quality_factor
-from nerif.simulation.particles.pictures import pictures
+from nerif.simulation.particles.images import images
 from nerif.simulation.particles.rig import four_cameras
 from nerif.simulation.particles.ring import VortexRing
 from nerif.simulation.particles.velocity import velocity_between
@@ -50,7 +50,7 @@ class Case:
         self.grid = Grid.of_resolution(self.box, round(max(self.box.edges) / VOXEL))
         self.ideal = [particles.volume(self.grid) for particles in self.particles]
         self.seen = [
-            pictures(particles, self.cameras, arguments.counts, seed=2 * seed + i)
+            images(particles, self.cameras, arguments.counts, seed=2 * seed + i)
             for i, particles in enumerate(self.particles)
         ]
 
@@ -82,9 +82,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--per-pixel", type=float, nargs="+", default=[0.02, 0.05], help="particles a pixel")
     parser.add_argument("--method", nargs="+", default=["ideal", *METHODS[:2]], choices=["ideal", *METHODS])
-    parser.add_argument("--pixels", type=int, default=200, help="of an edge of each picture")
+    parser.add_argument("--pixels", type=int, default=200, help="of an edge of each image")
     parser.add_argument("--depth", type=int, default=40, help="of the volume, in pixels")
-    parser.add_argument("--counts", type=float, default=1000.0, help="quanta of a particle in a picture")
+    parser.add_argument("--counts", type=float, default=1000.0, help="quanta of a particle in an image")
     parser.add_argument("--variation", type=float, default=0.0, help="of brightness: deviation of its logarithm")
     parser.add_argument("--displacement", type=float, default=4.0, help="of the fastest particles, voxels")
     parser.add_argument("--window", type=int, default=24, help="of the correlation, voxels")

@@ -138,9 +138,7 @@ def _fronts(box: Box, drawn: random.Random, seed: int) -> Bodies:
     return Bodies(box, scalar, *where, front=1.0, fade=0.0, wrinkling=drawn.choice((0.0, 0.1, 0.3)), thickness=thin)
 
 
-def _places(
-    box: Box, drawn: random.Random, count: int, sizes: tuple[float, float]
-) -> tuple[Tensor, Tensor, Tensor]:
+def _places(box: Box, drawn: random.Random, count: int, sizes: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
     """Centres, shapes and amplitudes of bodies that stay off the sides; one in three reaches through bottom and top."""
     generator = torch.Generator().manual_seed(drawn.randrange(1 << 30))
     centres, shapes = [], []

@@ -2,8 +2,8 @@
 
     python benchmarks/rigs.py ../shared/data/rigs --write benchmarks/results/rigs-cpu.md
 
-The folder holds measurement files and truth.nc (index excess on voxels), made by others; the row `pictures` renders its
-own, of 200² px through lenses at f/8 (pictures.py). Each row is a process of its own, alone on the machine.
+The folder holds measurement files and truth.nc (index excess on voxels), made by others; the row `images` renders its
+own, of 200² px through lenses at f/8 (images.py). Each row is a process of its own, alone on the machine.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pictures
+import images
 from bench import Table, add_write, alone
 
-PICTURES = "pictures"
-GOALS = {"thin": None, "f16": 0.0045, "f8": 0.0060, "f4": 0.015, "window6": None, PICTURES: 0.012}
+IMAGES = "images"
+GOALS = {"thin": None, "f16": 0.0045, "f8": 0.0060, "f4": 0.015, "window6": None, IMAGES: 0.012}
 """Rigs in the order of the table, and the L2 that NeRIF is to reach on them in 90 s."""
 REFINED: dict[str, tuple[tuple[str, ...], float | None, float | None]] = {
     "thin": (("cameras", "shift"), None, None),
@@ -42,15 +42,15 @@ class Way:
 
 def ways(name: str, method: str) -> list[Way]:
     """Return the ways in which a rig is reconstructed, those that know of its fault first."""
-    if name == PICTURES:
-        return [Way(source="pictures"), Way()]
+    if name == IMAGES:
+        return [Way(source="images"), Way()]
     found = [Way(), *([Way("off")] if name.startswith(("f", "window")) else [])]
     return found + ([Way(refine=REFINED[name][0])] if name in REFINED and method == "nerif" else [])
 
 
 def goals(name: str, method: str, way: Way) -> tuple[float | None, float | None]:
     """Return the L2 that is to be reached, and that after the best rigid motion."""
-    if method != "nerif" or way.aperture != "auto" or (name == PICTURES and way.source != PICTURES):
+    if method != "nerif" or way.aperture != "auto" or (name == IMAGES and way.source != IMAGES):
         return None, None
     return REFINED[name][1:] if way.refine else (GOALS.get(name), None)
 
@@ -89,9 +89,9 @@ def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[st
 def cells(name: str, method: str, way: Way, found: dict[str, float]) -> list[str]:
     """Return the row of what was found, its goals beside it."""
     before, after = ("" if goal is None else f"{goal:.2%}" for goal in goals(name, method, way))
-    lensed = name == PICTURES or name.startswith(("f", "window"))
+    lensed = name == IMAGES or name.startswith(("f", "window"))
     known = {"auto": "known", "off": "off"}[way.aperture] if lensed else "-"
-    shown = f"{name}, from {way.source}" if name == PICTURES else name
+    shown = f"{name}, from {way.source}" if name == IMAGES else name
     errors = [f"{found['l2']:.3%}", before, f"{found['aligned']:.3%}", after, f"{found['worst']:.2f}"]
     run = [f"{found['steps']:.0f}", f"{found['seconds']:.0f}"]
     return [shown, method, known, " ".join(way.refine) or "-", *errors, *run]
@@ -114,9 +114,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in asked.only:
             path = asked.rigs / f"{name}.nc"
-            if name == PICTURES:
+            if name == IMAGES:
                 path = Path(folder) / "correlation.nc"
-                pictures.photographed(pictures.CASES["200², f/8"], path.parent)
+                images.photographed(images.CASES["200², f/8"], path.parent)
             for method in asked.methods:
                 for way in ways(name, method):
                     seeds = asked.seeds if method == "nerif" else asked.seeds[:1]

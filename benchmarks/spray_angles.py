@@ -28,11 +28,11 @@ from nerif.reconstruction.voxels.multiplicative import MLEM
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 example = importlib.import_module("spray")
-HELD_OUT, read, reconstruct = example.HELD_OUT, example.read, example.reconstruct
+WITHHELD, read, reconstruct = example.WITHHELD, example.read, example.reconstruct
 relative_error = example.relative_error
 
 GOALS = {"impingement": 0.035, "jets": 0.045, "near": 0.042}
-OUT = list(HELD_OUT)
+OUT = list(WITHHELD)
 ITERATIONS = {"SART": 60, "MLEM": 100}
 
 
@@ -67,7 +67,7 @@ def best_mlem(data: Path, name: str) -> tuple[LineScan, float, np.ndarray, int]:
     found = []
     for count in range(10, ITERATIONS["MLEM"] + 1, 10):
         method = MLEM(voxels=60, basis="linear", iterations=count, tolerance=0.0, device="cpu")
-        scan, predicted, _, told = reconstruct(read(data, name), HELD_OUT, method)
+        scan, predicted, _, told = reconstruct(read(data, name), WITHHELD, method)
         found.append((relative_error(predicted[OUT], scan.readings[OUT]), count, scan, told.axis, predicted))
     _, count, scan, axis, predicted = min(found, key=lambda f: f[0])
     return scan, axis, predicted, count
@@ -86,8 +86,8 @@ def main() -> None:
     table, tells = Table("Spray: angles left out", columns, asked.write), []
     for name in asked.slices:
         start = time.perf_counter()
-        tv = example.total_variation(read(asked.data, name), HELD_OUT)
-        scan, predicted, _, told = reconstruct(read(asked.data, name), HELD_OUT, tv)
+        tv = example.total_variation(read(asked.data, name), WITHHELD)
+        scan, predicted, _, told = reconstruct(read(asked.data, name), WITHHELD, tv)
         seconds = time.perf_counter() - start
         axis = told.axis
         tells.append(f"{name}: {told}; {floor(scan)}")
@@ -125,7 +125,7 @@ def networks(asked: argparse.Namespace, name: str) -> list[str]:
     for seed in range(asked.seeds):
         method = NeRIF(max_steps=asked.steps, samples=(24, 40), seed=seed, device="cpu")
         start = time.perf_counter()
-        scan, predicted, _, told = reconstruct(read(asked.data, name), HELD_OUT, method)
+        scan, predicted, _, told = reconstruct(read(asked.data, name), WITHHELD, method)
         seconds = time.perf_counter() - start
         rows.append([*map(float, errors(scan, told.axis, predicted)), seconds])
     middle = np.median(rows, axis=0)

@@ -159,9 +159,7 @@ def main() -> None:
     add_write(parser)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    one = partial(
-        record, folder=options.folder, method=options.method, steps=options.steps, pixels=options.pixels
-    )
+    one = partial(record, folder=options.folder, method=options.method, steps=options.steps, pixels=options.pixels)
     numbers = range(options.first, options.first + options.cases)
     with ProcessPoolExecutor(options.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
         records = list(pool.map(one, numbers))

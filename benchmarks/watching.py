@@ -67,7 +67,7 @@ def steps_of(way: str, path: Path, preset_name: str, seconds: float, device: str
     with tempfile.TemporaryDirectory() as folder:
         monitor = QUIET
         if way != WAYS[0]:
-            monitor = Live(Path(folder), measurement, method).watching(QUIET, held_out=False)
+            monitor = Live(Path(folder), measurement, method).watching(QUIET, withheld=False)
         eye = multiprocessing.get_context("spawn").Process(target=look, args=(folder,))
         if way == WAYS[2]:
             eye.start()

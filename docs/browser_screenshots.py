@@ -1,4 +1,4 @@
-"""The pictures of the page "In the browser": `python docs/browser_screenshots.py docs/browser`.
+"""The images of the page "In the browser": `python docs/browser_screenshots.py docs/browser`.
 
 A small experiment is rendered and taken through the whole road by the command line, in a folder that the app then
 opens: what the command line made it picks up. Chromium and chromedriver are needed.
@@ -26,12 +26,12 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--enable-unsafe-swiftshader", "--hide-scrollbars",
 )  # fmt: skip
 LONGEST = 180.0  # seconds that are waited for anything
-SETTLES = 6.0  # seconds until pictures and 3-D views of a page have come
+SETTLES = 6.0  # seconds until images and 3-D views of a page have come
 ROAD = (
-    "render -o pictures --phantom flame --views 4 --arc 0 135 --image-size 96 96 --pixel-pitch 0.043 "
+    "render -o images --phantom flame --views 4 --arc 0 135 --image-size 96 96 --pixel-pitch 0.043 "
     "--background-distance 1000 --poses 12 --backgrounds 3",
-    "calibrate pictures --config pictures/calibrate.toml -o calibration.toml",
-    "displacement pictures --calibration calibration.toml --lower -25 -25 -25 --upper 25 25 25 -o measurement.nc",
+    "calibrate images --config images/calibrate.toml -o calibration.toml",
+    "displacement images --calibration calibration.toml --lower -25 -25 -25 --upper 25 25 25 -o measurement.nc",
     "check measurement.nc",
     "reconstruct measurement.nc -o results/flame --time-limit 20 --voxels 48 --uncertainty fast",
     "reconstruct measurement.nc -o results/flame-tv --method tv --voxels 32",
@@ -40,7 +40,7 @@ ROAD = (
 
 TYPED = {"displacement": {"lower": "-25 -25 -25", "upper": "25 25 25"}}  # by page
 LOOKS = {
-    "displacement": ("Preview", "document.querySelectorAll('.pictures img').length > 2", 4.0, False),
+    "displacement": ("Preview", "document.querySelectorAll('.images img').length > 2", 4.0, False),
     "check": ("Compare the views", "document.querySelector('.tabled table')", 1.0, False),
     "reconstruct": ("Start", "document.querySelector('.live-surface canvas')", 40.0, True),
 }
@@ -69,7 +69,7 @@ def served(folder: Path) -> Iterator[str]:
 
 
 def chromium(profile: Path) -> Any:
-    """A fresh browser with a window of the size of the pictures."""
+    """A fresh browser with a window of the size of the images."""
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -109,11 +109,11 @@ def do(driver: Any, button: str, there: str, seconds: float, scroll: bool) -> No
         time.sleep(1.0)
 
 
-def draw(pictures: Path, project: Path) -> None:
-    """Write a picture of every page of a project."""
+def draw(images: Path, project: Path) -> None:
+    """Write an image of every page of a project."""
     from selenium.webdriver.common.keys import Keys
 
-    pictures.mkdir(parents=True, exist_ok=True)
+    images.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as profile, served(project) as link:
         driver = chromium(Path(profile))
         try:
@@ -129,7 +129,7 @@ def draw(pictures: Path, project: Path) -> None:
                     time.sleep(1.0)
                 if page.name in LOOKS:
                     do(driver, *LOOKS[page.name])
-                driver.save_screenshot(str(pictures / f"{page.name}.png"))
+                driver.save_screenshot(str(images / f"{page.name}.png"))
                 if page.name == "reconstruct":
                     press(driver, "Stop")
                     wait_for(driver, "document.querySelector('.told').textContent.includes('Stopped')")
@@ -138,14 +138,14 @@ def draw(pictures: Path, project: Path) -> None:
 
 
 def main() -> None:
-    """Take the road, and the pictures."""
-    pictures = Path(sys.argv[1]).resolve()
+    """Take the road, and the images."""
+    images = Path(sys.argv[1]).resolve()
     with tempfile.TemporaryDirectory() as folder:
         project = Path(sys.argv[2]).resolve() if len(sys.argv) > 2 else Path(folder)
         if not (project / "results").exists():
             for line in ROAD:
                 nerif(project, line)
-        draw(pictures, project)
+        draw(images, project)
 
 
 if __name__ == "__main__":

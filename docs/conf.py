@@ -20,7 +20,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "docstrings",
     "mathml",
-    "pictures",
+    "figures",
     "repository",
 ]
 exclude_patterns = ["_build", "_drawings", "_extensions"]

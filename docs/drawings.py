@@ -1,4 +1,4 @@
-"""The drawings of the pages on conventions, method, pixels, pictures and rigs as SVG: `python docs/drawings.py FOLDER`.
+"""The drawings of the pages on conventions, method, pixels, images and rigs as SVG: `python docs/drawings.py FOLDER`.
 
 What they show is computed by nerif itself: camera axes, pixels and rays by `Camera`, voxel centres by `Grid`, the
 displacement by warping dots as its definition says. A convention that changed would change the drawing.
@@ -130,7 +130,7 @@ def pixel_points(camera: Camera, uv: object, depth: float) -> Point:
 
 
 def axes_and_pixels() -> Figure:
-    """World, camera, picture and background of one view."""
+    """World, camera, image and background of one view."""
     rows, columns = 6, 8
     ring = Ring(
         views=1, arc=(-90, -90), elevation=0, focal_length=50, pixel_pitch=4.4, image_size=(rows, columns),
@@ -164,7 +164,7 @@ def axes_and_pixels() -> Figure:
     label(axes, view([0, 0, 0]), "world", (-20, -3), fontsize=9)
     label(axes, view([-25, -25, 25]), "box", (8, 20), color=GREY)
 
-    # the picture, in front of the camera
+    # the image, in front of the camera
     plane = 78.0
     axes.add_patch(
         Polygon(view(pixel_points(camera, outline, plane)), fc="white", ec=INK, lw=1.2, alpha=0.85, zorder=7)
@@ -431,7 +431,7 @@ def cone() -> Figure:
     return figure
 
 
-def pictures() -> Figure:
+def images() -> Figure:
     """A pattern without and with flow, and what is left of the difference once the reference is moved."""
     size, draw = 72, np.random.default_rng(4)
     row, column = np.mgrid[:size, :size].astype(float)
@@ -467,7 +467,7 @@ DRAWINGS: dict[str, Callable[[], Figure]] = {
     "volume": volume_index,
     "lever_arm": lever_arm,
     "cone": cone,
-    "pictures": pictures,
+    "images": images,
     "observable": observable,
 }
 

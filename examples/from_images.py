@@ -1,8 +1,8 @@
-"""The whole road, from pictures alone: calibrate nine cameras, find displacements, check, reconstruct, see how good.
+"""The whole road, from images alone: calibrate nine cameras, find displacements, check, reconstruct, see how good.
 
     python examples/from_images.py out/from_images
 
-The pictures are rendered here, small ones, so that there is a truth to compare with; in the laboratory they come from
+The images are rendered here, small ones, so that there is a truth to compare with; in the laboratory they come from
 your cameras, in the same folders. Each line is what you would type: nerif calibrate FOLDER ..., nerif displacement ...
 """
 
@@ -23,16 +23,16 @@ def nerif(*words: object) -> None:
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/from_images")
-pictures = out / "pictures"
+images = out / "images"
 
 # Stands in for the laboratory: VIEW/target, VIEW/background, VIEW/reference, VIEW/flow for each of nine views.
-nerif("render", "-o", pictures, "--phantom", "flame", "--image-size", 128, 128, "--pixel-pitch", 0.032,
+nerif("render", "-o", images, "--phantom", "flame", "--image-size", 128, 128, "--pixel-pitch", 0.032,
       "--background-distance", 1000, "--poses", 24, "--backgrounds", 3, "--force")  # fmt: skip
 
 # Which target, and which of its poses is the world, stands in a small file; on the command line: --target.kind ...
-nerif("calibrate", pictures, "--config", pictures / "calibrate.toml", "-o", out / "calibration.toml", "--force")
+nerif("calibrate", images, "--config", images / "calibrate.toml", "-o", out / "calibration.toml", "--force")
 
-nerif("displacement", pictures, "--calibration", out / "calibration.toml", "--lower", -25, -25, -25,
+nerif("displacement", images, "--calibration", out / "calibration.toml", "--lower", -25, -25, -25,
       "--upper", 25, 25, 25, "-o", out / "measurement.nc", "--force")  # fmt: skip
 
 # Swapped components, flipped signs, mirrored and exchanged views would be named here, and flow that leaves the box.
@@ -41,4 +41,4 @@ nerif("check", out / "measurement.nc")
 nerif("reconstruct", out / "measurement.nc", "-o", out / "result", "--time-limit", 30, "--voxels", 64, "--force")
 
 # The truth was never looked at so far.
-nerif("evaluate", out / "result", "--truth", pictures / "truth" / "volume.nc")
+nerif("evaluate", out / "result", "--truth", images / "truth" / "volume.nc")

@@ -1,10 +1,10 @@
-"""A real supersonic jet from one camera: two pictures, no calibration, a field of (r, h), and its shock cells.
+"""A real supersonic jet from one camera: two images, no calibration, a field of (r, h), and its shock cells.
 
     python examples/jet.py jet_reference.tif jet_flow.tif --out jet
 
-The pictures are of github.com/alexlib/OpticFlow-BOS (MIT). Where camera and background stood is not known: distances
+The images are of github.com/alexlib/OpticFlow-BOS (MIT). Where camera and background stood is not known: distances
 and scale below are plausible ones, so that the index is known up to a factor, and lengths up to another. The right half
-is held out and predicted from the left; then the whole picture is reconstructed, from displacements and from the grey
+is held out and predicted from the left; then the whole image is reconstructed, from displacements and from the grey
 values themselves. Shock cells are told by their spacing, beside that of the displacement alone.
 """
 
@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from nerif.data.measurement import Measurement
 from nerif.imaging.calibration.importers.importers import ImportSettings
-from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
+from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera
 from nerif.imaging.measuring import Recording, Scene, Surroundings, measure_instant
 from nerif.imaging.readers.views import find_views
 from nerif.plotting.drawing import style
@@ -34,7 +34,7 @@ from nerif.workflow.pipeline import Run, reconstruct_into
 HARMONICS = 3  # of a cell
 DRAWS = 200  # of the bootstrap
 BLOCK = 0.25  # of a cell, in which residuals stay together
-ON_AXIS = 0.04  # of the width of the picture, within which the displacement is taken as that on the axis
+ON_AXIS = 0.04  # of the width of the image, within which the displacement is taken as that on the axis
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Spacing:
 def spacing(h: np.ndarray, signal: np.ndarray, shortest: float, longest: float) -> Spacing:
     """Fit a periodic signal and a slow trend, from the period whose spectral power is highest; block bootstrap.
 
-        signal = a + b h + c h^2 + sum_k [p_k cos(2 pi k h / L) + q_k sin(2 pi k h / L)]
+    signal = a + b h + c h^2 + sum_k [p_k cos(2 pi k h / L) + q_k sin(2 pi k h / L)]
     """
     h, signal = h[np.isfinite(signal)], signal[np.isfinite(signal)]
     h = h - h.mean()
@@ -80,8 +80,8 @@ def spacing(h: np.ndarray, signal: np.ndarray, shortest: float, longest: float) 
 
 
 def measure(folder: Path, rig: SimpleRig, background_distance: float) -> Measurement:
-    """Return what the one view in a folder measured: displacements, and the pictures themselves."""
-    name, size = find_picture(folder)
+    """Return what the one view in a folder measured: displacements, and the images themselves."""
+    name, size = find_image(folder)
     camera = simple_camera(rig, size, ImportSettings(background_distance=background_distance), name)
     scene = Scene(box_about_axis(camera), Surroundings())
     measured, _ = measure_instant(Recording(find_views(folder), {name: camera}, scene))
@@ -102,7 +102,7 @@ def correlations(directory: Path) -> dict[str, tuple[float, float]]:
 
 def cells(out: Path, measurement: Measurement, shortest: float, longest: float) -> None:
     """Print how far apart shock cells are, by the fields on the axis and by the displacement along it."""
-    for name in ("displacements", "pictures"):
+    for name in ("displacements", "images"):
         meridian = ResultDirectory(out / name).read().meridian
         assert meridian is not None
         told = spacing(meridian.h, meridian.quantities["index_excess"][:, 0], shortest, longest)
@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=90.0, help="of each reconstruction")
     parser.add_argument("--cells", type=float, nargs=2, default=(10.0, 40.0), help="mm between which a cell is sought")
     asked = parser.parse_args()
-    folder = asked.out / "pictures_taken"
+    folder = asked.out / "images_taken"
     for kind, path in (("reference", asked.reference), ("flow", asked.flow)):
         (folder / "camera" / kind).mkdir(parents=True, exist_ok=True)
         shutil.copy(path, folder / "camera" / kind / path.name)
@@ -170,9 +170,9 @@ def main() -> None:
     measurement.write(asked.out / "jet.nc")
     method = NeRIF(symmetry="axis", open_faces=("z-", "z+"), time_limit=asked.seconds, source="displacements")
     for name, settings, run in (
-        ("half", method, Run(hold_out=("right",))),
+        ("half", method, Run(withhold=("right",))),
         ("displacements", method, Run()),
-        ("pictures", replace(method, source="pictures"), Run(hold_out=("none",))),
+        ("images", replace(method, source="images"), Run(withhold=("none",))),
     ):
         print(f"-- {name}")
         reconstruct_into(asked.out / name, asked.out / "jet.nc", settings, run, force=True, monitor=Monitor(print))

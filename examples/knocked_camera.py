@@ -2,7 +2,7 @@
 
     python examples/knocked_camera.py out/knocked
 
-The pictures are rendered, as in from_images.py, of a flame of 14 mm; the calibration of one camera is then moved by
+The images are rendered, as in from_images.py, of a flame of 14 mm; the calibration of one camera is then moved by
 0.3 mm, as if the camera had been calibrated there and knocked before the flow was photographed. No camera can see how
 all of them moved together, so errors are compared after the best rigid motion of the field too.
 """
@@ -33,11 +33,11 @@ def nerif(*words: object) -> None:
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/knocked")
 seconds = sys.argv[2] if len(sys.argv) > 2 else "60"
-pictures = out / "pictures"
-nerif("render", "-o", pictures, "--phantom", "flame", "--box", 14, 14, 14, "--image-size", 128, 128,
+images = out / "images"
+nerif("render", "-o", images, "--phantom", "flame", "--box", 14, 14, 14, "--image-size", 128, 128,
       "--pixel-pitch", 0.032, "--focal-length", 100, "--distance", 400, "--background-distance", 600,
       "--poses", 24, "--backgrounds", 3, "--force")  # fmt: skip
-nerif("calibrate", pictures, "--config", pictures / "calibrate.toml", "-o", out / "good.toml", "--force")
+nerif("calibrate", images, "--config", images / "calibrate.toml", "-o", out / "good.toml", "--force")
 
 # x_cam = R x + t: a centre that stands elsewhere by c along the camera's axes has t less by c
 moved = torch.tensor(BY, dtype=torch.float64)
@@ -47,7 +47,7 @@ knocked = [replace(c, translation=c.translation - moved * (c.name == KNOCKED)) f
 write_cameras(out / "knocked.toml", knocked)
 box = ("--lower", -7, -7, -7, "--upper", 7, 7, 7, "--force")
 for rig in ("good", "knocked"):
-    nerif("displacement", pictures, "--calibration", out / f"{rig}.toml", "-o", out / f"{rig}.nc", *box)
+    nerif("displacement", images, "--calibration", out / f"{rig}.toml", "-o", out / f"{rig}.nc", *box)
 
 nerif("check", out / "knocked.nc", "--refine", "cameras", *SIGMA, "--time-limit", seconds)
 
@@ -55,7 +55,7 @@ errors = {}
 for name, rig, refine in (("good", "good", ()), ("knocked", "knocked", ()), ("refined", "knocked", ("cameras",))):
     more = ("--from", "displacements", *(("--refine", *refine, *SIGMA) if refine else ()))
     nerif("reconstruct", out / f"{rig}.nc", "-o", out / name, "--time-limit", seconds, "--voxels", 64, "--force", *more)
-    nerif("evaluate", out / name, "--truth", pictures / "truth" / "volume.nc", "--align", "rigid")
+    nerif("evaluate", out / name, "--truth", images / "truth" / "volume.nc", "--align", "rigid")
     metrics = json.loads((out / name / "metrics.json").read_text())
     errors[name] = (metrics["l2"], metrics["aligned"]["l2"])
 

@@ -1,8 +1,8 @@
-"""Particles in a vortex ring: four pictures at two instants, the volumes by MART, the velocity by correlation in 3-D.
+"""Particles in a vortex ring: four images at two instants, the volumes by MART, the velocity by correlation in 3-D.
 
     python examples/particles.py out/particles
 
-Pictures and flow are made up here, so that there is a truth to compare with. With pictures of your own, start from a
+Images and flow are made up here, so that there is a truth to compare with. With images of your own, start from a
 Measurement of emission for each instant (docs/formats.md).
 """
 
@@ -17,14 +17,14 @@ import numpy as np
 from nerif.geometry import Grid
 from nerif.reconstruction.voxels.multiplicative import MART
 from nerif.simulation.particles.cloud import Particles, quality_factor
-from nerif.simulation.particles.pictures import pictures
+from nerif.simulation.particles.images import images
 from nerif.simulation.particles.rig import four_cameras
 from nerif.simulation.particles.ring import VortexRing
 from nerif.simulation.particles.velocity import velocity_between
 
 parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
 parser.add_argument("out", type=Path, nargs="?", default=Path("out/particles"), help="directory for the results")
-parser.add_argument("--pixels", type=int, default=200, help="of an edge of each picture")
+parser.add_argument("--pixels", type=int, default=200, help="of an edge of each image")
 parser.add_argument("--depth", type=int, default=40, help="of the volume, in pixels")
 parser.add_argument("--per-pixel", type=float, default=0.05, help="particles a pixel")
 parser.add_argument("--displacement", type=float, default=4.0, help="of the fastest particles, voxels")
@@ -38,7 +38,7 @@ seconds, voxel = 1e-3, 0.1
 ring = VortexRing.within(box, arguments.displacement * voxel / seconds)
 before = Particles.draw(box, round(arguments.per_pixel * arguments.pixels**2), seed=0)
 after = ring.advect(before, seconds)
-seen = [pictures(particles, cameras, seed=i) for i, particles in enumerate((before, after))]
+seen = [images(particles, cameras, seed=i) for i, particles in enumerate((before, after))]
 for name, measurement in zip(("before", "after"), seen, strict=True):
     measurement.write(arguments.out / f"{name}.nc")
 
@@ -57,7 +57,7 @@ print(f"Q {quality:.3f}, rms error {error:.3f} voxel a component, found at {velo
 
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
 left.imshow(seen[0].maps["radiance"][0].numpy(), cmap="gray")
-left.set_title("one of four pictures")
+left.set_title("one of four images")
 extent = (box.lower[1], box.upper[1], box.lower[2], box.upper[2])
 middle.imshow(volumes[0].values[:, :, grid.shape[2] // 2].numpy(), cmap="gray", origin="lower", extent=extent)
 middle.set_title("middle of the volume")

@@ -20,7 +20,7 @@ from nerif import NeRIF, TotalVariation, reproject
 from nerif.imaging.line_scans import LineScan, Told
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 
-HELD_OUT = (2, 7, 12, 17)
+WITHHELD = (2, 7, 12, 17)
 WEIGHTS = (5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3)  # of total variation, tried
 FOLDS = 5  # shares of the angles, each of which is predicted from the others
 WATER = 1006.0  # mm2/g at 8 keV: extinction over density
@@ -34,13 +34,13 @@ def read(path: Path, name: str) -> LineScan:
 
 
 def reconstruct(
-    scan: LineScan, held_out: tuple[int, ...], method: Reconstructor
+    scan: LineScan, withheld: tuple[int, ...], method: Reconstructor
 ) -> tuple[LineScan, np.ndarray, Reconstruction, Told]:
     """Return the scan without offset, what is predicted of all its angles, the field, and what the scan told.
 
     Nothing of the angles held out is used.
     """
-    kept = [i for i in range(len(scan.angles)) if i not in held_out]
+    kept = [i for i in range(len(scan.angles)) if i not in withheld]
     told = scan.select(kept).tell()
     scan = scan.without_offset(told.offset)
     whole = scan.unbent(told.bend).measurement(told.axis)
@@ -50,10 +50,10 @@ def reconstruct(
     return scan, predicted, found, told
 
 
-def total_variation(scan: LineScan, held_out: tuple[int, ...], weights: tuple[float, ...] = WEIGHTS) -> TotalVariation:
+def total_variation(scan: LineScan, withheld: tuple[int, ...], weights: tuple[float, ...] = WEIGHTS) -> TotalVariation:
     """Return total variation with the weight that best predicts each fifth of the other angles from the rest."""
     method = TotalVariation(voxels=75, basis="linear", iterations=200)
-    kept = scan.select([i for i in range(len(scan.angles)) if i not in held_out])
+    kept = scan.select([i for i in range(len(scan.angles)) if i not in withheld])
 
     def error(weight: float) -> float:
         total = 0.0
@@ -84,7 +84,7 @@ def relative_error(predicted: np.ndarray, measured: np.ndarray) -> float:
     return float(np.linalg.norm(predicted - measured) / np.linalg.norm(measured))
 
 
-def draw(path: Path, scan: LineScan, predicted: np.ndarray, found: Reconstruction, held_out: tuple[int, ...]) -> None:
+def draw(path: Path, scan: LineScan, predicted: np.ndarray, found: Reconstruction, withheld: tuple[int, ...]) -> None:
     """Write the figure."""
     from matplotlib.figure import Figure
 
@@ -110,9 +110,9 @@ def draw(path: Path, scan: LineScan, predicted: np.ndarray, found: Reconstructio
         shown = ax.imshow(values, aspect="auto", extent=extent, **style)
         ax.set(xlabel="position [mm]", ylabel="angle [°]", title=title)
         figure.colorbar(shown, ax=ax)
-    for i in held_out:
+    for i in withheld:
         axes[1, 0].axhline(degrees[i], color="0.4", linewidth=0.6, linestyle=":")
-    for k, i in enumerate(held_out):
+    for k, i in enumerate(withheld):
         (line,) = axes[1, 1].plot(x, predicted[i] + k, linewidth=1)
         axes[1, 1].plot(x, scan.readings[i] + k, ".", markersize=4, color=line.get_color())
         axes[1, 1].text(x[-1], k + 0.08, f"{degrees[i]:.0f}°", ha="right", color=line.get_color())
@@ -126,7 +126,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="spray_Re6700.hdf5")
     parser.add_argument("--slice", default="impingement", choices=["jets", "impingement", "near"])
     parser.add_argument("--method", default="nerif", choices=["nerif", "tv"])
-    parser.add_argument("--hold-out", type=int, nargs="*", default=list(HELD_OUT), help="numbers of angles")
+    parser.add_argument("--withhold", type=int, nargs="*", default=list(WITHHELD), help="numbers of angles")
     parser.add_argument("--steps", type=int, default=300, help="of training")
     parser.add_argument("--find-axis", action="store_true", help="find the axis of rotation by a refined rig as well")
     parser.add_argument("--out", type=Path, default=Path("spray"))
@@ -134,21 +134,21 @@ def main() -> None:
     methods: dict[str, Reconstructor] = {
         "nerif": NeRIF(max_steps=asked.steps, samples=(24, 40)),
     }
-    scan, held_out = read(asked.data, asked.slice), tuple(asked.hold_out)
+    scan, withheld = read(asked.data, asked.slice), tuple(asked.withhold)
     if asked.find_axis:
         at = refined_axis(scan, scan.tell(), TotalVariation(voxels=40, basis="linear"))
         print(f"axis by a rig that is refined with the field: {at:.3f} mm")
     if asked.method == "tv":
-        methods["tv"] = total_variation(scan, held_out)
-    scan, predicted, found, told = reconstruct(scan, held_out, methods[asked.method])
+        methods["tv"] = total_variation(scan, withheld)
+    scan, predicted, found, told = reconstruct(scan, withheld, methods[asked.method])
     print(told)
-    kept = [i for i in range(len(scan.angles)) if i not in held_out]
+    kept = [i for i in range(len(scan.angles)) if i not in withheld]
     print(f"angles reconstructed from: relative rms error {relative_error(predicted[kept], scan.readings[kept]):.4f}")
-    if held_out:
-        chosen = list(held_out)
+    if withheld:
+        chosen = list(withheld)
         print(f"angles held out: relative rms error {relative_error(predicted[chosen], scan.readings[chosen]):.4f}")
     asked.out.mkdir(parents=True, exist_ok=True)
-    draw(asked.out / f"{asked.slice}-{asked.method}.png", scan, predicted, found, held_out)
+    draw(asked.out / f"{asked.slice}-{asked.method}.png", scan, predicted, found, withheld)
     print(f"{asked.out / f'{asked.slice}-{asked.method}.png'}: slice, sinogram and residuals")
 
 

@@ -43,9 +43,9 @@ from nerif.simulation.simulate import simulate
 torch.set_num_threads(1)  # tests run side by side
 
 
-GROUPS = {"whole": "report", "experiment": "pictures", "five": "films", "film": "films"}
+GROUPS = {"whole": "report", "experiment": "images", "five": "films", "film": "films"}
 """Fixtures of more than one file, by the group of the tests that use them."""
-LONGEST = ("pictures", "films", "report", "test_cluster", "test_consistency", "test_neural")
+LONGEST = ("images", "films", "report", "test_cluster", "test_consistency", "test_neural")
 """Groups to begin with, so that both processes end at about the same time."""
 
 

@@ -1,4 +1,4 @@
-"""Pictures written as cameras and their programs write them."""
+"""Images written as cameras and their programs write them."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ MEASUREMENTS = {
 NERIF = ["--preset", "fast", "--max-steps", "60", "--points-per-batch", "1024", "--device", "cpu"]
 RECONSTRUCTIONS = {
     "nerif": ("balls", NERIF),
-    "nerif_withheld": ("flame", [*NERIF, "--hold-out", "85deg", "--seed", "2"]),
+    "nerif_withheld": ("flame", [*NERIF, "--withhold", "85deg", "--seed", "2"]),
     "nerif_paper": ("balls", [*NERIF, "--preset", "paper", "--max-steps", "6"]),
     "nerif_rig": ("balls", [*NERIF, "--refine", "cameras"]),
     "nerif_bootstrap": ("balls", [*NERIF, "--uncertainty", "fast"]),

@@ -44,7 +44,7 @@ def test_particles(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_from_images(tmp_path):
-    """Pictures alone, to a field that correlates with the truth by 0.98 or more."""
+    """Images alone, to a field that correlates with the truth by 0.98 or more."""
     script = [sys.executable, str(EXAMPLES / "from_images.py"), str(tmp_path)]
     done = subprocess.run(script, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -80,7 +80,7 @@ def test_spray(tmp_path, monkeypatch, capsys):
     assert "axis at -0.27" in said
     assert (tmp_path / "jets-nerif.png").stat().st_size > 20_000
     method = example["TotalVariation"](voxels=40, basis="linear", regularisation=2e-3, iterations=30, device="cpu")
-    _, _, found, told = example["reconstruct"](example["read"](SPRAY, "jets"), example["HELD_OUT"], method)
+    _, _, found, told = example["reconstruct"](example["read"](SPRAY, "jets"), example["WITHHELD"], method)
     density = found.volume(Grid.of_resolution(found.box, 50)).values / example["WATER"] * 1e3
     inside = density[density > 0.5]
     assert 0.95 < float(inside.median()) < 1.1  # mg/mm3
@@ -114,7 +114,7 @@ def test_shock_cells_are_as_long_as_they_were_made():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not JET.is_dir(), reason=f"{JET.name}: the pictures are not there")
+@pytest.mark.skipif(not JET.is_dir(), reason=f"{JET.name}: the images are not there")
 def test_jet(tmp_path):
     """The half that was not seen is predicted, and the shock cells are those of the displacement."""
     pair = [str(JET / "jet_reference.tif"), str(JET / "jet_flow.tif")]

@@ -69,15 +69,15 @@ def write_page(folder: Path, pairs: Pairs, about: Mapping[str, Any]) -> Path:
     shown = page_figures(results)
     text = _markdown(results, about, shown)
     (folder / "figures").mkdir(parents=True, exist_ok=True)
-    pictures = {}
+    images = {}
     for spec in shown:
         name = f"figures/{spec.name}.svg"
-        picture = _svg(spec)
-        _write(folder / name, picture)
-        pictures[name] = "data:image/svg+xml;base64," + base64.b64encode(picture).decode()
+        image = _svg(spec)
+        _write(folder / name, image)
+        images[name] = "data:image/svg+xml;base64," + base64.b64encode(image).decode()
     _write(folder / "study.md", text.encode())
     page = folder / "study.html"
-    _write(page, render(text, pictures).encode())
+    _write(page, render(text, images).encode())
     return page
 
 
@@ -109,9 +109,7 @@ def _origins(results: Results) -> list[str]:
             rows.setdefault(tuple(bare(made.get(name, NOTHING)) for name in ORIGIN), []).append(case.key)
     if not rows:
         return []
-    cells = [
-        [*made, f"all {len(keys)}" if len(rows) == 1 else listed(keys, len(keys))] for made, keys in rows.items()
-    ]
+    cells = [[*made, f"all {len(keys)}" if len(rows) == 1 else listed(keys, len(keys))] for made, keys in rows.items()]
     return ["## Made by", markdown_table([*ORIGIN.values(), "Reconstructions"], cells, left=5)]
 
 
@@ -192,9 +190,9 @@ def _svg(spec: FigureSpec) -> bytes:
         figure = Figure(figsize=spec.size, layout="constrained")
         FigureCanvasSVG(figure)
         spec.draw(figure)
-        picture = io.BytesIO()
-        figure.savefig(picture, format="svg", metadata={"Date": None, "Creator": None, "Title": spec.caption})
-    return picture.getvalue()
+        image = io.BytesIO()
+        figure.savefig(image, format="svg", metadata={"Date": None, "Creator": None, "Title": spec.caption})
+    return image.getvalue()
 
 
 def _write(path: Path, content: bytes) -> None:

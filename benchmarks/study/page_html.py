@@ -41,13 +41,13 @@ figcaption { color: var(--soft); font-size: .9rem; margin-top: .3em; }
 """What the page has beside the style sheet of a report."""
 
 
-def render(text: str, pictures: Mapping[str, str]) -> str:
+def render(text: str, images: Mapping[str, str]) -> str:
     """Return the page.
 
     Parameters
     ----------
     text : Markdown; raw HTML in it is shown as it stands
-    pictures : what to put in the place of the addresses of its images, data: URIs
+    images : what to put in the place of the addresses of its images, data: URIs
     """
     parser: Any = MarkdownIt("commonmark", {"html": False}).enable("table")
     parser.validateLink = lambda address: address.startswith(("https://arxiv.org/", "figures/"))
@@ -66,7 +66,7 @@ def render(text: str, pictures: Mapping[str, str]) -> str:
             token.attrs = {"class": "right"} if right else {}
         for child in token.children or []:
             if child.type == "image":
-                child.attrSet("src", pictures.get(str(child.attrGet("src")), ""))
+                child.attrSet("src", images.get(str(child.attrGet("src")), ""))
     body: str = parser.renderer.render(tokens, parser.options, {})
     style = (ASSETS / "report.css").read_text() + STYLE
     return PAGE.format(title=html.escape(title), style=style, body=_dress(body, "\n".join(contents)))

@@ -57,9 +57,7 @@ OnProgress = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
 
 
-def run_cases(
-    cases: list[Case], folder: Path, on_progress: Callable[[int, str, float], None]
-) -> Iterator[Record]:
+def run_cases(cases: list[Case], folder: Path, on_progress: Callable[[int, str, float], None]) -> Iterator[Record]:
     """Run the cases that have no record yet, and yield the record of every case, in order.
 
     Parameters

@@ -47,13 +47,13 @@ def relink(text: str, folder: Path, docs: Path, modules: set[str]) -> str:
     root = docs.parent
 
     def turn(match: re.Match[str]) -> str:
-        picture, words, target, anchor = match[1], match[2], match[3], match[4] or ""
+        image, words, target, anchor = match[1], match[2], match[3], match[4] or ""
         path = Path(os.path.normpath(folder / target))
         if not path.exists() or not path.is_relative_to(root):
             return match[0]  # Sphinx says so, if it is an error
         inside = path.relative_to(root).as_posix()
         if inside.startswith("docs/"):
-            return f"{picture}[{words}](/{inside.removeprefix('docs/')}{anchor})"
+            return f"{image}[{words}](/{inside.removeprefix('docs/')}{anchor})"
         if PAGES.get(inside):
             return f"[{words}](/{PAGES[inside]}.md{anchor})"
         if inside == "benchmarks":
@@ -63,7 +63,7 @@ def relink(text: str, folder: Path, docs: Path, modules: set[str]) -> str:
         module = inside.removeprefix("src/").removesuffix(".py").replace("/", ".")
         if module in modules:
             return f"{{py:mod}}`{words.strip('`')} <{module}>`"
-        return f"{picture}[{words}](/{os.path.relpath(path, docs)}{anchor})"
+        return f"{image}[{words}](/{os.path.relpath(path, docs)}{anchor})"
 
     # not within fences
     parts = re.split(r"(^(?:```|~~~).*?^(?:```|~~~)[ ]*$)", text, flags=re.MULTILINE | re.DOTALL)

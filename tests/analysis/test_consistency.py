@@ -56,10 +56,10 @@ MISTAKES = {
     "sign": (in_view(1, lambda d: -d), "view 30deg: the sign of the displacement is flipped"),
     "sign of v": (in_view(4, lambda d: d * torch.tensor([1.0, -1.0])), "view 120deg: the sign of v is flipped"),
     "mirrored": (
-        in_view(3, lambda d: d.flip(1) * torch.tensor([-1.0, 1.0])), "view 90deg: the picture is mirrored left to right"
+        in_view(3, lambda d: d.flip(1) * torch.tensor([-1.0, 1.0])), "view 90deg: the image is mirrored left to right"
     ),
     "upside down": (
-        in_view(3, lambda d: d.flip(0) * torch.tensor([1.0, -1.0])), "view 90deg: the picture is upside down"
+        in_view(3, lambda d: d.flip(0) * torch.tensor([1.0, -1.0])), "view 90deg: the image is upside down"
     ),
     "exchanged": (exchanged(1, 4), "views 30deg and 120deg: these two views are exchanged"),
     "swapped everywhere": (lambda d: d.flip(-1), "all views: u and v are swapped"),
@@ -121,7 +121,7 @@ def test_no_false_alarm(phantom, seed, noise, step):
 
 @pytest.fixture(scope="module")
 def cut() -> Measurement:
-    """A flame that ends at the top and bottom of the box, all of which the pictures show, without noise."""
+    """A flame that ends at the top and bottom of the box, all of which the images show, without noise."""
     cameras, box = paper_rig(32)
     return simulate(make_phantom("flame", box, 0), cameras[::2], box, 1.00027, steps=30)
 
@@ -244,7 +244,7 @@ def test_what_was_found_is_undone(clean, tmp_path, capsys, name):
 
 
 def mirrored(view: int):
-    """Everything that a view has, as of a picture that is mirrored left to right."""
+    """Everything that a view has, as of an image that is mirrored left to right."""
 
     def mistake(m: Measurement) -> Measurement:
         maps = {"displacement": m.displacement.clone(), "sigma": m.sigma.clone(), "flow_mask": m.flow_mask.clone()}

@@ -33,8 +33,8 @@ class Scaled(Field):
 
 
 def test_the_true_field_leaves_the_noise_alone(measurement, ball):
-    views = evaluate_views(reproject(ball, measurement, held_out=("144deg",)))
-    assert [v["held_out"] for v in views] == [False] * 4 + [True]
+    views = evaluate_views(reproject(ball, measurement, withheld=("144deg",)))
+    assert [v["withheld"] for v in views] == [False] * 4 + [True]
     for v in views:
         assert v["rms_over_sigma"] == pytest.approx(1, abs=0.12)
         assert v["cc"] > 0.999

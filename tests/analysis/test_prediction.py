@@ -1,4 +1,4 @@
-"""Views of a network by way of voxels, as large pictures are re-projected: how near they are, and what is told."""
+"""Views of a network by way of voxels, as large images are re-projected: how near they are, and what is told."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_views_by_way_of_voxels_are_near_the_integral_and_say_how_near(empty, mo
     assert "10 voxels" in accuracy.how
 
 
-def test_large_pictures_of_a_network_take_the_short_way(network, empty, monkeypatch):
+def test_large_images_of_a_network_take_the_short_way(network, empty, monkeypatch):
     exact = reproject(network, empty)
     assert [a.error for a in exact.accuracies] == [0]
     monkeypatch.setitem(prediction.EXACT_WORK, "cpu", 0.0)
@@ -107,6 +107,6 @@ def test_the_file_keeps_how_it_was_predicted(network, empty, tmp_path):
         assert kept.attrs["predicted_by"] == "a spline"
         assert kept.attrs["predicted_error_px"] == kept["displacement"].attrs["predicted_error"] == 0.01
     back = Reprojection.read(tmp_path / "r.nc")
-    assert back.held_out == ("70deg",)
+    assert back.withheld == ("70deg",)
     assert torch.equal(back.predicted, views.predicted)
     assert torch.equal(back.measurement.displacement, empty.displacement)

@@ -95,7 +95,7 @@ def test_the_worst_finding_comes_first(right):
 
 
 @pytest.mark.slow
-def test_pictures_sorted_by_letters_are_named():
+def test_images_sorted_by_letters_are_named():
     """Cameras all around, so that no other order looks alike."""
     generator = torch.Generator().manual_seed(5)
     cameras = []
@@ -165,13 +165,13 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("code", VIEWS)
-def test_what_happened_to_a_picture_fits_best(right, code):
+def test_what_happened_to_a_image_fits_best(right, code):
     assert code_of(right, 1, VIEWS[code]) == code
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", ["upside_down", "mirrored", "transposed", "quarter_turn"])
-def test_what_happened_to_a_picture_is_named(code):
+def test_what_happened_to_a_image_is_named(code):
     measurement = measure(views=6, image_size=(30, 30), pixel_pitch=0.15)
     d = measurement.displacement.clone()
     d[3] = VIEWS[code](d[3])
@@ -179,7 +179,7 @@ def test_what_happened_to_a_picture_is_named(code):
     assert (found.code, found.views) == (code, (measurement.names[3],))
 
 
-def test_pictures_that_are_not_square_cannot_be_transposed(right):
+def test_images_that_are_not_square_cannot_be_transposed(right):
     cameras = tuple(replace(c, image_size=(24, 20)) for c in right.cameras)
     codes = {c.code for c in of_one_view(0, right.observations[0], cameras)}
     assert "mirrored" in codes

@@ -1,6 +1,6 @@
 """Every page by the rules of axe-core (WCAG 2 A and AA), light and dark, on a laptop and on a large screen.
 
-The project holds something for each page: pictures, a calibration, a measurement, results, and a run that is watched.
+The project holds something for each page: images, a calibration, a measurement, results, and a run that is watched.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ axe.run(document, {runOnly: ["wcag2a", "wcag2aa"], resultTypes: ["violations"]})
 
 THERE = {
     "design": "document.querySelector('.drawing svg') !== null",
-    "pictures": "document.querySelectorAll('.view button').length === 3 && document.querySelector('.cropper')",
+    "images": "document.querySelectorAll('.view button').length === 3 && document.querySelector('.cropper')",
     "calibration": "document.querySelector('.target img') !== null && document.querySelector('.tabled') !== null",
     "displacement": "document.querySelector('.cropper img') !== null",
     "check": "document.querySelector('.command code') !== null",

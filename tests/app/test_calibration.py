@@ -1,4 +1,4 @@
-"""The Calibration page in a real browser: corners, errors, pictures left out by a click, the rig, a ruler."""
+"""The Calibration page in a real browser: corners, errors, images left out by a click, the rig, a ruler."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from app.serving import Served, opened, served
 from app.test_pages import line, put
-from calibration_pictures import target_pictures
+from calibration_images import target_images
 from nerif.app.pages.calibration import form_of
 from nerif.cli.cli import main
 from nerif.geometry import Ring
@@ -26,19 +26,19 @@ NAMES = ("cam1", "cam2", "cam3")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three views with pictures of an upright target, one without; a calibration from the command line's library."""
+    """Three views with images of an upright target, one without; a calibration from the command line's library."""
     found = tmp_path_factory.mktemp("project")
     board = (40 + 170 * TARGET.raster(TARGET.pitch / 8)).astype(np.uint8)
     for name in NAMES:
         for source, count in (("target", 3), ("background", 1), ("reference", 1)):
             (found / "run" / name / source).mkdir(parents=True)
             for i in range(count):
-                picture = np.full((64, 96), 210, np.uint8)
+                image = np.full((64, 96), 210, np.uint8)
                 if (source, i) != ("target", 2):
-                    picture[4 : 4 + board.shape[0], 6 + i : 6 + i + board.shape[1]] = board
-                iio.imwrite(found / "run" / name / source / f"p{i}.png", picture)
+                    image[4 : 4 + board.shape[0], 6 + i : 6 + i + board.shape[1]] = board
+                iio.imwrite(found / "run" / name / source / f"p{i}.png", image)
     cameras = Ring(views=3, arc=(20.0, 100.0), image_size=(64, 96), pixel_pitch=0.17).cameras()
-    calibrate(target_pictures(cameras, TARGET, noise=0.01, poses=8)).write(found / "made.toml")
+    calibrate(target_images(cameras, TARGET, noise=0.01, poses=8)).write(found / "made.toml")
     return found
 
 
@@ -56,7 +56,7 @@ def choose(driver: Any, label: str, option: str) -> None:
     wait_for(driver, "return document.querySelector('.q-menu') === null")
 
 
-def test_settings_beside_the_pictures_are_the_defaults():
+def test_settings_beside_the_images_are_the_defaults():
     form = form_of(False, {"target": {"columns": 8, "rows": 5}, "world": "0"})
     assert form.field("target.columns").default == 8
     assert form.field("world").default == "0"
@@ -67,7 +67,7 @@ def test_settings_beside_the_pictures_are_the_defaults():
 
 @pytest.mark.slow
 @needs_browser
-def test_corners_are_found_and_a_picture_is_left_out_by_a_click(browser, server):
+def test_corners_are_found_and_a_image_is_left_out_by_a_click(browser, server):
     visit(browser, server)
     assert browser.execute_script("return document.querySelectorAll('.target circle').length") == 0
     choose(browser, "Target: kind", "chessboard")

@@ -59,7 +59,7 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     opened(browser, server, "check", LINE)
     click(browser, "Compare the views")
     wait_for(browser, "return document.querySelector('.tabled table') !== null", 120)
-    assert "the picture is mirrored left to right" in text(browser, ".tabled table")
+    assert "the image is mirrored left to right" in text(browser, ".tabled table")
     click(browser, "Undo what was found")
     found, good = written(folder / "bad.corrected.nc", 120), Measurement.read(folder / "good.nc")
     torch.testing.assert_close(found.displacement, good.displacement)

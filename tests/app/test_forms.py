@@ -35,7 +35,7 @@ def test_fields_are_those_of_the_record():
 def test_every_field_of_every_method_has_its_text(method):
     form = form_of(method, "auto")
     assert [f.name for f in form.fields if not f.help] == []
-    assert {"time_limit", "hold_out", "uncertainty"} <= {f.name for f in form.fields}
+    assert {"time_limit", "withhold", "uncertainty"} <= {f.name for f in form.fields}
 
 
 def test_help_is_that_of_the_class_that_has_the_field():
@@ -88,7 +88,7 @@ def test_the_command_line_gives_the_same_record(values):
 
 def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
     form = form_of("nerif", "fast")
-    values = {"report": False, "network.gradient_head": True, "weights.head": 0.5, "hold_out": ["0deg", "20deg"]}
+    values = {"report": False, "network.gradient_head": True, "weights.head": 0.5, "withhold": ["0deg", "20deg"]}
     made = form.made(values)
     given = dataclasses.replace(form.record, measurement=tyro.MISSING, out=tyro.MISSING)
     parsed = parse(given, ["m.nc", "-o", "x", *form.arguments(values)], "nerif reconstruct", "")

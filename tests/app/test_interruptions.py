@@ -81,7 +81,7 @@ def test_a_run_goes_on_when_its_server_is_killed(browser, folder):
     with served(folder) as server:
         visit(browser, server, "reconstruct")
         wait_for(browser, GOES_ON)
-        wait_for(browser, "return document.querySelectorAll('.pictures img').length >= 7", 60)
+        wait_for(browser, "return document.querySelectorAll('.images img').length >= 7", 60)
         assert [j.pid for j in Jobs(folder).all()] == [job.pid]  # the same one
         press(browser, "Stop")
         wait_for(browser, "return document.querySelector('.told').textContent.includes('Stopped')", 120)

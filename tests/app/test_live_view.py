@@ -1,4 +1,4 @@
-"""A run as it is watched: its pictures and its surface follow what it leaves in its directory."""
+"""A run as it is watched: its images and its surface follow what it leaves in its directory."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def look(directory: Path, radius: float, seconds: float) -> None:
     values = -1e-4 / (1 + np.exp(2 * (np.sqrt(x**2 + y**2 + z**2) - radius)))
     about = {
         "title": "training", "seconds": seconds, "quantity": "index_excess", "lower": LOWER, "upper": UPPER,
-        "held_out": True, "view": "0", "components": ["u"], "unit": "px",
+        "withheld": True, "view": "0", "components": ["u"], "unit": "px",
     }  # fmt: skip
     view = np.linspace(0, 1, 30, dtype=np.float32).reshape(5, 6, 1)
     part = directory / "part.npz"
@@ -86,8 +86,8 @@ def test_the_surface_comes_from_the_folder_alone(server):
 
 
 @needs_browser
-def test_pictures_and_surface_follow_the_run(browser, server, folder):
-    opened(browser, server, "reconstruct", "document.querySelectorAll('.pictures img').length === 5")
+def test_images_and_surface_follow_the_run(browser, server, folder):
+    opened(browser, server, "reconstruct", "document.querySelectorAll('.images img').length === 5")
     wait_for(browser, "return document.querySelector('.live-surface canvas') !== null")
     assert "x from -6 to 6" in text(browser, ".live-surface figcaption")
     alt = "document.querySelector('.live-surface [role=img]').ariaLabel"

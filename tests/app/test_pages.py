@@ -107,9 +107,9 @@ def test_a_run_is_started_watched_and_stopped(browser, server, folder):
     put(browser, "time_limit", "600")
     wait_for(browser, "return document.querySelector('.command code').textContent.includes('600')")
     browser.find_element("xpath", "//button[contains(., 'Start')]").click()
-    wait_for(browser, "return document.querySelectorAll('.pictures img').length >= 7", 120)
+    wait_for(browser, "return document.querySelectorAll('.images img').length >= 7", 120)
     wait_for(browser, "return document.querySelector('.curve canvas') !== null")
-    said = browser.execute_script("return [...document.querySelectorAll('.pictures img')].map(e => e.alt)")
+    said = browser.execute_script("return [...document.querySelectorAll('.images img')].map(e => e.alt)")
     assert "measured" in said[0]
     assert "predicted" in said[1]
     out = folder / "results" / "m & <b>-nerif"
@@ -118,10 +118,10 @@ def test_a_run_is_started_watched_and_stopped(browser, server, folder):
     assert look.view == live["view"]
     assert np.isfinite(look.predicted).all()
     visit(browser, server, "reconstruct")  # a reload loses nothing
-    wait_for(browser, "return document.querySelectorAll('.pictures img').length >= 7")
+    wait_for(browser, "return document.querySelectorAll('.images img').length >= 7")
     browser.find_element("xpath", "//section[@aria-label='The run']//button[contains(., 'Pause')]").click()
     wait_for(browser, "return document.querySelector('.told').textContent.includes('Paused')", 120)
-    assert (out / "checkpoint.safetensors").is_file() or (out / "first_look").is_dir()
+    assert (out / "checkpoint.safetensors").is_file() or (out / "cross_validation").is_dir()
     browser.find_element("xpath", "//section[@aria-label='The run']//button[contains(., 'Go on')]").click()
     wait_for(browser, "return /It runs.*step/.test(document.querySelector('.told').textContent)", 120)
     browser.find_element("xpath", "//section[@aria-label='The run']//button[contains(., 'Stop')]").click()

@@ -8,7 +8,7 @@ import pytest
 
 from nerif.app.project import Project
 from nerif.cli.cli import main
-from nerif.common.conventions import InputError
+from refusals import refused
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def folder(tmp_path):
 def test_paths_outside_are_refused(folder, name):
     project = Project(folder)
     if name:
-        with pytest.raises(InputError, match="path: expected"):
+        with refused("path"):
             project.path(name)
     else:
         assert project.path(name) == folder
@@ -33,7 +33,7 @@ def test_links_that_lead_outside_are_refused(folder):
     (folder / "out").symlink_to(folder.parent)
     (folder / "in").symlink_to(folder)
     project = Project(folder)
-    with pytest.raises(InputError, match="outside"):
+    with refused("path"):
         project.path("out/secret")
     assert project.path("in/new.nc") == folder / "new.nc"
     assert project.relative(folder / "in" / "a b.nc") == "a b.nc"
@@ -49,7 +49,7 @@ def test_what_is_in_a_folder(folder):
     (folder / "runs" / "one" / "run.toml").write_text("")
     (folder / "film.zarr").mkdir()
     for source in ("reference", "flow"):
-        (folder / "pictures" / "cam1" / source).mkdir(parents=True)
+        (folder / "images" / "cam1" / source).mkdir(parents=True)
     (folder / "away").symlink_to(folder.parent)
     (folder / "away.nc").symlink_to(folder.parent / "secret")
     project = Project(folder)
@@ -59,8 +59,8 @@ def test_what_is_in_a_folder(folder):
     assert found.calibrations == ("cal.toml",)
     assert found.results == ("runs/one",)
     assert found.films == ("film.zarr",)
-    assert found.experiments == ("pictures",)
-    assert [view.name for view in project.views("pictures")] == ["cam1"]
+    assert found.experiments == ("images",)
+    assert [view.name for view in project.views("images")] == ["cam1"]
 
 
 def test_what_cannot_be_read_is_named(folder):

@@ -1,4 +1,4 @@
-"""The whole road by clicks and keys: from a folder that holds nothing but pictures to a volume for other programs."""
+"""The whole road by clicks and keys: from a folder that holds nothing but images to a volume for other programs."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ pytestmark = [needs_browser, pytest.mark.slow]
 LONGEST = 120.0  # seconds on the road
 RESTS = "arguments[0].scrollIntoView({block: 'center'}); return arguments[0].getBoundingClientRect().toJSON()"
 SMALL = ["--image-size", "56", "64", "--pixel-pitch", "0.075", "--background-distance", "900"]
-PICTURES = ["--references", "3", "--poses", "10", "--backgrounds", "2", "--columns", "6", "--rows", "5"]
+IMAGES = ["--references", "3", "--poses", "10", "--backgrounds", "2", "--columns", "6", "--rows", "5"]
 
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], Path]:
-    """Pictures of four views in a project of its own; what is known of the target; the truth, out of reach."""
+    """Images of four views in a project of its own; what is known of the target; the truth, out of reach."""
     found = tmp_path_factory.mktemp("project")
-    words = ["--phantom", "gaussians", "--views", "4", "--arc", "10", "120", *SMALL, *PICTURES, "--truth-voxels", "24"]
+    words = ["--phantom", "gaussians", "--views", "4", "--arc", "10", "120", *SMALL, *IMAGES, "--truth-voxels", "24"]
     assert main(["render", "-o", str(found / "run"), *words]) == 0
     target, truth = read_toml(found / "run" / "calibrate.toml"), tmp_path_factory.mktemp("truth") / "volume.nc"
     shutil.move(found / "run" / "truth" / "volume.nc", truth)
@@ -74,7 +74,7 @@ def runs_done(driver: Any, count: int) -> None:
     assert driver.execute_script("return document.querySelectorAll('.run.failed').length") == 0
 
 
-def test_from_pictures_to_an_exported_volume(browser, project):
+def test_from_images_to_an_exported_volume(browser, project):
     folder, target, truth = project
     begun = time.monotonic()
     with served(folder) as server:
@@ -82,7 +82,7 @@ def test_from_pictures_to_an_exported_volume(browser, project):
         browser.get_log("performance")
         browser.get(server.link)
         design(browser)
-        pictures(browser)
+        images(browser)
         calibration(browser, target)
         displacement(browser, folder)
         check(browser)
@@ -106,15 +106,15 @@ def design(driver: Any) -> None:
     assert "px" in text(driver, ".headline b")
 
 
-def pictures(driver: Any) -> None:
-    """All pictures can be used."""
-    go(driver, "Pictures")
+def images(driver: Any) -> None:
+    """All images can be used."""
+    go(driver, "Images")
     wait_for(driver, "return document.querySelectorAll('.view .pair img').length === 8")
     wait_for(driver, "return document.querySelector('.told').textContent.startsWith('4 views. Nothing is wrong')")
 
 
 def calibration(driver: Any, target: dict[str, Any]) -> None:
-    """The target is told, found in the pictures, and gives four cameras."""
+    """The target is told, found in the images, and gives four cameras."""
     go(driver, "Calibration")
     wait_for(driver, "return document.querySelector('input[name=\"target.columns\"]') !== null")
     choose(driver, "Target: kind", target["target"]["kind"])
@@ -141,7 +141,7 @@ def displacement(driver: Any, folder: Path) -> None:
     fill(driver, "upper", "25 25 25")
     wait_for(driver, "return document.querySelector('.command code').textContent.includes('--upper 25')")
     click(driver, "Preview")
-    wait_for(driver, "return document.querySelectorAll('.pictures img').length >= 3", 60)
+    wait_for(driver, "return document.querySelectorAll('.images img').length >= 3", 60)
     click(driver, "Find all displacements")
     runs_done(driver, 2)
     assert (folder / "measurement.nc").is_file()

@@ -73,7 +73,7 @@ def test_every_peer_finds_the_jet(peer, seen):
     assert max(errors) > min(errors)
 
 
-def test_an_axis_beside_the_middle_of_the_picture_is_found():
+def test_an_axis_beside_the_middle_of_the_image_is_found():
     box = Box((-25.0, -20.0, -25.0), (25.0, 30.0, 25.0))
     field, camera = GaussianJet(box), camera_of(1.0, 80)
     measurement = simulate(field, [camera], box, N_AMBIENT, steps=60)

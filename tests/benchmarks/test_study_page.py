@@ -122,8 +122,8 @@ def test_written_page_needs_nothing_else(tmp_path):
     assert not NAN.search(re.sub(r'src="[^"]*"', "", text))
     written = sorted(p.name for p in (tmp_path / "figures").iterdir())
     assert written == sorted(f"{spec.name}.svg" for spec in page_figures(results()))
-    for picture in re.findall(r"base64,([^\"]*)", text):
-        assert b"<path" in base64.b64decode(picture)
+    for image in re.findall(r"base64,([^\"]*)", text):
+        assert b"<path" in base64.b64decode(image)
     for name in re.findall(r"\]\((figures/.*?)\)", (tmp_path / "study.md").read_text()):
         assert (tmp_path / name).is_file()
     assert not list(tmp_path.rglob("*.part"))

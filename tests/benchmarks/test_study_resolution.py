@@ -77,9 +77,7 @@ def test_a_gaussian_edge(sigma, error):
     )
     seen = found.mtf.frequency < 2 * found.lp_per_mm
     gauss = torch.exp(-2 * (math.pi * found.mtf.frequency * sigma * PHANTOM.unit) ** 2)
-    torch.testing.assert_close(
-        found.mtf.transfer[seen], gauss[seen], rtol=0, atol=2e-3 if sigma < 0.1 else 0.05
-    )
+    torch.testing.assert_close(found.mtf.transfer[seen], gauss[seen], rtol=0, atol=2e-3 if sigma < 0.1 else 0.05)
 
 
 @pytest.mark.parametrize(("sigma", "error"), [(0.05, 0.01), (0.1, 0.025)])

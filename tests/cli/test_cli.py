@@ -41,7 +41,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cli")
     measurement = str(folder / "m.nc")
     assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", measurement, *TINY]) == 0
-    assert main(["reconstruct", measurement, "-o", str(folder / "r"), "--hold-out", "170deg", *QUICK]) == 0
+    assert main(["reconstruct", measurement, "-o", str(folder / "r"), "--withhold", "170deg", *QUICK]) == 0
     return folder
 
 
@@ -81,8 +81,8 @@ def test_result_directory_is_complete(work):
     assert metrics["device"] == "cpu"
     assert metrics["seconds"] > 0
     assert metrics["peak_memory_bytes"] > 1e6
-    assert [v["held_out"] for v in metrics["views"]] == [False, False, False, True]
-    assert set(metrics["views"][0]) >= {"name", "held_out", "cc", "ssim", "psnr", "rms_px"}
+    assert [v["withheld"] for v in metrics["views"]] == [False, False, False, True]
+    assert set(metrics["views"][0]) >= {"name", "withheld", "cc", "ssim", "psnr", "rms_px"}
     volume = xr.load_dataset(work / "r/volume.nc", engine="h5netcdf")
     assert set(volume.data_vars) == {"index_excess", "n", "density", "temperature"}
     assert volume["n"].dtype == np.float64
@@ -95,7 +95,7 @@ def test_result_directory_is_complete(work):
 def test_run_toml_repeats_the_run(work, tmp_path):
     settings = tomllib.loads((work / "r/run.toml").read_text())
     assert settings["network"]["width"] == 24
-    assert settings["hold_out"] == ["170deg"]
+    assert settings["withhold"] == ["170deg"]
     again = tmp_path / "again"
     assert main(["reconstruct", "--config", str(work / "r/run.toml"), "-o", str(again), str(work / "m.nc")]) == 0
     points = torch.rand(20, 3)
@@ -252,7 +252,7 @@ def test_ctrl_c_leaves_a_usable_result_to_resume(work, tmp_path):
     out = tmp_path / "r"
     command = [sys.executable, "-m", "nerif", "reconstruct", str(work / "m.nc"), "-o", str(out), "--no-report", *QUICK]
     command[command.index("--max-steps") + 1] = "100000"
-    command += ["--checkpoint-every", "0.2", "--hold-out", "none"]
+    command += ["--checkpoint-every", "0.2", "--withhold", "none"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     deadline = time.monotonic() + 90
     while not (out / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
@@ -391,7 +391,7 @@ def test_forced_run_with_bad_input_keeps_what_was_there(work, tmp_path, capsys):
     out = tmp_path / "r"
     shutil.copytree(work / "r", out)
     for bad in (
-        ["--hold-out", "nobody"],
+        ["--withhold", "nobody"],
         ["--gas.composition", "phlogiston"],
         ["--device", "cuda:9"],
         ["--epochs", "-1"],

@@ -1,4 +1,4 @@
-"""The verbs from pictures to a measurement, on a small rendered experiment."""
+"""The verbs from images to a measurement, on a small rendered experiment."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ VIEWS = 4
 
 @pytest.fixture(scope="session")
 def experiment(tmp_path_factory):
-    """Pictures of four views, a calibration and a measurement, each made by its verb."""
+    """Images of four views, a calibration and a measurement, each made by its verb."""
     folder = tmp_path_factory.mktemp("experiment")
     code = main(
-        ["render", "-o", str(folder / "pictures"), "--phantom", "gaussians", "--views", str(VIEWS), "--arc", "10",
+        ["render", "-o", str(folder / "images"), "--phantom", "gaussians", "--views", str(VIEWS), "--arc", "10",
          "120", "--image-size", "96", "112", "--pixel-pitch", "0.0425", "--background-distance", "900",
          "--references", "3", "--poses", "10", "--backgrounds", "2", "--truth-voxels", "20"]
     )  # fmt: skip
     assert code == 0
-    pictures, out = folder / "pictures", folder / "calibration.toml"
-    assert main(["calibrate", str(pictures), "--config", str(pictures / "calibrate.toml"), "-o", str(out)]) == 0
+    images, out = folder / "images", folder / "calibration.toml"
+    assert main(["calibrate", str(images), "--config", str(images / "calibrate.toml"), "-o", str(out)]) == 0
     assert main(displacement(folder)) == 0
     return folder
 
@@ -44,7 +44,7 @@ QUICK = ("--method", "dis")  # where it does not matter how displacements are fo
 
 
 def displacement(folder, *more):
-    words = ["displacement", str(folder / "pictures"), "--calibration", str(folder / "calibration.toml")]
+    words = ["displacement", str(folder / "images"), "--calibration", str(folder / "calibration.toml")]
     return [*words, *BOX, "-o", str(folder / "m.nc"), *map(str, more)]
 
 
@@ -56,7 +56,7 @@ def copy(experiment, tmp_path):
 
 
 def test_calibration_finds_the_rendered_rig(experiment):
-    truth = read_cameras(experiment / "pictures" / "truth" / "calibration.toml")
+    truth = read_cameras(experiment / "images" / "truth" / "calibration.toml")
     found = read_cameras(experiment / "calibration.toml")
     assert [c.name for c in found] == [c.name for c in truth]
     points = torch.from_numpy(np.random.default_rng(0).uniform(-15, 15, (50, 3)))
@@ -79,9 +79,9 @@ def test_measurement_holds_what_was_rendered(experiment):
     from nerif.fields.phantoms import make_phantom
 
     phantom = make_phantom("gaussians", measurement.box, 0)
-    truth = {c.name: c.camera() for c in read_cameras(experiment / "pictures" / "truth" / "calibration.toml")}
+    truth = {c.name: c.camera() for c in read_cameras(experiment / "images" / "truth" / "calibration.toml")}
     displaced, taken = measurement.observations
-    assert taken.technique.name == "pictures"
+    assert taken.technique.name == "images"
     assert float(measurement.usable_for(taken).float().mean()) > 0.98
     found = measurement.usable_for(displaced)
     for i, name in enumerate(measurement.names):
@@ -94,57 +94,57 @@ def test_measurement_holds_what_was_rendered(experiment):
     assert iio.imread(experiment / "m.png").std() > 10
 
 
-def test_truth_is_beside_the_pictures(experiment):
-    assert read_volume(experiment / "pictures" / "truth" / "volume.nc").values.shape == (20, 20, 20)
+def test_truth_is_beside_the_images(experiment):
+    assert read_volume(experiment / "images" / "truth" / "volume.nc").values.shape == (20, 20, 20)
 
 
 @pytest.mark.slow
-def test_field_from_pictures_alone_is_that_which_was_rendered(experiment):
+def test_field_from_images_alone_is_that_which_was_rendered(experiment):
     """Four views are few; examples/from_images.py does nine (test_examples.py, slow)."""
     words = ["reconstruct", str(experiment / "m.nc"), "-o", str(experiment / "r"), "--method", "tikhonov"]
     assert main([*words, "--voxels", "16", "--basis", "linear", "--regularisation", "3e-3", "--no-report"]) == 0
-    assert main(["evaluate", str(experiment / "r"), "--truth", str(experiment / "pictures/truth/volume.nc")]) == 0
+    assert main(["evaluate", str(experiment / "r"), "--truth", str(experiment / "images/truth/volume.nc")]) == 0
     assert json.loads((experiment / "r/metrics.json").read_text())["cc"] > 0.9
 
 
 @pytest.mark.slow
-def test_a_network_goes_by_pictures_and_the_page_shows_them(experiment, tmp_path, capsys):
+def test_a_network_goes_by_images_and_the_page_shows_them(experiment, tmp_path, capsys):
     out = tmp_path / "result"
     held = Measurement.read(experiment / "m.nc").names[1]
-    words = ["reconstruct", str(experiment / "m.nc"), "-o", str(out), "--from", "pictures", "--hold-out", held]
+    words = ["reconstruct", str(experiment / "m.nc"), "-o", str(out), "--from", "images", "--withhold", held]
     assert main([*words, "--max-steps", "40", "--voxels", "16", "--points-per-batch", "2048"]) == 0
-    assert tomllib.loads((out / "run.toml").read_text())["source"] == "pictures"
+    assert tomllib.loads((out / "run.toml").read_text())["source"] == "images"
     views = json.loads((out / "metrics.json").read_text())["views"]
-    assert {(v["name"], v["measured"]) for v in views if v["held_out"]} == {(held, "displacement"), (held, "flow")}
+    assert {(v["name"], v["measured"]) for v in views if v["withheld"]} == {(held, "displacement"), (held, "flow")}
     page = (out / "report.html").read_text()
     assert page.count("data:image/png") >= 3 * 3 * VIEWS  # measured, predicted, difference of u, v and flow
     settings = out / "run.toml"
-    settings.write_text(settings.read_text().replace('source = "pictures"', 'from = "displacements"'))
+    settings.write_text(settings.read_text().replace('source = "images"', 'from = "displacements"'))
     assert main(["reconstruct", "--config", str(settings), "-o", str(tmp_path / "again"), "--no-report"]) == 0
     kept = tomllib.loads((tmp_path / "again/run.toml").read_text())
     assert kept["source"] == "displacements"
     capsys.readouterr()
     assert main([*words[:-4], "--force", "--from", "images"]) == 2
-    assert "from: expected one of auto, pictures, displacements, both, got 'images'" in capsys.readouterr().err
+    assert "from: expected one of auto, images, displacements, both, got 'images'" in capsys.readouterr().err
     plain = tmp_path / "plain.nc"
     whole = Measurement.read(experiment / "m.nc")
     replace(whole, maps={}).write(plain)
-    assert main(["reconstruct", str(plain), "-o", str(tmp_path / "none"), "--from", "pictures"]) == 2
-    assert "expected a measurement with pictures (variables reference and flow)" in capsys.readouterr().err
+    assert main(["reconstruct", str(plain), "-o", str(tmp_path / "none"), "--from", "images"]) == 2
+    assert "expected a measurement with images (variables reference and flow)" in capsys.readouterr().err
 
 
 def test_nothing_is_overwritten_unasked(experiment, capsys):
     assert main(displacement(experiment)) == 2
     assert "exists already" in capsys.readouterr().err
-    assert main(["calibrate", str(experiment / "pictures"), "-o", str(experiment / "calibration.toml")]) == 2
-    assert main(["render", "-o", str(experiment / "pictures")]) == 2
+    assert main(["calibrate", str(experiment / "images"), "-o", str(experiment / "calibration.toml")]) == 2
+    assert main(["render", "-o", str(experiment / "images")]) == 2
 
 
-def test_bad_pictures_cost_only_themselves(copy, capsys):
-    views = sorted(p.name for p in (copy / "pictures").iterdir() if (p / "flow").is_dir())
-    (copy / "pictures" / views[0] / "reference" / "reference_001.tif").write_bytes(b"broken")
-    (copy / "pictures" / views[1] / "flow" / "flow_000.tif").unlink()
-    tifffile.imwrite(copy / "pictures" / views[2] / "flow" / "flow_000.tif", np.zeros((50, 60), np.uint16))
+def test_bad_images_cost_only_themselves(copy, capsys):
+    views = sorted(p.name for p in (copy / "images").iterdir() if (p / "flow").is_dir())
+    (copy / "images" / views[0] / "reference" / "reference_001.tif").write_bytes(b"broken")
+    (copy / "images" / views[1] / "flow" / "flow_000.tif").unlink()
+    tifffile.imwrite(copy / "images" / views[2] / "flow" / "flow_000.tif", np.zeros((50, 60), np.uint16))
     assert main(displacement(copy, "--force", *QUICK)) == 0
     said = capsys.readouterr().out
     assert "left out: " in said
@@ -155,7 +155,7 @@ def test_bad_pictures_cost_only_themselves(copy, capsys):
 
 
 def test_no_good_view_is_an_error(copy, capsys):
-    for flow in (copy / "pictures").glob("*/flow/*.tif"):
+    for flow in (copy / "images").glob("*/flow/*.tif"):
         flow.write_bytes(b"")
     before = (copy / "m.nc").read_bytes()
     assert main(displacement(copy, "--force")) == 2
@@ -166,7 +166,7 @@ def test_no_good_view_is_an_error(copy, capsys):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--frame", "3"], "frame, average: expected numbers within the 1 flow pictures"),
+        (["--frame", "3"], "frame, average: expected numbers within the 1 flow images"),
         (["--method", "piv"], "method: expected one of"),
         (["--views", "none"], "views: expected some of"),
         (["--average", "0"], "average: expected 1 or more"),
@@ -222,7 +222,7 @@ def test_masks_that_leave_nothing(experiment, tmp_path, capsys):
     assert main(["mask", str(experiment / "m.nc"), "-o", str(out), "--threshold", "1000"]) == 2
     assert "no flow is left in view" in capsys.readouterr().err
     assert main(["mask", str(experiment / "m.nc"), "-o", str(out), "--drawn", str(tmp_path)]) == 2
-    assert "expected pictures named as the views" in capsys.readouterr().err
+    assert "expected images named as the views" in capsys.readouterr().err
     assert not out.exists()
 
 
@@ -278,36 +278,36 @@ def test_other_programs_calibrations_are_taken_over(experiment, tmp_path, capsys
     ],
 )
 def test_calibrate_settings_that_cannot_be_right(experiment, tmp_path, capsys, more, words):
-    config = experiment / "pictures" / "calibrate.toml"
-    line = ["calibrate", str(experiment / "pictures"), "--config", str(config), "-o", str(tmp_path / "c.toml"), *more]
+    config = experiment / "images" / "calibrate.toml"
+    line = ["calibrate", str(experiment / "images"), "--config", str(config), "-o", str(tmp_path / "c.toml"), *more]
     assert main(line) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "c.toml").exists()
 
 
 def test_a_mirrored_camera_is_refused(copy, capsys):
-    view = next(p for p in sorted((copy / "pictures").iterdir()) if (p / "flow").is_dir())
+    view = next(p for p in sorted((copy / "images").iterdir()) if (p / "flow").is_dir())
     for path in view.glob("*/*.tif"):
         tifffile.imwrite(path, tifffile.imread(path)[:, ::-1])
-    config = copy / "pictures" / "calibrate.toml"
-    assert main(["calibrate", str(copy / "pictures"), "--config", str(config), "-o", str(copy / "c.toml")]) == 2
+    config = copy / "images" / "calibrate.toml"
+    assert main(["calibrate", str(copy / "images"), "--config", str(config), "-o", str(copy / "c.toml")]) == 2
     said = capsys.readouterr().err
     assert f"view '{view.name}'" in said
     assert "mirrored" in said
 
 
 @pytest.mark.slow
-def test_many_flow_pictures_become_a_sequence(copy, capsys):
+def test_many_flow_images_become_a_sequence(copy, capsys):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
     from nerif.data.measurement_sequence import MeasurementSequence
 
-    views = [folder for folder in sorted((copy / "pictures").iterdir()) if (folder / "flow").is_dir()]
+    views = [folder for folder in sorted((copy / "images").iterdir()) if (folder / "flow").is_dir()]
     for folder in views:
-        (picture,) = (folder / "flow").glob("*.tif*")
+        (image,) = (folder / "flow").glob("*.tif*")
         rest = sorted((folder / "reference").iterdir())[0]
-        picture.rename(picture.with_name(f"flow0{picture.suffix}"))
+        image.rename(image.with_name(f"flow0{image.suffix}"))
         for number in (1, 2):  # nothing flows in these
-            shutil.copy(rest, picture.with_name(f"flow{number}{picture.suffix}"))
+            shutil.copy(rest, image.with_name(f"flow{number}{image.suffix}"))
     spoilt = next(iter(sorted((views[0] / "flow").glob("flow1*"))))
     iio.imwrite(spoilt, np.zeros_like(iio.imread(spoilt)))
     out = copy / "film.zarr"
@@ -337,12 +337,12 @@ def test_many_flow_pictures_become_a_sequence(copy, capsys):
     assert "expected numbers within the 3 of view" in capsys.readouterr().err
 
 
-def test_flow_pictures_of_another_depth_than_the_reference_are_refused(copy, capsys):
-    view = next(p for p in sorted((copy / "pictures").iterdir()) if (p / "flow").is_dir())
-    (picture,) = (view / "flow").glob("*.tif*")
-    whole = iio.imread(picture)
+def test_flow_images_of_another_depth_than_the_reference_are_refused(copy, capsys):
+    view = next(p for p in sorted((copy / "images").iterdir()) if (p / "flow").is_dir())
+    (image,) = (view / "flow").glob("*.tif*")
+    whole = iio.imread(image)
     assert whole.dtype == np.uint16
-    iio.imwrite(picture, (whole >> 8).astype(np.uint8))
+    iio.imwrite(image, (whole >> 8).astype(np.uint8))
     words = displacement(copy, "--frames", "all", "--frame-rate", "1000", *QUICK)
     words[words.index("-o") + 1] = str(copy / "film.zarr")
     assert main(words) == 2

@@ -33,7 +33,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     measurement = str(folder / "m.nc")
     assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", measurement, *TINY]) == 0
     for method in METHODS:
-        arguments = ["--method", method, "-o", str(folder / method), "--hold-out", "85deg", "--voxels", "14"]
+        arguments = ["--method", method, "-o", str(folder / method), "--withhold", "85deg", "--voxels", "14"]
         assert main(["reconstruct", measurement, *arguments, "--iterations", "20", "--no-report"]) == 0
     return folder
 
@@ -53,7 +53,7 @@ def test_result_directory_is_like_any_other(work, method):
     result = work / method
     assert isinstance(read_field(result)[0], VoxelField)
     metrics = json.loads((result / "metrics.json").read_text())
-    held = [v for v in metrics["views"] if v["held_out"]]
+    held = [v for v in metrics["views"] if v["withheld"]]
     assert [v["name"] for v in held] == ["85deg"]
     assert all(v["cc"] > 0.5 for v in metrics["views"])
     assert metrics["seconds"] > 0

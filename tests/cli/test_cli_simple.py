@@ -1,4 +1,4 @@
-"""From the pictures of one camera to a measurement without a calibration target, by the verbs."""
+"""From the images of one camera to a measurement without a calibration target, by the verbs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ VIEW = "-90deg"
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory):
-    """Pictures of one camera on the side of y-, as `nerif displacement` takes them."""
-    folder = tmp_path_factory.mktemp("simple") / "pictures"
+def images(tmp_path_factory):
+    """Images of one camera on the side of y-, as `nerif displacement` takes them."""
+    folder = tmp_path_factory.mktemp("simple") / "images"
     code = main(
         ["render", "-o", str(folder), "--phantom", "gaussians", "--views", "1", "--arc", "-90", "-90", "--image-size",
          "96", "80", "--pixel-pitch", "0.05", "--poses", "0", "--references", "2", "--background-distance", "300",
@@ -30,14 +30,14 @@ def pictures(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def calibration(pictures):
-    out = pictures.parent / "calibration.toml"
-    assert main(["calibrate", str(pictures), *DISTANCES, *LENS, "-o", str(out)]) == 0
+def calibration(images):
+    out = images.parent / "calibration.toml"
+    assert main(["calibrate", str(images), *DISTANCES, *LENS, "-o", str(out)]) == 0
     return out
 
 
-def test_the_camera_is_the_rendered_one(pictures, calibration):
-    (truth,), (found,) = read_cameras(pictures / "truth" / "calibration.toml"), read_cameras(calibration)
+def test_the_camera_is_the_rendered_one(images, calibration):
+    (truth,), (found,) = read_cameras(images / "truth" / "calibration.toml"), read_cameras(calibration)
     assert found.name == truth.name == VIEW
     assert found.image_size == truth.image_size
     for name in ("intrinsics", "rotation", "translation"):
@@ -50,8 +50,8 @@ def test_the_camera_is_the_rendered_one(pictures, calibration):
     assert iio.imread(calibration.with_suffix(".rig.png")).std() > 5
 
 
-def test_displacements_go_by_the_box_of_the_calibration(pictures, calibration, tmp_path, capsys):
-    words = ["displacement", str(pictures), "--calibration", str(calibration), "--method", "dis"]
+def test_displacements_go_by_the_box_of_the_calibration(images, calibration, tmp_path, capsys):
+    words = ["displacement", str(images), "--calibration", str(calibration), "--method", "dis"]
     assert main([*words, "-o", str(tmp_path / "m.nc")]) == 0
     measurement = Measurement.read(tmp_path / "m.nc")
     assert measurement.box == read_box(calibration)
@@ -59,16 +59,16 @@ def test_displacements_go_by_the_box_of_the_calibration(pictures, calibration, t
     given = ["--lower", "-20", "-20", "-30", "--upper", "20", "20", "30"]
     assert main([*words, *given, "-o", str(tmp_path / "own.nc")]) == 0
     assert Measurement.read(tmp_path / "own.nc").box == Box((-20, -20, -30), (20, 20, 30))
-    words[3] = str(pictures / "truth" / "calibration.toml")
+    words[3] = str(images / "truth" / "calibration.toml")
     for some, said in (((), "holds none; give --lower X Y Z and --upper"), (given[:4], "both corners of the box")):
         assert main([*words, *some, "-o", str(tmp_path / "none.nc")]) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "none.nc").exists()
 
 
-def test_what_was_measured_is_said(pictures, tmp_path, capsys):
+def test_what_was_measured_is_said(images, tmp_path, capsys):
     out = tmp_path / "c.toml"
-    line = ["calibrate", str(pictures), *DISTANCES, "--mm-per-px", "0.25", "-o", str(out)]
+    line = ["calibrate", str(images), *DISTANCES, "--mm-per-px", "0.25", "-o", str(out)]
     assert main([*line, "--lower", "-5", "-5", "0", "--upper", "5", "5", "9"]) == 0
     said = capsys.readouterr().out
     assert f"camera '{VIEW}', 700 mm from the axis of the flow, the background 300 mm behind it" in said
@@ -79,10 +79,10 @@ def test_what_was_measured_is_said(pictures, tmp_path, capsys):
     assert read_box(again) == Box((-5, -5, 0), (5, 5, 9))
 
 
-def test_a_picture_and_a_look_at_the_rig(pictures, tmp_path):
-    picture = str(pictures / VIEW / "reference" / "reference_000.tif")
+def test_a_image_and_a_look_at_the_rig(images, tmp_path):
+    image = str(images / VIEW / "reference" / "reference_000.tif")
     out = tmp_path / "c.toml"
-    line = ["calibrate", picture, *DISTANCES, "--mm-per-px", "0.25", "-o", str(out)]
+    line = ["calibrate", image, *DISTANCES, "--mm-per-px", "0.25", "-o", str(out)]
     assert main([*line, "--check"]) == 0
     assert out.with_suffix(".rig.png").exists()
     assert not out.exists()
@@ -103,8 +103,8 @@ def test_a_picture_and_a_look_at_the_rig(pictures, tmp_path):
         ([*DISTANCES, *LENS, "--lower", "0", "0", "0"], "expected both corners of the box"),
     ],
 )
-def test_what_cannot_be_is_refused(pictures, tmp_path, capsys, words, said):
-    assert main(["calibrate", str(pictures), *words, "-o", str(tmp_path / "c.toml")]) == 2
+def test_what_cannot_be_is_refused(images, tmp_path, capsys, words, said):
+    assert main(["calibrate", str(images), *words, "-o", str(tmp_path / "c.toml")]) == 2
     error = capsys.readouterr().err
     assert said in error
     assert "Traceback" not in error

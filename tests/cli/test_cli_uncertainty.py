@@ -74,7 +74,7 @@ def test_standard_deviations_and_percentiles_are_written(result):
     about = json.loads((out / "metrics.json").read_text())["uncertainty"]
     assert (about["kind"], about["members"], about["diverged"]) == ("fast", 2, [])
     found = json.loads((out / "metrics.json").read_text())
-    assert len(found["first_look"]["views"]) == 1
+    assert len(found["cross_validation"]["views"]) == 1
     assert "standard deviations" in found["verdict"]["why"]
 
 
@@ -133,7 +133,7 @@ def test_a_trial_that_diverged_is_named(measured, tmp_path, capsys, monkeypatch)
 
     monkeypatch.setattr(Tikhonov, "__call__", third_diverges)
     words = ["reconstruct", str(measured), "-o", str(tmp_path / "r"), *QUICK, "--uncertainty", "fast"]
-    assert main([*words, "--hold-out", "none"]) == 0
+    assert main([*words, "--withhold", "none"]) == 0
     assert "trial 2 diverged" in capsys.readouterr().out
     about = json.loads((tmp_path / "r/metrics.json").read_text())["uncertainty"]
     assert (about["members"], about["diverged"]) == (1, [2])
@@ -196,7 +196,7 @@ def test_a_run_that_failed_is_not_repeated(measured, tmp_path, monkeypatch):
     monkeypatch.setattr(Tikhonov, "__call__", failing)
     lines: list[str] = []
     settings = Tikhonov(voxels=8, regularisation=0.1, device="cpu")
-    run = Run(report=False, uncertainty="fast", hold_out=("none",))
+    run = Run(report=False, uncertainty="fast", withhold=("none",))
     reconstruct_into(tmp_path / "r", measured, settings, run, monitor=Monitor(lines.append))
     assert len(asked) == 1
     assert "uncertainty: none of a run that diverged" in lines

@@ -63,7 +63,7 @@ def test_files_that_are_whole_are_named(tmp_path, monkeypatch, capsys):
 
 
 STAGES = {
-    "before the first step": ("_first_look", "nothing was saved yet"),
+    "before the first step": ("_cross_validation", "nothing was saved yet"),
     "sampling": ("all_quantities", "holds the field, not yet all that is written of it"),
     "re-projecting": ("reproject", "holds the field, not yet all that is written of it"),
     "scoring": ("evaluate_views", "holds the field, not yet all that is written of it"),
@@ -76,7 +76,7 @@ def test_a_reconstruction_says_what_is_saved_and_goes_on(stage, measurement, tmp
     name, words = STAGES[stage]
     path, out = tmp_path / "m.nc", tmp_path / "r"
     measurement.write(path)
-    run = Run(hold_out=("none",), report=False)
+    run = Run(withhold=("none",), report=False)
     with monkeypatch.context() as patch:
         patch.setattr(workflow, name, broken_off)
         with pytest.raises(Interrupted, match=words) as stop:
@@ -88,9 +88,9 @@ def test_a_reconstruction_says_what_is_saved_and_goes_on(stage, measurement, tmp
 
 
 def test_a_result_that_was_there_is_not_taken_for_the_run_s_own(measurement, tmp_path, monkeypatch):
-    run = Run(hold_out=("none",), report=False)
+    run = Run(withhold=("none",), report=False)
     reconstruct_into(tmp_path / "r", measurement, QUICK, run, voxels=8)
-    monkeypatch.setattr(workflow, "_first_look", broken_off)
+    monkeypatch.setattr(workflow, "_cross_validation", broken_off)
     with pytest.raises(Interrupted, match="nothing was saved yet"):
         reconstruct_into(tmp_path / "r", measurement, QUICK, run, voxels=8, force=True)
 
@@ -100,7 +100,7 @@ def test_a_second_ctrl_c_in_the_training_leads_to_the_checkpoint(measurement, tm
         if step.step == 3:
             raise KeyboardInterrupt
 
-    run = Run(hold_out=("none",), report=False, checkpoint_every=0.0)
+    run = Run(withhold=("none",), report=False, checkpoint_every=0.0)
     with pytest.raises(Interrupted, match="holds the last checkpoint; nerif reconstruct --resume"):
         reconstruct_into(tmp_path / "r", measurement, QUICK, run, on_step=stop)
 
@@ -113,7 +113,7 @@ def test_every_stage_of_a_reconstruction_is_told(measurement, tmp_path):
         return Monitor().counting(title)
 
     monitor = replace(Monitor(), counting=counting)
-    reconstruct_into(tmp_path / "r", measurement, QUICK, Run(hold_out=("none",)), voxels=8, monitor=monitor)
+    reconstruct_into(tmp_path / "r", measurement, QUICK, Run(withhold=("none",)), voxels=8, monitor=monitor)
     assert told == ["sampling the field", "re-projecting", "scoring the views", "writing the report"]
 
 
@@ -136,8 +136,8 @@ def test_a_note_of_a_step_is_one_line(capsys):
     step = Step(1, 0.1, 1.0, 0.1, {"loss": 1.0}, 1.0, lambda: None, lambda: None)  # type: ignore[arg-type,return-value]
     with MONITOR.training("training") as told:
         told(step)
-        told(replace(step, note="the loss is of pictures from here on, of displacements before: it jumps"))
-    assert capsys.readouterr().out == "the loss is of pictures from here on, of displacements before: it jumps\n"
+        told(replace(step, note="the loss is of images from here on, of displacements before: it jumps"))
+    assert capsys.readouterr().out == "the loss is of images from here on, of displacements before: it jumps\n"
 
 
 def test_a_signal_ends_a_command_without_a_traceback(tmp_path):

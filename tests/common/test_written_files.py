@@ -41,7 +41,7 @@ def result(tmp_path, said) -> ResultDirectory:
     found.begin({"seed": 1})
     found.write_metrics({"seconds": 1})
     written(found.path, REPORT, CALIBRATION)
-    for folder in (found.member(1).path, found.member(2).path, found.first_look.path):
+    for folder in (found.member(1).path, found.member(2).path, found.cross_validation.path):
         written(folder, ASKED, "field.safetensors")
     written(found.path / FIGURES, "views.pdf", "slices.pdf")
     assert not said
@@ -59,7 +59,7 @@ def test_a_forced_run_removes_what_the_one_before_wrote_and_nothing_else(result,
     result.begin({"seed": 2})
     assert contents(result.path) == {RUN, *own}
     assert all((result / name).read_text() == "mine" for name in own)
-    assert not (result / "first_look").exists()
+    assert not (result / "cross_validation").exists()
     assert not said
     assert result.settings()["seed"] == 2
 
@@ -188,7 +188,7 @@ def test_the_demo_keeps_a_measurement_that_is_not_its_own(tmp_path, monkeypatch)
     assert contents(out) == {"measurement.nc", "measurement.before.nc", "measurement.truth.nc"}
 
 
-def test_pictures_that_were_not_rendered_are_not_rendered_over(tmp_path):
+def test_images_that_were_not_rendered_are_not_rendered_over(tmp_path):
     from nerif.fields.phantoms import make_phantom
     from nerif.geometry import Box, Ring
     from nerif.simulation.experiment import Experiment

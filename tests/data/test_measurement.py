@@ -17,6 +17,7 @@ from nerif.forward.deflection import Deflection
 from nerif.forward.registry import TECHNIQUES
 from nerif.geometry import Lens, Ring
 from nerif.simulation.simulate import simulate
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +112,9 @@ def test_select(full):
     assert part.names == (full.names[0], full.names[2])
     assert torch.equal(part.displacement.nan_to_num(), full.displacement[[0, 2]].nan_to_num())
     assert torch.equal(part.valid, full.valid[[0, 2]])
-    with pytest.raises(InputError, match="nobody"):
+    with refused("view"):
         full.select(["nobody"])
-    with pytest.raises(InputError, match="none"):
+    with refused("view"):
         full.select([])
 
 
@@ -179,7 +180,7 @@ def test_normal_that_is_no_unit_vector(full, tmp_path):
     dataset["background_normal"].values[1] *= 2
     assert np.isfinite(dataset["background_normal"].values).all()
     dataset.to_netcdf(tmp_path / "x.nc", engine="h5netcdf")
-    with pytest.raises(InputError, match="background_normal of view '60deg'"):
+    with refused("background_normal of view '60deg'"):
         Measurement.read(tmp_path / "x.nc")
 
 
@@ -190,7 +191,7 @@ def test_a_normal_without_an_offset(full):
     dataset = plain.to_dataset()
     normals = torch.stack([camera.background.normal for camera in full.cameras]).numpy()
     dataset["background_normal"] = ("view", "i"), normals
-    with pytest.raises(InputError, match=r"background_offset of view '0deg': .*got nan; give it, or leave out"):
+    with refused("background_offset of view '0deg'"):
         Measurement.from_dataset(dataset)
     dataset["background_normal"] = ("view", "i"), np.full_like(normals, np.nan)
     assert Measurement.from_dataset(dataset).cameras[0].background is None
@@ -203,7 +204,7 @@ def test_sigma_and_displacement_that_no_camera_measures_are_left_out(full):
     m = replace(full, sigma=sigma, displacement=d, valid=None)
     assert m.bad_pixels == 3
     assert not bool(m.usable[0, 1, 1:4].any())
-    with pytest.raises(InputError, match="no valid pixel"):
+    with refused("displacement of view '0deg'"):
         replace(full, sigma=torch.full_like(sigma, 1e-30))
 
 
@@ -239,7 +240,7 @@ def test_truncated_file_is_refused_in_silence(full, tmp_path, capfd):
 
 @pytest.mark.parametrize("distortion", [0.0, -0.1])
 def test_rows_and_corners_without_a_wanted_pixel_are_passed_over(measurement, monkeypatch, distortion):
-    """Pixels are traced in blocks of rows; one that is masked, or beyond a smaller picture, has none."""
+    """Pixels are traced in blocks of rows; one that is masked, or beyond a smaller image, has none."""
     monkeypatch.setattr("nerif.data.measurement.CHUNK", 3 * measurement.displacement.shape[2])
     cameras = [replace(c, distortion=torch.tensor([distortion, 0, 0, 0, 0]).double()) for c in measurement.cameras]
     height, width = cameras[1].image_size

@@ -1,4 +1,4 @@
-"""The half plane of a symmetric flow: what it reads of volumes, its files and its pictures in a result."""
+"""The half plane of a symmetric flow: what it reads of volumes, its files and its images in a result."""
 
 from __future__ import annotations
 

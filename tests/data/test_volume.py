@@ -14,6 +14,7 @@ from nerif.data.exports import export
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.geometry import Box, Grid
+from refusals import refused
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
 VALUES = torch.arange(60, dtype=torch.float32).reshape(5, 3, 4) * 1e-6
@@ -106,7 +107,7 @@ def test_n_stays_n_where_nobody_said_the_ambient_index(tmp_path):
 @pytest.mark.parametrize("value", [float("nan"), 0.00027, "air"])
 def test_ambient_index_that_cannot_be_one(tmp_path, value):
     write_netcdf(tmp_path / "n.nc", [Volume(VALUES, GRID, attributes={"n_ambient": value})])
-    with pytest.raises(InputError, match=r"n\.nc: attribute n_ambient: expected a refractive index such as"):
+    with refused("attribute n_ambient"):
         read_volume(tmp_path / "n.nc")
 
 
@@ -148,5 +149,5 @@ def test_refusals(volumes, tmp_path):
         read_volume(tmp_path / "v.nc", "temperature")
     with pytest.raises(InputError, match="stl"):
         export(tmp_path / "v.stl", volumes)
-    with pytest.raises(InputError, match="shape"):
+    with refused("volume 'index_excess'"):
         Volume(VALUES.movedim(0, 2), GRID)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.common.conventions import FACES, InputError
+from nerif.common.conventions import FACES
 from nerif.fields.grid import Boundary, VoxelField, spline_weights
 from nerif.geometry import Box, Grid
+from refusals import refused
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 GRID = Grid(BOX, (5, 6, 7))
@@ -78,13 +79,13 @@ def test_single_precision_and_another_device_keep_the_field():
 
 @pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_right():
-    with pytest.raises(InputError, match=r"coefficients: expected the shape \(7, 8, 9\)"):
+    with refused("coefficients"):
         VoxelField(torch.zeros(5, 6, 7), GRID, 1)
-    with pytest.raises(InputError, match="degree: expected one of 1, 3, got 2"):
+    with refused("degree"):
         VoxelField(torch.zeros(5, 6, 7), GRID, 2)
-    with pytest.raises(InputError, match="values of shape"):
+    with refused("volume"):
         VoxelField.through(torch.zeros(4, 6, 7), GRID)
-    with pytest.raises(InputError, match="ambient_faces: expected faces out of"):
+    with refused("ambient_faces"):
         Boundary(("top",))
-    with pytest.raises(InputError, match="at least 2 voxels"):
+    with refused("grid"):
         Boundary().extend(torch.zeros(1, 6, 7), 2)

@@ -25,6 +25,7 @@ from nerif.geometry import Box
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.files import FIELD, read_field, write_field
 from nerif.reconstruction.neural.presets import PRESETS
+from refusals import refused
 
 BASE = NetworkShape(depth=3, width=11, octaves=2, skip=2, head_width=5, gradient_head=True)
 SHAPES = {
@@ -102,7 +103,7 @@ def test_octaves_run_along_directions_that_a_cube_turned_into_itself_has():
             assert torch.allclose(some.norm(dim=1), torch.ones(count))
             assert torch.allclose(some.T @ some, count / 3 * torch.eye(3), atol=1e-5)
             assert float((some @ some.T - torch.eye(count)).abs().max()) < 0.9  # no two are one
-    with pytest.raises(InputError, match="directions: expected one of 3, 9, 13, got 5"):
+    with refused("directions"):
         NetworkShape(directions=5)
 
 
@@ -137,7 +138,7 @@ def test_shapes_that_cannot_be_right(change):
 
 
 def test_gradient_heads_that_do_not_exist_cannot_be_asked():
-    with pytest.raises(InputError, match="gradient_head"):
+    with refused("gradient_head"):
         network(SHAPES["value only"]).value_and_gradient(torch.zeros(1, 3, dtype=torch.float64), heads=True)
 
 

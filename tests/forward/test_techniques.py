@@ -16,7 +16,6 @@ from torch import Tensor
 from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import predict, reproject
-from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
@@ -44,6 +43,7 @@ from nerif.reconstruction.voxels.problem import Problem
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import Simulation, simulate
+from refusals import refused
 
 PACKAGE = Path(registry.__file__).parents[1]
 BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
@@ -176,7 +176,7 @@ def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
 
 def test_weights_of_other_channels_than_named_never_reach_the_kernels(measured, monkeypatch):
     monkeypatch.setattr(Cubic, "channels", ("one", "two"))
-    with pytest.raises(InputError, match="Cubic: expected weights of 2 channels a ray, got 1"):
+    with refused("Cubic"):
         VoxelOperator(rays_of(measured["deflection"])[::50], Grid(BOX, (5, 5, 5)), Cubic())
 
 
@@ -347,7 +347,7 @@ def test_a_run_that_began_from_another_scale_goes_on_as_if_it_had_not_stopped(me
     again = settings(m, resume=read_state(tmp_path))
     points = torch.rand(50, 3) * 6
     assert torch.equal(again.field(points), whole.field(points))
-    with pytest.raises(InputError, match=r"the bounds that the run began with, 0 to 0\.5, got 0 to 0\.4"):
+    with refused("resume"):
         replace(settings, upper=0.4)(m, resume=half.state)
     training = Training(settings, TrainingData(settings, m), None, start)
     bounds = training.field.bounds
@@ -394,7 +394,7 @@ def held_by(operator: VoxelOperator) -> int:
 
 @pytest.mark.parametrize("method", [NETWORK, Tikhonov(voxels=8, device="cpu")], ids=["network", "voxels"])
 def test_bounds_that_leave_nothing_with_those_of_the_technique_are_refused(method, measured):
-    with pytest.raises(InputError, match=r"upper: expected to leave a range around 0, got 0 to 0 .* of emission"):
+    with refused("upper"):
         replace(method, upper=0.0)(measured["emission"])
     assert not replace(NETWORK, max_steps=1, upper=0.0)(measured["interferometry"]).outcome.failed
 
@@ -405,7 +405,7 @@ def test_bounds_cannot_be_left(measured):
     values = bounded.field.sample(Grid.of_resolution(BOX, 30))
     assert float(values.min()) >= -1e-5 * (1 + 1e-6)  # as float32 rounds
     assert float(values.max()) <= 0
-    with pytest.raises(InputError, match="lower, upper: expected bounds of the field around 0"):
+    with refused("lower, upper"):
         NeRIF(lower=1e-5)
 
 
@@ -424,7 +424,7 @@ def test_intensities_are_fitted_where_little_light_is_left(balls):
         assert torch.equal(model.read(integral, rays), values)
         result = replace(NETWORK, max_steps=20, model=name)(m)
         assert not result.outcome.failed
-    with pytest.raises(InputError, match="model: expected a linear one, got 'intensity'"):
+    with refused("model"):
         Tikhonov(model="intensity")(m)
 
 
@@ -443,9 +443,9 @@ def test_gains_of_cameras_are_found(measured):
     found = fit_gains(with_gains(even, dict(zip(even.names, (1 / gains).tolist(), strict=True))))
     assert [*found] == [*even.names]
     assert torch.allclose(torch.tensor([*found.values()]), gains / gains.log().mean().exp(), rtol=0.03)
-    with pytest.raises(InputError, match="fit_gains: expected emission"):
+    with refused("fit_gains"):
         fit_gains(measured["absorption"])
-    with pytest.raises(InputError, match="fit_gains: expected two views or more"):
+    with refused("fit_gains"):
         fit_gains(even.select(even.names[:1]))
 
 
@@ -463,7 +463,7 @@ def test_absorbance_of_counts_and_its_sigma():
 
 def test_where_no_quantum_is_left_the_absorbance_is_large():
     passed = torch.tensor([0.0, -0.3, 1.0, 50.0]).double().numpy()
-    found, sigma = absorbance(passed, 0 * passed + 100, reference_pictures=float("inf"))
+    found, sigma = absorbance(passed, 0 * passed + 100, reference_images=float("inf"))
     assert found.tolist() == pytest.approx([math.log(200), math.log(200), math.log(100), math.log(2)])
     assert sigma.tolist() == pytest.approx([2, 2, 1, 50**-0.5])
     found, _ = absorbance(passed, torch.tensor([0.0, 100, 100, 100]).numpy())
@@ -480,59 +480,59 @@ def test_noise_alone_is_not_an_offset(measured):
     noise = torch.randn(noisy.shape, generator=torch.Generator().manual_seed(2))
     noisy = noisy + 0.06 * noisy.nan_to_num().max() * noise
     replace(measured["emission"], maps={"radiance": noisy})
-    with pytest.raises(InputError, match="radiance: expected 0 or more"):
+    with refused("radiance"):
         replace(measured["emission"], maps={"radiance": noisy - 0.5 * noisy.nan_to_num().max()})
 
 
 def test_counts_that_cannot_be():
     bright, dim = torch.full((50,), 100.0).numpy(), torch.full((50,), 30.0).numpy()
-    with pytest.raises(InputError, match="intensity: expected at most the reference"):
+    with refused("intensity"):
         absorbance(bright, dim)
-    with pytest.raises(InputError, match="intensity: expected counts of 0 or more"):
+    with refused("intensity"):
         absorbance(dim - 90, bright)
-    with pytest.raises(InputError, match="reference: expected pictures of shape"):
+    with refused("reference"):
         absorbance(dim[:3], bright)
-    with pytest.raises(InputError, match="dark: expected pictures of shape"):
+    with refused("dark"):
         absorbance(dim, bright, dim[:3])
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_measurements_that_cannot_be(measured):
     m = measured["absorption"]
-    with pytest.raises(InputError, match="subtract the offset of pixels beside the medium"):
+    with refused("absorbance"):
         replace(m, maps={"absorbance": m.maps["absorbance"] - 0.6})
-    with pytest.raises(InputError, match="radiance: expected 0 or more"):
+    with refused("radiance"):
         replace(measured["emission"], maps={"radiance": -measured["emission"].maps["radiance"]})
-    with pytest.raises(InputError, match=r"maps: expected names out of .*got 'phase'"):
+    with refused("maps"):
         replace(m, maps={**m.maps, "phase": m.maps["absorbance"]})
-    with pytest.raises(InputError, match="expected techniques of one field, got deflection and absorption"):
+    with refused("technique"):
         replace(measured["deflection"], maps=m.maps)
     fringes = measured["interferometry"]
-    with pytest.raises(InputError, match="together are weighed by their noise"):
+    with refused("technique"):
         NETWORK(replace(measured["deflection"], sigma=None, wavelength_nm=532.0, maps=fringes.maps))
-    with pytest.raises(InputError, match="wavelength_nm: expected the wavelength of the interferometer"):
+    with refused("wavelength_nm"):
         replace(fringes, wavelength_nm=None)
-    with pytest.raises(InputError, match="background of view '0deg': expected none for absorption"):
+    with refused("background of view '0deg'"):
         replace(m, cameras=RING.cameras())
-    with pytest.raises(InputError, match="background of view '0deg': expected a plane for deflection, got none"):
+    with refused("background of view '0deg'"):
         replace(measured["deflection"], cameras=m.cameras)
     whole = fringes.maps["fringes"] / fringes.maps["fringes"].nan_to_num().abs().max() * 4
-    with pytest.raises(InputError, match="expected an unwrapped phase"):
+    with refused("fringes"):
         replace(fringes, maps={"fringes": torch.remainder(whole, 1)})
-    with pytest.raises(InputError, match="mlem and mart take line integrals of what is never negative"):
+    with refused("method"):
         MLEM(voxels=8, device="cpu")(measured["deflection"])
-    with pytest.raises(InputError, match="model: expected one of auto, absorbance, intensity, poisson for absorption"):
+    with refused("model"):
         NeRIF(model="curved")(m)
-    with pytest.raises(InputError, match="technique: expected one of deflection"):
+    with refused("technique"):
         Simulation(technique=("schlieren",))
-    with pytest.raises(InputError, match="counts: expected a technique that counts quanta"):
+    with refused("counts"):
         Simulation(technique=("interferometry",), counts=100.0, truth_voxels=4)(RING.cameras())
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_maps_of_other_shapes_are_refused(measured):
     m = measured["absorption"]
-    with pytest.raises(InputError, match=r"absorbance: expected \(view, row, column\) = .* got \(5, 18, 23, 1\)"):
+    with refused("absorbance"):
         replace(m, maps={"absorbance": m.maps["absorbance"][..., None]})
 
 
@@ -551,7 +551,7 @@ def test_a_technique_by_which_nothing_was_measured_is_none(balls):
 
 
 def hill(shape: tuple[int, int], fringes: float, width: float, steepness: float = 1.0) -> Tensor:
-    """A phase of so many fringes, as wide as a share of the picture's shorter side."""
+    """A phase of so many fringes, as wide as a share of the image's shorter side."""
     y, x = (torch.arange(n) - (n - 1) / 2 for n in shape)
     radius = torch.sqrt(y[:, None] ** 2 + x**2) / (width * max(min(shape), 40))
     return fringes * torch.exp(-(radius ** (2 * steepness)) / 2)
@@ -567,9 +567,9 @@ def test_wrapped_phases_are_refused_whatever_the_size(size, fringes, noise):
     phase = hill(size, fringes, 0.2)
     phase = phase + noise * torch.randn(size, generator=torch.Generator().manual_seed(0))
     wrapped = torch.remainder(phase + 0.5, 1) - 0.5
-    with pytest.raises(InputError, match="expected an unwrapped phase in fringes, got one in fringes"):
+    with refused("fringes"):
         check_phase(wrapped)
-    with pytest.raises(InputError, match=r"got one in radians .*unwrap_phase\(radians\) / 2 pi"):
+    with refused("fringes"):
         check_phase(2 * torch.pi * wrapped)
 
 
@@ -586,7 +586,7 @@ def test_small_phases_with_noise_and_steep_flanks_are_measured(size, steepness):
 
 
 def test_nothing_measured_is_refused():
-    with pytest.raises(InputError, match="measurement: expected one of displacement, flow, absorbance, radi"):
+    with refused("measurement"):
         Measurement(RING.cameras(), None, BOX, 1.0)
     cameras = [Absorption.seen_by(c) for c in RING.cameras()]
     empty = measurement_of({Absorption: torch.zeros(5, 18, 23, 1)}, cameras, BOX, 1.0)

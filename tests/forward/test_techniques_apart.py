@@ -24,6 +24,7 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import REPROJECTION, ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
 from nerif.workflow.pipeline import Run, reconstruct_into
+from refusals import refused
 
 RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=5, regularisation=1e-3, device="cpu")
@@ -62,7 +63,7 @@ def test_a_technique_sees_no_field_of_another_quantity(files, tmp_path, capsys):
     assert "technique: expected a technique that sees the field of refractive index (deflection, interfero" in said
     assert not out.exists()
     field, box, n_ambient = ResultDirectory(files["deflection"].with_suffix("")).field()
-    with pytest.raises(InputError, match=r"technique: .*, got absorption"):
+    with refused("technique"):
         predict(field, RING.cameras(), box, n_ambient, technique=Absorption, quantity="index_excess")
 
 
@@ -105,7 +106,7 @@ def test_gains_that_were_fitted_stay_with_the_result(files, tmp_path):
     torch.testing.assert_close(out.reprojection().measurement.maps["radiance"], views.measurement.maps["radiance"])
     settings = {k: v for k, v in out.settings().items() if k != "about"}
     out.write_settings(settings, {"gains": {"0deg": 0}})
-    with pytest.raises(InputError, match="expected a number above 0 for view '0deg', got 0"):
+    with refused("gains of run.toml"):
         evaluate(out.path, measurement=uneven)
     out.write_settings(settings)  # forgotten, the views are not what the field was fitted to
     evaluate(out.path, measurement=uneven)
@@ -117,7 +118,7 @@ def test_a_view_that_shows_nothing_is_refused_by_name(files, left):
     even = Measurement.read(files["emission"])
     radiance = even.maps["radiance"].clone()
     radiance[2] *= left
-    with pytest.raises(InputError, match=rf"fit_gains: view '{even.names[2]}' .* leave it out"):
+    with refused("fit_gains"):
         fit_gains(replace(even, maps={"radiance": radiance}))
 
 
@@ -127,9 +128,9 @@ def test_a_view_that_shows_nothing_is_refused_by_name(files, left):
 def test_a_simulation_names_its_technique_and_takes_a_peak_only_where_it_counts(files, tmp_path, capsys):
     assert main(["simulate", "--technique", "-o", str(tmp_path / "m.nc")]) == 2
     assert "technique: expected one or more of deflection" in capsys.readouterr().err
-    with pytest.raises(InputError, match="peak: expected for the extinction or emission of a phantom, got deflection"):
+    with refused("peak"):
         Simulation(peak=0.1)
-    with pytest.raises(InputError, match=r"peak: .*, got a volume file"):
+    with refused("peak"):
         Simulation("mine.nc", ("emission",), peak=0.1)
     measurement, truth = Simulation("gaussians", ("emission",), peak=0.1, steps=10, truth_voxels=16)(RING.cameras())
     assert 0.05 < float(truth.values.max()) <= 0.1
@@ -158,7 +159,7 @@ def test_flow_that_leaves_through_a_face_is_told_where_no_gauge_names_the_face()
 
 
 def test_noise_below_zero_is_no_mistake_in_a_check():
-    """Of a view that shows a few things only, most pixels are noise about 0; the small pictures have no sigma."""
+    """Of a view that shows a few things only, most pixels are noise about 0; the small images have no sigma."""
     simulation = Simulation("flame", ("emission",), noise=0.3, steps=10, truth_voxels=8)
     measurement, _ = simulation(replace(RING, image_size=(36, 37), pixel_pitch=0.11).cameras())
     assert float(measurement.maps["radiance"].min()) < 0

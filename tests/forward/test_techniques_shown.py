@@ -14,7 +14,6 @@ import torch
 from nerif.analysis.consistency import everywhere, looks, of_one_view
 from nerif.analysis.evaluation import score_lines
 from nerif.cli.cli import main
-from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import INDEX, Volume, field_of
 from nerif.data.volume_file import read_volume, write_netcdf
@@ -27,6 +26,7 @@ from nerif.report.pages import error_of, figures_of, residuals_over_sigma, view
 from nerif.report.view_images import view_images
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.sequence.plan import SequenceSettings
+from refusals import refused
 
 RIG = ["--image-size", "14", "17", "--pixel-pitch", "0.26", "--views", "3", "--steps", "20", "--truth-voxels", "8"]
 QUICK = ["--method", "tikhonov", "--voxels", "8", "--iterations", "5", "--regularisation", "1e-4"]
@@ -41,7 +41,7 @@ def simulated(folder: Path, *techniques: str) -> Path:
 
 def reconstructed(path: Path) -> Path:
     out = path.with_suffix("")
-    assert main(["reconstruct", str(path), "-o", str(out), "--hold-out", "85deg", "--no-report", *QUICK]) == 0
+    assert main(["reconstruct", str(path), "-o", str(out), "--withhold", "85deg", "--no-report", *QUICK]) == 0
     assert main(["evaluate", str(out), "--truth", str(path.with_name(f"{path.stem}.truth.nc"))]) == 0
     assert main(["report", str(out)]) == 0
     return out
@@ -165,7 +165,7 @@ def test_metrics_of_displacements_alone_are_still_read(absorption):
     """As versions that knew no other technique wrote them."""
     out = ResultDirectory(absorption)
     kept = (out.path / "metrics.json").read_text()
-    old = {"views": [{"name": "0deg", "held_out": False, "cc": 0.9, "rms_px": 0.25}]}
+    old = {"views": [{"name": "0deg", "withheld": False, "cc": 0.9, "rms_px": 0.25}]}
     try:
         (out.path / "metrics.json").write_text(json.dumps(old))
         [view] = out.metrics()["views"]
@@ -227,7 +227,7 @@ def test_quantities_of_a_sequence_follow_from_the_measurement(both, absorption):
     combined, alone = (Measurement.read(p.with_suffix(".nc")) for p in (both, absorption))
     assert SequenceSettings().for_measurement(combined).quantities == (INDEX, "density")
     assert SequenceSettings().for_measurement(alone).quantities == ("extinction",)
-    with pytest.raises(InputError, match="quantities: expected some of extinction for absorption, got 'density'"):
+    with refused("quantities"):
         SequenceSettings(quantities=("density",), gas=GasSettings()).for_measurement(alone)
 
 

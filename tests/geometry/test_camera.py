@@ -11,6 +11,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.geometry import PROJECTIONS, Box, Camera, Plane, projection_named
 from nerif.geometry.camera import distort, fold, undistort
+from refusals import refused
 
 F64 = torch.float64
 
@@ -144,7 +145,7 @@ def test_sight_distance_and_pixel_size_of_points(camera):
     assert moved[0].tolist() == pytest.approx([1.0, 0.0], abs=0.01)
 
 
-def test_one_row_pictures(camera):
+def test_one_row_images(camera):
     row = camera.view(row=60, column=0, height=1, width=200)
     grid = row.pixel_grid()
     assert grid.shape == (1, 200, 2)
@@ -171,28 +172,27 @@ def test_pixel_grid_is_column_then_row(camera):
 def test_mirrored_axis_swapped_axis_and_stretch_are_no_rotation(camera):
     flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=F64))
     for wrong in (flip @ camera.rotation, camera.rotation[[1, 0, 2]], 1.01 * camera.rotation):
-        with pytest.raises(InputError, match="rotation of view 'camera'"):
+        with refused("rotation of view 'camera'"):
             replace(camera, rotation=wrong)
 
 
 def test_intrinsics_that_cannot_be_right(camera):
     negative = camera.intrinsics.clone()
     negative[1, 1] *= -1
-    words = {"perspective": "positive focal lengths in px", "telecentric": "positive scales in px/mm"}
-    with pytest.raises(InputError, match=words[camera.projection.name]):
+    with refused("intrinsics of view 'camera'"):
         replace(camera, intrinsics=negative)
-    with pytest.raises(InputError, match="transposed"):
+    with refused("intrinsics of view 'camera'"):
         replace(camera, intrinsics=camera.intrinsics.T)
     with pytest.raises(InputError, match="translation"):
         replace(camera, translation=camera.translation * math.nan)
-    with pytest.raises(InputError, match="image_size"):
+    with refused("image_size of view 'camera'"):
         replace(camera, image_size=(0, 10))
-    with pytest.raises(InputError, match="view 'a': projection: expected one of perspective, telecentric, got 'fish'"):
+    with refused("view 'a': projection"):
         projection_named("fish", "view 'a': projection")
 
 
 def test_distortion_that_folds_the_image_is_refused(camera):
-    with pytest.raises(InputError, match=r"distortion of view 'camera': .* check their order"):
+    with refused("distortion of view 'camera'"):
         replace(camera, distortion=torch.tensor([-900.0, 0, 0, 0, 0], dtype=F64)).check_distortion()
 
 
@@ -212,7 +212,7 @@ def test_pixels_beyond_the_fold_of_a_distortion_have_no_ray(k):
     assert bool(undistort(beyond, coefficients).isnan().all())
 
 
-def test_what_folds_back_into_a_picture_is_not_seen_in_it(rotation_about):
+def test_what_folds_back_into_a_image_is_not_seen_in_it(rotation_about):
     intrinsics = torch.tensor([[100.0, 0, 100], [0, 100, 100], [0, 0, 1]], dtype=F64)
     camera = Camera(
         intrinsics, torch.eye(3, dtype=F64), torch.tensor([0.0, 0, 100], dtype=F64), (201, 201),

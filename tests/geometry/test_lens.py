@@ -10,6 +10,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.geometry import PROJECTIONS, Box, Lens, Plane, Ring, spread_points
+from refusals import refused
 
 BOX = Box.cube(40.0)
 RING = Ring(views=2, arc=(20.0, 70.0), elevation=6.0, image_size=(8, 10), pixel_pitch=0.2)
@@ -128,7 +129,7 @@ def test_a_lens_by_its_f_number():
     # the image of the background is sharp: the distance of the image from the lens over the f-number
     assert seen.lens.diameter == pytest.approx(RING.focal_length / 8.0)
     assert RING.cameras()[0].lens is None
-    with pytest.raises(InputError, match="f_number: expected above 0"):
+    with refused("f_number"):
         RING.cameras(f_number=-1.0)
 
 
@@ -136,7 +137,7 @@ def test_a_camera_that_looks_at_no_background_keeps_its_focus():
     seen = camera(Lens(5.0)).without_background
     assert seen.background is None
     assert seen.lens.focus == pytest.approx(camera(None).depth(camera(None).plane))
-    with pytest.raises(InputError, match="focus_distance of view '20deg': expected mm along the optical axis"):
+    with refused("focus_distance of view '20deg'"):
         replace(camera(Lens(5.0)), background=None)
 
 
@@ -153,7 +154,7 @@ def test_lenses_that_cannot_be(wrong, words):
 
 def test_thin_rays_pass_no_lens():
     seen = camera(None)
-    with pytest.raises(InputError, match="expected rays through a lens, got thin ones"):
+    with refused("aperture_diameter"):
         seen.rays(seen.pixel_grid().reshape(-1, 2)).through(torch.zeros(80, 1, 4))
 
 
@@ -176,7 +177,7 @@ def test_where_a_telecentric_camera_counts_its_depth_from_changes_nothing():
 
 
 def test_a_pinhole_is_not_in_focus_behind_itself():
-    with pytest.raises(InputError, match="focus_distance of view '20deg': expected a lens in focus before the camera"):
+    with refused("focus_distance of view '20deg'"):
         camera(Lens(3.0, -500.0))
     thin = replace(camera(Lens(0.0)), background=None)  # beside views whose lens is known
     assert float(thin.rays(torch.zeros(1, 2).double()).lens.radius) == 0

@@ -129,7 +129,7 @@ RIGHT = {
     "one view": (ring(views=1), BOX),
     "elevated": (ring(elevation=35.0), BOX),
     "a part of the box": (ring(focal_length=400.0), BOX),
-    "a small box in large pictures": (ring(), Box.cube(2.0)),
+    "a small box in large images": (ring(), Box.cube(2.0)),
     "lines": (tuple(c.view(20, 0, 1, 48) for c in ring()), BOX),
     "parts that overlap": (tuple(c.view(5 * i, 0, 20, 48) for i, c in enumerate(ring())), BOX),
     "a thin box": (ring(), Box((-25.0, -25.0, -0.2), (25.0, 25.0, 0.2))),

@@ -9,6 +9,7 @@ import torch
 
 from nerif.common.conventions import FACES, InputError, parse_faces
 from nerif.geometry import TELECENTRIC, Box, Grid, Rays, Ring, paper_rig
+from refusals import refused
 
 F64 = torch.float64
 BOX = Box((-1.0, -2.0, -3.0), (2.0, 4.0, 6.0))
@@ -59,9 +60,9 @@ def test_box_and_faces():
         assert float(points[:, others].std(dim=0).min()) > 0
         assert bool(((points >= torch.tensor(BOX.lower)) & (points <= torch.tensor(BOX.upper))).all())
     for lower, upper in (((0, 0, 0), (1, 0, 1)), ((0, 0, 0), (1, -1, 1)), ((0, 0, 0), (1, math.nan, 1))):
-        with pytest.raises(InputError, match="box"):
+        with refused("box"):
             Box(lower, upper)
-    with pytest.raises(InputError, match="up"):
+    with refused("ambient_faces"):
         parse_faces("x- up")
 
 
@@ -73,7 +74,7 @@ def test_grid_is_indexed_z_y_x_at_voxel_centres():
     assert points[4, 1, 1].tolist() == [1.25, 1.0, 1.5]
     assert points[0, 0, 0].tolist() == [-0.25, -1.0, -2.5]
     assert Grid.of_resolution(BOX, 27).shape == (27, 18, 9)
-    with pytest.raises(InputError, match="grid"):
+    with refused("grid"):
         Grid(BOX, (0, 3, 2))
 
 
@@ -86,7 +87,7 @@ def test_paper_rig():
         assert float(c.intrinsics[0, 0]) == float(c.intrinsics[1, 1]) == 2500.0
         origin, above = c.project(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 10.0]], dtype=F64))
         assert origin.tolist() == pytest.approx([99.5, 99.5])
-        assert float(above[1]) < float(origin[1])  # up in the world is up in the picture
+        assert float(above[1]) < float(origin[1])  # up in the world is up in the image
         assert float(c.centre.norm()) == pytest.approx(700.0)
         assert float(c.rays(torch.tensor([[99.5, 99.5]], dtype=F64)).ends.distance) == pytest.approx(1200.0)
     first = cameras[0]
@@ -100,7 +101,7 @@ def test_ring_settings():
     ring = Ring(views=3, arc=(0, 90), extra_angles=(10,), elevation=30, distance=100, image_size=(20, 30))
     assert ring.angles == (0, 45, 90, 10)
     assert ring.cameras()[0].centre.tolist() == pytest.approx([100 * math.cos(math.pi / 6), 0, 50])
-    with pytest.raises(InputError, match="different angles"):
+    with refused("views"):
         Ring(views=3, arc=(0, 90), extra_angles=(45,)).cameras()
     for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
         with pytest.raises(InputError, match=name):
@@ -143,11 +144,11 @@ def test_rings_that_cannot_be(name, value, unchecked):
 
 def test_boxes_and_grids_that_cannot_be(unchecked):
     for lower, upper in (((0, 0, 0), (1, 1, math.nan)), ((1e6, 0, 0), (1e6 + 1, 1, 1)), ((0, 0, 0), (1e9, 1, 1))):
-        with pytest.raises(InputError, match="box: expected lower < upper"):
+        with refused("box"):
             Box(lower, upper)
-    with pytest.raises(InputError, match="voxels: expected at least 1"):
+    with refused("voxels"):
         Grid.of_resolution(Box.cube(1.0), 0)
-    with pytest.raises(InputError, match="grid: expected three positive"):
+    with refused("grid"):
         Grid(Box.cube(1.0), (1.5, 2, 2))
 
 

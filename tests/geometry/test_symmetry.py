@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from nerif.common.conventions import InputError
 from nerif.geometry import Box
 from nerif.geometry.symmetry import Symmetry, parse_symmetry
+from refusals import refused
 
 BOX = Box((-20.0, -20.0, -30.0), (20.0, 20.0, 30.0))
 SIDES = ("x-", "x+", "y-", "y+")
@@ -28,12 +28,12 @@ def test_names_are_understood(text, found):
 
 @pytest.mark.parametrize("text", ["axes", "axis+", "axis+9", "planar+1", ""])
 def test_other_names_are_refused(text):
-    with pytest.raises(InputError, match=r"symmetry: expected none, axis, axis\+N"):
+    with refused("symmetry"):
         parse_symmetry(text)
 
 
 def test_an_axis_without_a_direction_is_refused():
-    with pytest.raises(InputError, match="axis_direction"):
+    with refused("axis_direction"):
         about(direction=(0.0, 0.0, 0.0))
 
 
@@ -69,7 +69,7 @@ def test_the_reduced_box_ends_at_the_nearest_ambient_face():
     assert straight.reduced_box(BOX, SIDES).upper[0] == pytest.approx(18.0)
     assert straight.reduced_box(BOX, ()).upper[0] == pytest.approx(math.hypot(21.0, 22.0))
     assert straight.reduced_box(BOX, SIDES).lower[2] == pytest.approx(-30.0)
-    with pytest.raises(InputError, match="axis_point: expected the axis within the box"):
+    with refused("axis_point"):
         about(point=(25.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0)).reduced_box(BOX, SIDES)
 
 

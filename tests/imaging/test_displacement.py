@@ -1,4 +1,4 @@
-"""Displacement from pictures: signs, sizes, noise, what is not valid, and camera shake."""
+"""Displacement from images: signs, sizes, noise, what is not valid, and camera shake."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.patterns import Background
+from refusals import refused
 
 SHAPE = (90, 120)
 FULL = 4095.0
@@ -39,8 +40,8 @@ def truth():
     return np.stack([2.0 * bump, -1.2 * bump * (columns - 75) / 22], axis=-1)
 
 
-def pictures(pattern, d, count=1, noise=12.0, seed=0):
-    """Counts of a 12-bit camera: `count` references, and the flow picture reference(p - d(p))."""
+def images(pattern, d, count=1, noise=12.0, seed=0):
+    """Counts of a 12-bit camera: `count` references, and the flow image reference(p - d(p))."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
     still = 0.8 * FULL * pattern(rows, columns)
@@ -51,7 +52,7 @@ def pictures(pattern, d, count=1, noise=12.0, seed=0):
 
 @pytest.mark.parametrize("method", FLOWS)
 def test_every_method_has_the_sign_and_grid_of_the_conventions(pattern, truth, method):
-    references, flow = pictures(pattern, truth)
+    references, flow = images(pattern, truth)
     d = displacement(references[0].astype(np.float32), flow.astype(np.float32), DisplacementSettings(method))
     assert d.shape == (*SHAPE, 2)
     error = np.linalg.norm(d - truth, axis=-1)[8:-8, 8:-8]
@@ -62,7 +63,7 @@ def test_every_method_has_the_sign_and_grid_of_the_conventions(pattern, truth, m
 
 
 def test_warp_undoes_the_flow(pattern, truth):
-    references, flow = pictures(pattern, truth, noise=0.0)
+    references, flow = images(pattern, truth, noise=0.0)
     back = warp(references[0].astype(np.float32), -truth)
     left = (flow - back)[8:-8, 8:-8].std()  # dots of 3 px are finer than pixels can carry
     assert left < 0.15 * (flow.astype(float) - references[0])[8:-8, 8:-8].std()
@@ -70,7 +71,7 @@ def test_warp_undoes_the_flow(pattern, truth):
 
 @pytest.mark.parametrize("method", ["deepflow", "dis", "correlation"])
 def test_brightness_and_contrast_do_not_matter(pattern, truth, method):
-    references, flow = pictures(pattern, truth)
+    references, flow = images(pattern, truth)
     settings = DisplacementSettings(method)
     d = displacement(references[0].astype(np.float32), flow.astype(np.float32), settings)
     dimmed = displacement(references[0].astype(np.float32), 0.5 * flow.astype(np.float32) + 300, settings)
@@ -78,7 +79,7 @@ def test_brightness_and_contrast_do_not_matter(pattern, truth, method):
 
 
 def test_local_contrast_copes_with_uneven_light(pattern, truth):
-    references, flow = pictures(pattern, truth)
+    references, flow = images(pattern, truth)
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]]
     glow = flow * (1 - 0.006 * columns) + 1500 * np.exp(-(((rows - 40) / 20) ** 2))
     evened = DisplacementSettings("dis", local_contrast=15)
@@ -89,7 +90,7 @@ def test_local_contrast_copes_with_uneven_light(pattern, truth):
 @pytest.mark.parametrize("references", [1, 6])
 @pytest.mark.parametrize("method", ["deepflow", "dis", "ilk", "correlation"])
 def test_sigma_is_about_the_error(pattern, truth, method, references):
-    many, flow = pictures(pattern, truth, references, noise=40.0)
+    many, flow = images(pattern, truth, references, noise=40.0)
     found = measure(many, [flow], DisplacementSettings(method), FULL)
     assert found.noise_from == ("repeats" if references >= 3 else "structure tensor")
     error = (found.displacement - truth)[8:-8, 8:-8]
@@ -101,15 +102,15 @@ def test_repeats_follow_the_noise_of_the_camera(pattern):
     settings = DisplacementSettings("dis")
     sigma = []
     for noise in (20.0, 80.0):
-        references, flow = pictures(pattern, np.zeros((*SHAPE, 2)), 6, noise)
+        references, flow = images(pattern, np.zeros((*SHAPE, 2)), 6, noise)
         sigma.append(np.median(measure(references, [flow], settings).sigma))
     assert 2.0 < sigma[1] / sigma[0] < 8.0
 
 
-def test_averaging_flow_pictures_lowers_noise(pattern, truth):
+def test_averaging_flow_images_lowers_noise(pattern, truth):
     still = 0 * truth  # so that noise is the only error
-    references, _ = pictures(pattern, still, 6, noise=60.0)
-    flows = [pictures(pattern, still, 1, 60.0, seed=s)[1] for s in range(20, 26)]
+    references, _ = images(pattern, still, 6, noise=60.0)
+    flows = [images(pattern, still, 1, 60.0, seed=s)[1] for s in range(20, 26)]
     settings = DisplacementSettings("ilk")
     one, six = measure(references, flows[:1], settings), measure(references, flows, settings)
 
@@ -121,7 +122,7 @@ def test_averaging_flow_pictures_lowers_noise(pattern, truth):
 
 
 def test_what_cannot_be_measured_is_not_valid(pattern, truth):
-    references, flow = pictures(pattern, truth, 1)
+    references, flow = images(pattern, truth, 1)
     rng = np.random.default_rng(1)
     references[0][20:40, 20:40] = 1600  # nothing printed here
     flow[20:40, 20:40] = (1600 + 12 * rng.standard_normal((20, 20))).astype(np.uint16)
@@ -140,7 +141,7 @@ def test_what_cannot_be_measured_is_not_valid(pattern, truth):
 def test_pixels_that_come_from_outside_the_reference_are_not_valid(pattern):
     d = np.zeros((*SHAPE, 2))
     d[..., 0] = 2.5
-    references, flow = pictures(pattern, d)
+    references, flow = images(pattern, d)
     found = measure(references, [flow], DisplacementSettings("correlation"))
     assert not found.valid[:, :2].any()
     assert found.valid[10:-10, 10:-10].mean() > 0.95
@@ -150,7 +151,7 @@ def test_shake_is_removed(pattern, truth):
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
     y, x = rows - 45, columns - 60
     shake = np.stack([0.8 + 0.004 * x - 0.006 * y, -0.5 + 0.006 * x + 0.004 * y], axis=-1)
-    references, flow = pictures(pattern, truth + shake, 1)
+    references, flow = images(pattern, truth + shake, 1)
     plain = measure(references, [flow], DisplacementSettings("dis"))
     still = measure(references, [flow], DisplacementSettings("dis", shake_border=10))
     inner = (slice(12, -12), slice(12, -12))
@@ -159,7 +160,7 @@ def test_shake_is_removed(pattern, truth):
     assert still.valid.mean() > 0.9
 
 
-def test_shake_ignores_outliers_and_leaves_a_still_picture_alone(truth):
+def test_shake_ignores_outliers_and_leaves_a_still_image_alone(truth):
     rng = np.random.default_rng(0)
     d = (0.02 * rng.standard_normal((*SHAPE, 2))).astype(np.float32)
     d[:10, 20:50] += 3.0
@@ -183,23 +184,23 @@ def test_settings_that_cannot_be_right(change, words):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_pictures_that_cannot_be_right(pattern):
-    references, flow = pictures(pattern, np.zeros((*SHAPE, 2)))
+def test_images_that_cannot_be_right(pattern):
+    references, flow = images(pattern, np.zeros((*SHAPE, 2)))
     settings = DisplacementSettings("dis")
-    with pytest.raises(InputError, match="one size"):
+    with refused("images"):
         measure(references, [flow[:50]], settings)
-    with pytest.raises(InputError, match="single grey"):
+    with refused("reference"):
         measure([np.full(SHAPE, 7, np.uint16)], [flow], settings)
-    with pytest.raises(InputError, match="at least one of each"):
+    with refused("images"):
         measure([], [flow], settings)
-    with pytest.raises(InputError, match="half the picture"):
+    with refused("shake_border"):
         measure(references, [flow], dataclasses.replace(settings, shake_border=45))
-    with pytest.raises(InputError, match="window: expected at most"):
+    with refused("window"):
         window_correlation(flow.astype(np.float32), flow.astype(np.float32), window=64)
 
 
 def test_no_movement_is_no_displacement(pattern):
-    references, _ = pictures(pattern, np.zeros((*SHAPE, 2)))
+    references, _ = images(pattern, np.zeros((*SHAPE, 2)))
     for method in FLOWS:
         still = references[0].astype(np.float32)
         d = displacement(still, still, DisplacementSettings(method))

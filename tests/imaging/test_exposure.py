@@ -12,7 +12,7 @@ from nerif.imaging.readers.open import open_frames
 SHAPE = (60, 80)
 
 
-def picture(bits: int, shift: int = 0, saturate: bool = True, seed: int = 0) -> np.ndarray:
+def synthetic(bits: int, shift: int = 0, saturate: bool = True, seed: int = 0) -> np.ndarray:
     """A noisy pattern of a sensor of so many bits, moved up by `shift`, with a reflection of 12 x 10 px in it."""
     rng = np.random.default_rng(seed)
     full = 2**bits - 1
@@ -31,18 +31,18 @@ def opened(tmp_path, *images: np.ndarray):
 @pytest.mark.parametrize("left", [False, True])
 def test_a_full_sensor_is_known_on_either_side_of_16_bit(tmp_path, bits, left):
     shift = 16 - bits if left else 0
-    image = picture(bits, shift)
-    full = full_scale(opened(tmp_path, image, picture(bits, shift, saturate=False, seed=1)))
+    image = synthetic(bits, shift)
+    full = full_scale(opened(tmp_path, image, synthetic(bits, shift, saturate=False, seed=1)))
     assert full == (2**bits - 1) << shift
     expected = np.zeros(SHAPE, dtype=bool)
     expected[20:32, 30:40] = True
     assert np.array_equal(saturated(image, full), expected)
-    assert not saturated(picture(bits, shift, saturate=False, seed=1), full).any()
+    assert not saturated(synthetic(bits, shift, saturate=False, seed=1), full).any()
 
 
 @pytest.mark.parametrize(("bits", "top"), [(8, 255), (16, 65535)])
 def test_a_container_that_is_filled(tmp_path, bits, top):
-    image = picture(bits)
+    image = synthetic(bits)
     full = full_scale(opened(tmp_path, image))
     assert full == top
     assert saturated(image, full).sum() == 120
@@ -50,7 +50,7 @@ def test_a_container_that_is_filled(tmp_path, bits, top):
 
 @pytest.mark.parametrize("level", [3000, 3900])
 def test_a_sensor_that_is_full_below_the_top_of_its_range(level):
-    image = np.minimum(picture(12), level).astype(np.uint16)
+    image = np.minimum(synthetic(12), level).astype(np.uint16)
     assert np.array_equal(saturated(image, 4095.0), image == level)
     assert saturated(image, 4095.0).sum() == 120
 
@@ -66,15 +66,15 @@ def test_nothing_is_saturated_where_the_highest_values_are_noise(tmp_path):
             assert not saturated(frames[0], full_scale(frames)).any(), (bits, shift, brightness)
 
 
-def test_a_plateau_tells_nothing_in_a_picture_without_noise():
+def test_a_plateau_tells_nothing_in_a_image_without_noise():
     image = np.full(SHAPE, 60, np.uint8)
     image[10:30, 10:50] = 200
     assert not saturated(image, 255.0).any()
 
 
-def test_a_brighter_picture_than_those_looked_at_is_not_saturated(tmp_path):
-    dark = opened(tmp_path, picture(10, saturate=False))
-    bright = picture(12, saturate=False)
+def test_a_brighter_image_than_those_looked_at_is_not_saturated(tmp_path):
+    dark = opened(tmp_path, synthetic(10, saturate=False))
+    bright = synthetic(12, saturate=False)
     assert full_scale(dark) == 1023
     assert not saturated(bright, full_scale(dark)).any()
 
@@ -83,14 +83,14 @@ def test_stated_bits_that_the_values_exceed_are_not_believed(tmp_path):
     import h5py
 
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["x"] = picture(12, 4)[None]
+        file["x"] = synthetic(12, 4)[None]
         file["x"].attrs["bits"] = 12
     assert full_scale(open_frames(tmp_path / "a.h5")) == 65520
 
 
 def test_full_scale_of_two_sources_is_that_of_the_brighter(tmp_path):
-    np.save(tmp_path / "dark.npy", picture(10, saturate=False)[None])
-    bright = opened(tmp_path, picture(12))
+    np.save(tmp_path / "dark.npy", synthetic(10, saturate=False)[None])
+    bright = opened(tmp_path, synthetic(12))
     assert full_scale(open_frames(tmp_path / "dark.npy"), bright) == 4095
 
 
@@ -104,7 +104,7 @@ def test_effective_bits_of_unknown_ones(tmp_path, peak, bits):
 
 
 def test_effective_bits_of_known_ones(tmp_path):
-    stack = np.stack([picture(12, seed=s) for s in range(4)])
+    stack = np.stack([synthetic(12, seed=s) for s in range(4)])
     assert effective_bits(opened(tmp_path, *(stack // 16).astype(np.uint8))) == 8
     assert effective_bits(opened(tmp_path, *(stack / 4095).astype(np.float32))) == 1
     header = write_photron(tmp_path, packed(stack // 8), n=4, h=SHAPE[0], w=SHAPE[1])

@@ -19,6 +19,7 @@ from nerif.common.conventions import InputError
 from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
 from nerif.imaging.calibration.importers.importers import ImportSettings, import_cameras, is_calibration
+from refusals import refused
 
 PLANE = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -900.0)
 
@@ -129,11 +130,11 @@ def test_a_calibration_keeps_the_lenses_and_is_given_some(tmp_path):
     assert {camera.lens for camera in import_cameras(path, ImportSettings(aperture_diameter=0.0))} == {None}
     assert [camera.lens for camera in import_cameras(path)] == [Lens(3.5), Lens(4.0, 900.0)]
     path.write_text(path.read_text().replace("aperture_diameter = 3.5", "aperture_diameter = -3.5"))
-    with pytest.raises(InputError, match=r"camera '.*': aperture_diameter: expected a lens of 0 mm or more, got -3\.5"):
+    with refused("aperture_diameter"):
         read_cameras(path)
-    with pytest.raises(InputError, match="focus_distance: expected together with aperture_diameter"):
+    with refused("focus_distance"):
         ImportSettings(focus_distance=900.0)
-    with pytest.raises(InputError, match="aperture_diameter: expected a lens"):
+    with refused("aperture_diameter"):
         ImportSettings(aperture_diameter=-1.0)
 
 
@@ -170,11 +171,10 @@ def test_how_well_a_pose_is_known_is_said_or_taken_from_the_file_in_its_unit(tmp
     assert own.pose_sigma.tolist() == [0, 1, 2, 30, 40, 50]
     (said,) = import_cameras(path, ImportSettings(pose_sigma_mm=0.3, pose_sigma_deg=0.01))
     assert said.pose_sigma.tolist() == pytest.approx([np.radians(0.01)] * 3 + [0.3] * 3)
-    with pytest.raises(InputError, match="pose_sigma_mm, pose_sigma_deg: expected both or neither"):
+    with refused("pose_sigma_mm, pose_sigma_deg"):
         ImportSettings(pose_sigma_mm=0.3)
-    with pytest.raises(InputError, match="pose_sigma_deg: expected a standard deviation of 0 or more, got -1"):
+    with refused("pose_sigma_deg"):
         ImportSettings(pose_sigma_mm=0.3, pose_sigma_deg=-1.0)
-
 
 
 def test_what_is_not_known_is_asked_for(tmp_path):
@@ -395,7 +395,7 @@ def test_opencv_errors(tmp_path):
         import_cameras(tmp_path.joinpath("empty").mkdir() or tmp_path / "empty")
     mirrored = np.diag([-1.0, 1, 1]) @ a["R"]
     write_opencv(path, {"K": a["K"], "R": mirrored, "T": a["t"]})
-    with pytest.raises(InputError, match=r"bad.yml.*mirrored axis"):
+    with refused("rotation of view 'bad'"):
         import_cameras(path)
 
 
@@ -468,7 +468,7 @@ def test_nerf_cameras_of_browns_models_are_read(tmp_path, model):
 def test_opencv_cameras_of_other_models_are_refused(tmp_path, key, value):
     a, path = arrays(ONE), tmp_path / "fisheye.yml"
     write_opencv(path, {key: value, "K": a["K"], "D": a["D"][:4], "R": a["R"], "T": a["t"]})
-    with pytest.raises(InputError, match=r"fisheye.yml.*undistort the pictures"):
+    with pytest.raises(InputError, match=r"fisheye.yml.*undistort the images"):
         import_cameras(path)
 
 
@@ -478,7 +478,7 @@ def test_opencv_matrices_where_numbers_belong_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"odd.yml: image_height, image_width: expected 2 numbers"):
         import_cameras(path)
     write_opencv(path, {**a, "xi": np.ones((1, 1))})
-    with pytest.raises(InputError, match=r"odd.yml.*undistort the pictures"):
+    with pytest.raises(InputError, match=r"odd.yml.*undistort the images"):
         import_cameras(path)
 
 
@@ -588,7 +588,7 @@ def test_camera_parameters_by_to_struct(tmp_path, release, radial, pose):
     (got,) = import_cameras(path, ImportSettings(pose=pose))
     assert sees(got, struct, pose)
     assert got.image_size == (160, 200)
-    with pytest.raises(InputError, match=r"pose of picture 7.* got 3 and 3 poses"):
+    with pytest.raises(InputError, match=r"pose of image 7.* got 3 and 3 poses"):
         import_cameras(path, ImportSettings(pose=7))
 
 
@@ -602,10 +602,10 @@ def test_camera_parameters_of_several_cameras_or_one_pose(tmp_path):
     assert all(sees(c, struct, 1) for c, struct in zip(got, (left, right, left), strict=True))
 
 
-def test_camera_parameters_without_target_pictures(tmp_path):
+def test_camera_parameters_without_target_images(tmp_path):
     path = tmp_path / "plain.mat"
     scipy.io.savemat(path, {**camera_parameters(1, "R2022b"), "RotationVectors": np.zeros((0, 3))})
-    with pytest.raises(InputError, match=r"pose of picture 1 in RotationVectors.* got 0 and 3 poses"):
+    with pytest.raises(InputError, match=r"pose of image 1 in RotationVectors.* got 0 and 3 poses"):
         import_cameras(path)
 
 
@@ -619,8 +619,8 @@ def test_rotation_matrices_of_the_toolbox_multiply_row_vectors(tmp_path):
     assert sees(got, {**struct, "RotationVectors": vectors}, 2)
 
 
-@pytest.mark.parametrize("pictures", [True, False])
-def test_stereo_parameters_by_to_struct(tmp_path, pictures):
+@pytest.mark.parametrize("images", [True, False])
+def test_stereo_parameters_by_to_struct(tmp_path, images):
     """x_2 = x_1 RotationOfCamera2 + TranslationOfCamera2; the poses of camera 2 are those of camera 1, so moved."""
     path = tmp_path / "stereo.mat"
     one, two = camera_parameters(1, "R2021a"), camera_parameters(2, "R2021a")
@@ -632,11 +632,11 @@ def test_stereo_parameters_by_to_struct(tmp_path, pictures):
     stereo = {"CameraParameters1": one, "CameraParameters2": two, "RotationOfCamera2": turn,
               "TranslationOfCamera2": shift, "Version": one["Version"]}  # fmt: skip
     none = {"RotationVectors": np.zeros((0, 3)), "TranslationVectors": np.zeros((0, 3))}
-    if not pictures:
+    if not images:
         stereo |= {"CameraParameters1": one | none, "CameraParameters2": two | none}
     scipy.io.savemat(path, stereo)
-    first, second = import_cameras(path, ImportSettings(pose=2 if pictures else 1))
-    if pictures:
+    first, second = import_cameras(path, ImportSettings(pose=2 if images else 1))
+    if images:
         assert sees(first, one, 2)
         assert sees(second, two, 2)
         return
@@ -680,7 +680,7 @@ def test_bouguets_toolbox(tmp_path):
     (got,) = import_cameras(path, ImportSettings(pose=2))
     assert same(got, ONE)
     assert got.image_size == (160, 200)
-    with pytest.raises(InputError, match=r"pose of picture 1 .* got Rc_2"):
+    with pytest.raises(InputError, match=r"pose of image 1 .* got Rc_2"):
         import_cameras(path)
 
 
@@ -756,21 +756,21 @@ def test_other_errors(tmp_path):
     odd.write_text("x")
     with pytest.raises(InputError, match=r"ending in .toml .csv"):
         import_cameras(odd)
-    with pytest.raises(InputError, match="scale_mm"):
+    with refused("scale_mm"):
         ImportSettings(scale_mm=0.0)
 
 
-def test_calibrations_are_told_from_pictures(tmp_path):
-    opencv, pictures, both = (tmp_path / name for name in ("opencv", "pictures", "both"))
-    for folder in (opencv, pictures, both):
+def test_calibrations_are_told_from_images(tmp_path):
+    opencv, images, both = (tmp_path / name for name in ("opencv", "images", "both"))
+    for folder in (opencv, images, both):
         folder.mkdir()
     for folder in (opencv, both):
         (folder / "left.yml").touch()
-    (pictures / "views.toml").touch()
+    (images / "views.toml").touch()
     (both / "cam1").mkdir()
     assert is_calibration(opencv)
     assert is_calibration(opencv / "left.yml")
-    assert not is_calibration(pictures)
+    assert not is_calibration(images)
     assert not is_calibration(both)
 
 
@@ -778,7 +778,7 @@ def test_only_the_cameras_asked_for(tmp_path):
     path = tmp_path / "c.toml"
     write_cameras(path, [CalibratedCamera.from_camera(c) for c in (ONE, TWO)])
     assert [c.name for c in import_cameras(path, only=("two",))] == ["two"]
-    with pytest.raises(InputError, match="views: expected some of one, two, got 'three'"):
+    with refused("views"):
         import_cameras(path, only=("three",))
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerif.common.conventions import InputError
 from nerif.imaging.line_scans import LineScan
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from refusals import refused
 
 ANGLES = np.radians(np.arange(0, 180, 12.0))
 POSITIONS = -6 + 0.25 * np.arange(47)  # not about the axis
@@ -88,9 +88,9 @@ def test_angles_that_are_cut_off_are_not_counted_on():
     cut = scan.readings.copy()
     cut[3, :5] = 0.4
     assert 3 not in replace(scan, readings=cut).complete
-    with pytest.raises(InputError, match="three angles or more that hold all of the medium, got 0"):
+    with refused("readings"):
         replace(scan, readings=scan.readings + 1).bend()
-    with pytest.raises(InputError, match="four angles or more that hold all of the medium, got 2"):
+    with refused("readings"):
         replace(scan, readings=np.where(np.arange(len(ANGLES))[:, None] < 2, scan.readings, 1.0)).axis()
 
 
@@ -102,16 +102,16 @@ def test_every_angle_has_a_name_of_its_own():
     assert [float(name.removesuffix("deg")) for name in names] == pytest.approx(degrees, abs=1e-6)
     assert len(set(names)) == len(names)
     twice = replace(scan, angles=np.radians([*degrees[:7], 150.0]))
-    with pytest.raises(InputError, match=r"angles: expected different angles, got 150deg 2 times; average"):
+    with refused("angles"):
         twice.measurement(AXIS)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_scans_that_cannot_be():
     scan = true_scan()
-    with pytest.raises(InputError, match="readings: expected one for each angle and position"):
+    with refused("readings"):
         LineScan(ANGLES[:-1], POSITIONS, scan.readings)
-    with pytest.raises(InputError, match="positions: expected evenly spaced, rising positions"):
+    with refused("positions"):
         LineScan(ANGLES, POSITIONS**3, scan.readings)
-    with pytest.raises(InputError, match="four angles and positions or more"):
+    with refused("readings"):
         scan.select([0, 1])

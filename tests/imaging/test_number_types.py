@@ -1,4 +1,4 @@
-"""Pictures of any number type and layout in memory give what the same grey values in double precision give."""
+"""Images of any number type and layout in memory give what the same grey values in double precision give."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from nerif.imaging.displacement.correlation import correlate, normalised_median_
 from nerif.imaging.displacement.displacement import AtRest, DisplacementSettings, displacement, measure
 from nerif.imaging.displacement.exposure import check_exposure, saturated
 from nerif.imaging.displacement.noise import local_correlation, smoothed_away, structure_variance
-from nerif.imaging.displacement.photometry import CameraNoise, PicturePair
+from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
+from nerif.imaging.image_quality import reduced
 from nerif.imaging.masks import MaskSettings, flow_mask
-from nerif.imaging.picture_looks import reduced
 
 SHAPE = 32, 36
 ALL = np.ones(SHAPE, dtype=bool)
@@ -54,7 +54,7 @@ FUNCTIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "shake": lambda a, b: remove_shake(stacked(a, b), border(SHAPE, 4)),
     "noise of repeats": lambda a, b: camera_noise(CameraNoise.of_repeats([a, b], (a + 1.0 * b) / 2, 2)),
     "noise of what is left": lambda a, b: camera_noise(CameraNoise.of_residual(a, b, ALL)),
-    "pair": lambda a, b: PicturePair.of(a, b, SHIFT, None, 1, ALL, ALL).sigma,
+    "pair": lambda a, b: ImagePair.of(a, b, SHIFT, None, 1, ALL, ALL).sigma,
     "saturated": lambda a, b: saturated(a, 240.0),
     "exposure": lambda a, b: np.array([check_exposure(a, full, "p") is None for full in (240.0, 65535.0)]),
     "mask": lambda a, b: flow_mask(stacked(a, b), stacked(np.maximum(b, 9), np.maximum(a, 9)), MASKS),
@@ -86,7 +86,7 @@ def test_the_type_of_the_numbers_does_not_matter(greys, name):
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_a_picture_of_black_and_white_is_one_of_0_and_1(greys, name):
+def test_a_image_of_black_and_white_is_one_of_0_and_1(greys, name):
     black_and_white = [grey > 128 for grey in greys]
     function = FUNCTIONS[name]
     right = np.asarray(function(*(x.astype(np.float64) for x in black_and_white)), dtype=np.float64)

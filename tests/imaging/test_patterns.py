@@ -15,6 +15,7 @@ from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.patterns import KINDS, MARGIN, Background, paper_for, print_pattern
+from refusals import refused
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -64,7 +65,7 @@ def test_wavelet_noise_has_one_band_and_multiscale_noise_many():
 def test_patterns_that_cannot_be(change, words):
     with pytest.raises(InputError, match=words):
         Background(**{"width": 60.0, "height": 40.0, "dot": 1.0, **change})
-    with pytest.raises(InputError, match="pixel"):
+    with refused("pixel"):
         Background("dots", 60.0, 40.0, 1.0).raster(0.8)
 
 
@@ -79,7 +80,7 @@ def test_files_are_of_true_size(tmp_path):
     assert box is not None
     assert float(box[1]) / 72 * 25.4 == pytest.approx(60 + 2 * MARGIN, rel=1e-3)
     assert float(box[2]) / 72 * 25.4 == pytest.approx(40 + 2 * MARGIN, rel=1e-3)
-    with pytest.raises(InputError, match=r"\.pdf or \.png"):
+    with refused("out"):
         print_pattern(tmp_path / "p.gif", pattern)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["p.pdf", "p.png"]
 

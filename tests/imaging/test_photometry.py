@@ -1,4 +1,4 @@
-"""Noise of cameras from their pictures, and pairs of pictures with it."""
+"""Noise of cameras from their images, and pairs of images with it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from nerif.forward.images import Pictures
+from nerif.forward.images import Images
 from nerif.imaging.displacement.displacement import AtRest, DisplacementSettings, measure
-from nerif.imaging.displacement.photometry import CameraNoise, PicturePair
+from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.warping import warp
 
 READ, ELECTRONS = 6.0, 3.0  # grey values; electrons a grey value
@@ -33,8 +33,8 @@ def variance(light: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("repeats", [2, 8])
 def test_repeats_tell_the_noise_of_a_flickering_lamp(repeats):
     light = scene()
-    pictures = [exposed(light * (1 + 0.02 * (-1) ** i), i) for i in range(repeats)]
-    noise = CameraNoise.of_repeats(pictures, np.mean(pictures, axis=0), repeats)
+    images = [exposed(light * (1 + 0.02 * (-1) ** i), i) for i in range(repeats)]
+    noise = CameraNoise.of_repeats(images, np.mean(images, axis=0), repeats)
     assert noise.variance(light) == pytest.approx(variance(light), rel=0.15)
 
 
@@ -43,8 +43,8 @@ def test_the_noise_does_not_change_with_the_number_of_references(references, mon
     """Of many only some are compared with the mean of all."""
     monkeypatch.setattr("nerif.imaging.displacement.displacement._repeat_sigma", lambda *_: None)  # it is slow
     light, draw = scene(), np.random.default_rng(0)
-    pictures = [light + np.sqrt(variance(light)) * draw.standard_normal(light.shape) for _ in range(references)]
-    noise = AtRest.of(pictures, DisplacementSettings()).camera
+    images = [light + np.sqrt(variance(light)) * draw.standard_normal(light.shape) for _ in range(references)]
+    noise = AtRest.of(images, DisplacementSettings()).camera
     assert float(np.mean(noise.variance(light) / variance(light))) == pytest.approx(1, abs=0.03)
 
 
@@ -59,7 +59,7 @@ def test_a_single_reference_leaves_it_to_what_is_left():
 
 
 @pytest.mark.parametrize("references", [1, 5])
-def test_a_pair_holds_the_pictures_and_their_noise(references):
+def test_a_pair_holds_the_images_and_their_noise(references):
     light = scene()
     row, column = np.mgrid[: light.shape[0], : light.shape[1]]
     d = np.stack([0.6 * np.exp(-((column - 50) ** 2 + (row - 45) ** 2) / 600), np.zeros(light.shape)], axis=-1)
@@ -80,9 +80,9 @@ def test_noise_told_by_attributes_of_a_file_is_that_of_a_pair():
     light, everywhere = scene(), np.ones((90, 100), dtype=bool)
     reference, flow = exposed(light, 1), exposed(1.2 * light, 2)
     noise = CameraNoise(READ**2, 1 / ELECTRONS)
-    pair = PicturePair.of(reference, flow, np.zeros((*light.shape, 2)), noise, 1, everywhere, everywhere)
+    pair = ImagePair.of(reference, flow, np.zeros((*light.shape, 2)), noise, 1, everywhere, everywhere)
     maps = {"flow": torch.tensor(flow)[None], "reference": torch.tensor(reference)[None]}
-    told = Pictures.completed(maps, {"read_noise": READ, "electrons_per_grey_value": ELECTRONS})["picture_sigma"]
+    told = Images.completed(maps, {"read_noise": READ, "electrons_per_grey_value": ELECTRONS})["image_sigma"]
     np.testing.assert_allclose(told[0].numpy(), pair.sigma, rtol=0.01)
 
 
@@ -96,7 +96,7 @@ def test_shake_is_taken_from_the_reference():
     assert float(left.std()) < 0.3 * float((found.pair.flow - light)[inner].std())
 
 
-def test_the_mean_of_several_pictures_is_no_picture():
+def test_the_mean_of_several_images_is_no_image():
     light = scene()
-    pictures = [exposed(light, i) for i in range(4)]
-    assert measure(pictures[:2], pictures[2:], DisplacementSettings("dis")).pair is None
+    images = [exposed(light, i) for i in range(4)]
+    assert measure(images[:2], images[2:], DisplacementSettings("dis")).pair is None

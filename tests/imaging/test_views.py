@@ -1,4 +1,4 @@
-"""Where the pictures of an experiment are found, and that one bad picture does not cost the others."""
+"""Where the images of an experiment are found, and that one bad image does not cost the others."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import tifffile
 
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.imaging.readers.views import _pose_keys, find_targets, find_views, good_pictures
+from nerif.imaging.readers.views import _pose_keys, find_targets, find_views, good_images
+from refusals import refused
 
 
 def save(path, image):
@@ -33,7 +34,7 @@ def test_folders_are_views_in_natural_order(folder):
     assert set(views[0].sources) == {"reference", "flow"}
     assert len(views[0].open("reference")) == 3
     assert [v.name for v in find_views(folder, ["cam10"])] == ["cam10"]
-    with pytest.raises(InputError, match=r"view 'cam2': no target pictures; expected .*cam2/target/"):
+    with refused("view 'cam2'"):
         views[0].open("target")
 
 
@@ -47,8 +48,8 @@ def test_a_file_tells_crops_of_a_shared_sensor(folder):
     left, right = find_views(folder)
     whole = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60)
     said: list[str] = []
-    assert np.array_equal(good_pictures(left, "flow", said.append)[0], whole[5:25, 2:27])
-    assert np.array_equal(good_pictures(right, "flow", said.append)[0], whole[5:25, 30:55][:, ::-1])
+    assert np.array_equal(good_images(left, "flow", said.append)[0], whole[5:25, 2:27])
+    assert np.array_equal(good_images(right, "flow", said.append)[0], whole[5:25, 30:55][:, ::-1])
 
 
 @pytest.mark.parametrize(
@@ -72,38 +73,38 @@ def test_no_folder_no_view_no_such_view(tmp_path, folder):
         find_views(tmp_path / "nowhere")
     with pytest.raises(InputError, match="no view found"):
         find_views(folder / "notes")
-    with pytest.raises(InputError, match="views: expected some of cam2, cam10, got 'cam3'"):
+    with refused("views"):
         find_views(folder, ["cam3"])
 
 
-def test_good_pictures_are_kept_and_bad_ones_named(folder):
+def test_good_images_are_kept_and_bad_ones_named(folder):
     (folder / "cam2" / "reference" / "r1.tif").write_bytes(b"II*\x00 broken")
     said: list[str] = []
-    pictures = good_pictures(find_views(folder)[0], "reference", said.append)
-    assert len(pictures) == 2
+    images = good_images(find_views(folder)[0], "reference", said.append)
+    assert len(images) == 2
     assert any(line.startswith("left out:") and "r1.tif" in line for line in said)
     for i in (0, 2):
         (folder / "cam2" / "reference" / f"r{i}.tif").write_bytes(b"")
-    with pytest.raises(InputError, match="none of its 3 reference pictures can be used"):
-        good_pictures(find_views(folder)[0], "reference", said.append)
+    with refused("view 'cam2'"):
+        good_images(find_views(folder)[0], "reference", said.append)
 
 
-def test_over_exposed_pictures_are_told(folder):
+def test_over_exposed_images_are_told(folder):
     save(folder / "cam2" / "flow.tif", np.full((20, 30), 65535, np.uint16))
     said: list[str] = []
-    good_pictures(find_views(folder)[0], "flow", said.append)
+    good_images(find_views(folder)[0], "flow", said.append)
     assert any("flow.tif" in line and "over-exposed" in line for line in said)
 
 
-def test_many_pictures_are_thinned_evenly(folder):
+def test_many_images_are_thinned_evenly(folder):
     for i in range(3, 20):
         save(
             folder / "cam2" / "reference" / f"r{i}.tif",
             np.full((20, 30), 100 * i, np.uint16) + np.eye(20, 30, dtype=np.uint16),
         )
-    pictures = good_pictures(find_views(folder)[0], "reference", lambda line: None, most=4)
-    assert len(pictures) == 4
-    assert pictures[-1].max() == 1901
+    images = good_images(find_views(folder)[0], "reference", lambda line: None, most=4)
+    assert len(images) == 4
+    assert images[-1].max() == 1901
 
 
 def test_pose_numbers_come_from_names():
@@ -113,7 +114,7 @@ def test_pose_numbers_come_from_names():
     assert _pose_keys(["a1.tif", "b1.tif"]) == ["0", "1"]
 
 
-def test_pictures_without_a_target_are_named(folder):
+def test_images_without_a_target_are_named(folder):
     rng = np.random.default_rng(1)
     for i in range(2):
         save(folder / "cam2" / "target" / f"t{i}.tif", rng.integers(0, 4000, (120, 160)).astype(np.uint16))

@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid
 from nerif.physics.gas_optics import ambient_index
 from nerif.physics.quantities import NOT_UNIFORM, GasChanges, GasSettings, derive, derive_all, deviation
+from refusals import refused
 
 
 def test_hot_air_from_its_index():
@@ -67,13 +67,13 @@ def test_a_flow_is_judged_once_for_all_its_repetitions():
 
 def test_refusals():
     volume = Volume(torch.zeros(2, 3, 4), Grid(Box.cube(4.0), (2, 3, 4)), attributes={"n_ambient": 1.00027})
-    with pytest.raises(InputError, match="quantity"):
+    with refused("quantity"):
         derive(volume, "pressure", GasSettings())
-    with pytest.raises(InputError, match="phlogiston"):
+    with refused("composition"):
         derive(volume, "density", GasSettings("phlogiston"))
-    with pytest.raises(InputError, match="pressure_pa"):
+    with refused("pressure_pa"):
         GasSettings(pressure_pa=-1)
-    with pytest.raises(InputError, match="pressure_pa"):
+    with refused("pressure_pa"):
         GasSettings(pressure_pa=float("inf"))
 
 

@@ -43,7 +43,7 @@ def test_a_name_that_is_not_there_is_refused():
 
 
 class Panel(HTMLParser):
-    """The one picture and the cells of what a notebook shows; every tag must be closed in turn."""
+    """The one image and the cells of what a notebook shows; every tag must be closed in turn."""
 
     def __init__(self, html: str) -> None:
         super().__init__()

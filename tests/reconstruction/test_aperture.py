@@ -13,12 +13,11 @@ from nerif.analysis.consistency import check_consistency
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume
 from nerif.analysis.prediction import predict_view, reproject
 from nerif.cli.cli import main
-from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
-from nerif.forward.images import Pictures
+from nerif.forward.images import Images
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
@@ -34,6 +33,7 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate, view_displacement
+from refusals import refused
 
 BOX = Box.cube(50.0)
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(14, 16), pixel_pitch=0.25)
@@ -90,12 +90,12 @@ def test_windows_are_kept_by_files_and_used_by_displacements_alone(wide, tmp_pat
     assert "aperture_diameter" not in dataset
     assert lens_rays(seen_through(back, "auto")) > 1
     assert lens_rays(seen_through(back, "off")) == 1
-    with pytest.raises(InputError, match="aperture: expected a measurement that knows aperture_diameter"):
+    with refused("aperture"):
         seen_through(back, "on")
-    assert Pictures.seen_by(cameras[3]).lens.window == 0
+    assert Images.seen_by(cameras[3]).lens.window == 0
     assert wide.techniques[0].seen_by(cameras[3]).lens.window == 3
     dataset["window"][1] = -1.0
-    with pytest.raises(InputError, match="window: expected an edge of 0"):
+    with refused("window"):
         Measurement.from_dataset(dataset)
 
 
@@ -147,14 +147,14 @@ def test_the_aperture_can_be_turned_off_and_insisted_on(wide):
     assert seen_through(thin, "off") is thin
     none = replace(wide, cameras=tuple(replace(camera, lens=Lens(0.0)) for camera in wide.cameras))
     assert all(camera.lens is None for camera in seen_through(none, "auto").cameras)
-    with pytest.raises(InputError, match="aperture: expected a measurement that knows aperture_diameter"):
+    with refused("aperture"):
         seen_through(thin, "on")
     for kind in (NeRIF, Tikhonov):
-        with pytest.raises(InputError, match="aperture: expected one of auto, on, off, got 'f/8'"):
+        with refused("aperture"):
             kind(aperture="f/8")
-        with pytest.raises(InputError, match="knows aperture_diameter"):
+        with refused("aperture"):
             kind(aperture="on")(thin)
-    with pytest.raises(InputError, match="lens_rays: expected an even number"):
+    with refused("lens_rays"):
         NeRIF(lens_rays=3)
 
 
@@ -171,7 +171,7 @@ def test_a_wider_cone_is_followed_by_more_rays(wide):
 
 def test_lenses_are_known_of_all_views_or_of_none(wide):
     one = replace(wide.cameras[0], lens=None)
-    with pytest.raises(InputError, match="aperture_diameter: expected of every view or of none"):
+    with refused("aperture_diameter"):
         replace(wide, cameras=(one, *wide.cameras[1:]))
 
 
@@ -183,7 +183,7 @@ def test_a_file_keeps_the_lenses(wide, tmp_path):
     dataset = replace(wide, cameras=cameras).to_dataset()
     assert dataset.attrs["Conventions"] == "BOST-1.1"
     dataset["aperture_diameter"][1] = -1.0
-    with pytest.raises(InputError, match="view '45deg': aperture_diameter: expected a lens of 0 mm or more"):
+    with refused("aperture_diameter"):
         Measurement.from_dataset(dataset)
     dataset["aperture_diameter"][:] = 0.0
     assert all(c.lens is None for c in Measurement.from_dataset(dataset).cameras)
@@ -226,7 +226,7 @@ def test_a_run_through_lenses_is_repeated_exactly_and_resumed(wide):
     whole = settings(wide)
     half = settings(wide, on_step=lambda step: step.step == 10)
     assert torch.equal(whole.field(points), settings(wide, resume=half.state).field(points))
-    with pytest.raises(InputError, match="got other cameras"):
+    with refused("resume"):
         settings(seen_through(wide, "off"), resume=half.state)
 
 

@@ -33,7 +33,7 @@ def noisy(measurement):
 
 
 def test_a_bin_is_the_weighted_mean_of_its_usable_pixels(noisy):
-    """One bin by hand, of the first view, in the middle of the picture."""
+    """One bin by hand, of the first view, in the middle of the image."""
     rays, displacement, sigma = binned(noisy.select([noisy.names[0]]))
     camera, row, column = noisy.cameras[0], 9, 12
     block = (0, slice(row, row + EDGE), slice(column, column + EDGE))
@@ -87,13 +87,11 @@ def test_without_sigma_a_bin_of_more_pixels_weighs_more(noisy):
     assert 1.1 < float(ratio) <= EDGE
 
 
-def test_small_pictures_are_not_binned(measurement):
+def test_small_images_are_not_binned(measurement):
     assert coarsest_edge(measurement) == 1
     for pixels, edge in ((200, 1), (256, 2), (1000, 4), (1024, 8)):
         cameras = Ring(views=2, image_size=(pixels, pixels + 30)).cameras()
-        shown = replace(
-            measurement, cameras=cameras, displacement=torch.zeros(2, pixels, pixels + 30, 2), sigma=None
-        )
+        shown = replace(measurement, cameras=cameras, displacement=torch.zeros(2, pixels, pixels + 30, 2), sigma=None)
         assert coarsest_edge(shown) == edge
 
 

@@ -63,7 +63,7 @@ def test_a_cycle_ends_in_time():
     assert found.judge(2.0, 1.0, 10, 50.0).reason == "time_limit"
 
 
-def test_pixels_held_back_are_of_most_views_and_in_no_batch(measurement):
+def test_pixels_withheld_are_of_most_views_and_in_no_batch(measurement):
     rest, held = hold_back(measurement, 1)
     index = [measurement.names.index(name) for name in held.names]
     assert len(index) > len(measurement.names) / 2
@@ -74,12 +74,12 @@ def test_pixels_held_back_are_of_most_views_and_in_no_batch(measurement):
     assert bool(rest.usable.flatten(1).any(dim=1).all())
     assert 0.02 < taken.sum() / measurement.usable.sum() < 0.2
     data = TrainingData(ENDLESS, measurement, judged=True)
-    assert data.held_back is not None
-    assert len(data) + len(data.held_back) == len(TrainingData(ENDLESS, measurement))
+    assert data.withheld is not None
+    assert len(data) + len(data.withheld) == len(TrainingData(ENDLESS, measurement))
 
 
 @pytest.mark.slow
-def test_a_single_pixel_is_held_back_of_a_few_and_none_of_single_ones(measurement):
+def test_a_single_pixel_is_withheld_of_a_few_and_none_of_single_ones(measurement):
     valid = torch.zeros_like(measurement.usable)
     valid[:, 10, 10] = True
     few = replace(measurement, valid=valid)
@@ -99,7 +99,7 @@ def test_a_run_without_a_limit_converges_and_goes_on_where_it_was(measurement, b
     whole = ENDLESS(measurement, lambda s: states.__setitem__(s.step, s.capture()) if s.step == 90 else None)
     assert whole.outcome.reason == "converged"
     assert "rays held back are met to" in whole.outcome.message
-    judged = [record["held_back"] for record in whole.history if "held_back" in record]
+    judged = [record["withheld_residual"] for record in whole.history if "withheld_residual" in record]
     assert len(judged) >= 2
     assert judged[0] > judged[-1] > 0.9
     grid = Grid.of_resolution(measurement.box, 24)
@@ -109,7 +109,7 @@ def test_a_run_without_a_limit_converges_and_goes_on_where_it_was(measurement, b
     again = ENDLESS(measurement, resume=read_state(tmp_path))
     points = torch.rand(50, 3)
     assert torch.equal(again.field(points), whole.field(points))
-    assert [r["held_back"] for r in again.history if "held_back" in r] == judged
+    assert [r["withheld_residual"] for r in again.history if "withheld_residual" in r] == judged
     told = ENDLESS(measurement, resume=whole.state)
     assert told.outcome.message == whole.outcome.message
     assert len(told.history) == len(whole.history)
@@ -131,14 +131,14 @@ def test_more_time_goes_on_with_the_next_cycle(measurement):
     assert again.history[-1]["step"] > short.history[-1]["step"]
     limited = replace(ENDLESS, max_steps=20)(measurement)
     endless = replace(ENDLESS, first_cycle=10)(measurement, resume=limited.state)
-    first = next(record for record in endless.history if "held_back" in record)
+    first = next(record for record in endless.history if "withheld_residual" in record)
     assert first["step"] == 30
 
 
 @pytest.mark.slow
 def test_the_best_cycle_is_kept_with_the_rig_it_had(measurement, monkeypatch):
     errors, rigs = itertools.chain([2.0], itertools.repeat(3.0)), []
-    monkeypatch.setattr(objective.Objective, "held_back", lambda self: next(errors))
+    monkeypatch.setattr(objective.Objective, "withheld", lambda self: next(errors))
     monkeypatch.setattr("nerif.reconstruction.rig.refinement.SIGN", -1.0)  # the rig is taken to be off
 
     def watch(step: Step) -> bool:
@@ -157,7 +157,7 @@ def test_the_best_cycle_is_kept_with_the_rig_it_had(measurement, monkeypatch):
 def test_the_best_cycle_is_kept(measurement, monkeypatch, interrupted):
     """A cycle that the rays held back like less than the one before gives it back, one that was broken off too."""
     errors, fields = itertools.chain([2.0], itertools.repeat(3.0)), []
-    monkeypatch.setattr(objective.Objective, "held_back", lambda self: next(errors))
+    monkeypatch.setattr(objective.Objective, "withheld", lambda self: next(errors))
     settings = replace(ENDLESS, first_cycle=20)
 
     def watch(step: Step) -> bool:
@@ -175,7 +175,7 @@ def test_the_best_cycle_is_kept(measurement, monkeypatch, interrupted):
     assert all(torch.equal(found[k], v) for k, v in kept.items())
 
 
-def test_pixels_are_held_back_of_every_technique_where_the_box_is_seen():
+def test_pixels_are_withheld_of_every_technique_where_the_box_is_seen():
     """Of a technique with a few pixels in one view some are, and none of those beside the box."""
     cameras, box = paper_rig(60)
     fringes = torch.full((2, 60, 60, 1), torch.nan)

@@ -145,7 +145,7 @@ def test_no_run_mixes_devices_or_rounds_what_is_no_network(measurement, gpu, nam
 
 
 @pytest.mark.slow
-def test_a_run_by_pictures(measurement, gpu):
+def test_a_run_by_images(measurement, gpu):
     draw = torch.Generator().manual_seed(0)
     reference = 100 + 30 * torch.randn(measurement.shape, generator=draw)
     flow = 1.1 * reference + torch.randn(measurement.shape, generator=draw)

@@ -23,7 +23,7 @@ from nerif.simulation.simulate import simulate
 
 @pytest.fixture(scope="module")
 def flame() -> Measurement:
-    """A flame that is seen by pictures of many more pixels than the grids here have voxels."""
+    """A flame that is seen by images of many more pixels than the grids here have voxels."""
     cameras, box = paper_rig(96)
     return simulate(make_phantom("flame", box, 0), cameras[::3], box, 1.00027, 0.05, 0, steps=20)
 
@@ -60,7 +60,7 @@ def test_a_camera_in_the_middle_of_the_box_has_bins_of_some_size(flame):
 
 def test_a_view_without_a_whole_bin_keeps_its_pixels(flame):
     (observation,) = flame.observations
-    found = binned_rays(flame, observation, 128)  # larger than the picture
+    found = binned_rays(flame, observation, 128)  # larger than the image
     assert all(torch.allclose(a, b) for a, b in zip(found[1:], flame.rays()[1:], strict=True))
     assert torch.allclose(found[0].direction, flame.rays()[0].direction)
 

@@ -9,11 +9,11 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nerif.common.conventions import InputError
 from nerif.fields.grid import Boundary
 from nerif.forward.deflection import MODELS
 from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays, Ring
 from nerif.reconstruction.voxels.operator import VoxelOperator
+from refusals import refused
 
 GRID = (9, 11, 13)
 FACES = Boundary(("x-", "y+", "z-"))
@@ -186,24 +186,24 @@ def test_a_constant_moves_nothing_and_a_slope_all_alike(rays, box):
 @pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_right(rays, box):
     missing = rays.clip(Box((900.0, 900.0, 900.0), (901.0, 901.0, 901.0)))
-    with pytest.raises(InputError, match="rays: expected rays that cross the box, got none"):
+    with refused("rays"):
         operator(missing, box)
-    with pytest.raises(InputError, match="model: expected a linear one, got Curved"):
+    with refused("model"):
         operator(rays, box, model="curved")
-    with pytest.raises(InputError, match="basis: expected linear or cubic, got 'quintic'"):
+    with refused("basis"):
         operator(rays, box, basis="quintic")
-    with pytest.raises(InputError, match="step: expected above 0"):
+    with refused("step"):
         operator(rays, box, step=0.0)
-    with pytest.raises(InputError, match=r"step: expected above 0 and at most 0.5 voxels \(basis linear\), got 0.7"):
+    with refused("step"):
         operator(rays, box, step=0.7)
-    with pytest.raises(InputError, match="at least 2 along each edge"):
+    with refused("voxels"):
         VoxelOperator(rays, Grid(box, (1, 4, 5)), LEVER, "cubic")
-    with pytest.raises(InputError, match="rays: expected rays clipped to the box of the grid"):
+    with refused("rays"):
         VoxelOperator(rays, Grid(Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), GRID), LEVER)
     a = operator(rays, box)
-    with pytest.raises(InputError, match=r"coefficients: expected \(9, 11, 13\)"):
+    with refused("coefficients"):
         a(torch.zeros(9, 11, 12))
-    with pytest.raises(InputError, match="seen: expected"):
+    with refused("seen"):
         a.T(torch.zeros(3, 2))
 
 

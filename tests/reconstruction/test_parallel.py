@@ -49,7 +49,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(("norm", "optimiser", "tolerance"), [("squared", "muon", 2e-3), ("l2", "adam", 2e-5)])
 def test_two_processes_find_the_field_of_one(measured, tmp_path, norm, optimiser, tolerance):
     one, two = tmp_path / "one", tmp_path / "two"
-    words = ["--norm", norm, "--optimiser", optimiser, "--hold-out", "none", *SMALL]
+    words = ["--norm", norm, "--optimiser", optimiser, "--withhold", "none", *SMALL]
     assert main(["reconstruct", str(measured), "-o", str(one), *words]) == 0
     done = torchrun("reconstruct", measured, "-o", two, *words)
     assert done.returncode == 0, done.stderr

@@ -27,6 +27,7 @@ from nerif.reconstruction.rig.refined import moved_lines, with_corrections
 from nerif.reconstruction.rig.refinement import Refinement
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
+from refusals import refused
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
 RING = Ring(views=5, arc=(0.0, 144.0), image_size=(24, 26), pixel_pitch=0.15)
@@ -50,7 +51,7 @@ def in_sigmas(measurement):
 
 
 def spoiled(measurement, seed=0):
-    """The measurement with cameras that stand elsewhere than it says, and pictures that are shifted; by how much."""
+    """The measurement with cameras that stand elsewhere than it says, and images that are shifted; by how much."""
     sizes = torch.tensor([5e-4] * 3 + [0.5] * 3 + [0.0, 0.0] + [0.03] * 2 + [0.0] * 4, dtype=torch.float64)
     count = len(measurement.cameras)
     true = torch.randn(count, len(NAMES), generator=torch.Generator().manual_seed(seed)).double() * sizes
@@ -171,7 +172,7 @@ def test_the_rigid_motion_of_all_cameras_is_taken_out(measured):
     assert float(refinement._centred(one)[2, 4]) > 0.5
 
 
-def test_a_stretch_of_all_pictures_alike_is_taken_out_and_that_of_one_is_not(measured):
+def test_a_stretch_of_all_images_alike_is_taken_out_and_that_of_one_is_not(measured):
     refinement = Refinement.asked(measured, ["shift"])
     alike = torch.zeros(len(measured.cameras), len(NAMES), dtype=torch.float64)
     for name in ("u_x", "v_y"):
@@ -186,7 +187,7 @@ def test_a_stretch_of_all_pictures_alike_is_taken_out_and_that_of_one_is_not(mea
     assert float(refinement._centred(one)[2, NAMES.index("u_x")]) == pytest.approx(0.008)
 
 
-def test_a_shift_of_pictures_is_not_overshot(measured):
+def test_a_shift_of_images_is_not_overshot(measured):
     """Two steps against the field as it is find it; a third stays there."""
     shift = torch.tensor([0.4, -0.3])
     wrong = replace(measured, displacement=measured.displacement + shift)
@@ -227,9 +228,9 @@ def test_a_run_refines_and_resumes_as_if_undisturbed(measured):
 def test_a_checkpoint_without_a_refined_rig_is_not_gone_on_with_and_the_other_way_round(measured):
     plain = NeRIF(max_steps=2, points_per_batch=512, device="cpu")
     moved = replace(plain, refine=("cameras",))
-    for before, after, word in ((plain, moved, "without"), (moved, plain, "with")):
+    for before, after in ((plain, moved), (moved, plain)):
         state = before(measured).state
-        with pytest.raises(InputError, match=f"a run {word} --refine; give the same settings"):
+        with refused("refine"):
             after(measured, resume=state)
 
 
@@ -245,12 +246,12 @@ def test_every_technique_tells_whether_a_view_is_off(measured):
     assert float(alone.explained.min()) > 0.9
 
 
-def test_without_a_limit_the_rays_held_back_are_seen_by_the_refined_rig(measured):
+def test_without_a_limit_the_rays_withheld_are_seen_by_the_refined_rig(measured):
     wrong, _ = spoiled(measured)
     data = TrainingData(NeRIF(refine=("cameras",), device="cpu"), wrong, judged=True)
-    held = data.held_back.parts[0]
+    held = data.withheld.parts[0]
     data.refinement.restore({**data.refinement.kept(), "values": torch.ones(5, 14).double() * data.refinement.sigma})
-    moved = data.refined(held, held_back=True)
+    moved = data.refined(held, withheld=True)
     assert float((moved.rays.origin - held.rays.origin).norm(dim=1).min()) > 0.05
 
 
@@ -267,9 +268,9 @@ def test_what_cannot_be_refined_is_refused(options, words):
 
 def test_a_pose_sigma_that_refines_nothing_is_refused(measured):
     cameras = tuple(replace(camera, pose_sigma=torch.zeros(6)) for camera in measured.cameras)
-    with pytest.raises(InputError, match="pose_sigma: expected some standard deviations above 0"):
+    with refused("pose_sigma"):
         Refinement.asked(replace(measured, cameras=cameras), ["cameras"])
-    with pytest.raises(InputError, match=r"pose_sigma of view '.*': expected standard deviations of 0 or more"):
+    with refused("pose_sigma of view '0deg'"):
         replace(cameras[0], pose_sigma=-torch.ones(6))
 
 
@@ -284,9 +285,9 @@ def test_what_is_given_goes_before_what_cameras_know_and_that_before_the_default
 
 def test_a_shift_is_of_displacements_alone(measured):
     flat = simulate(make_phantom("gaussians", BOX, 0), RING.cameras(), BOX, 1.0, techniques=[Absorption])
-    with pytest.raises(InputError, match="refine: expected displacements alone for 'shift', got absorbance"):
+    with refused("refine"):
         Refinement.asked(flat, ["shift"], 0.2, 0.02, 0.05)
-    with pytest.raises(InputError, match="refine: expected cameras that look at a background"):
+    with refused("refine"):
         Refinement.asked(flat, ["background"], 0.2, 0.02, 0.05)
 
 

@@ -76,7 +76,7 @@ def test_the_user_hears_of_it_and_the_app_shows_it(measurement, tmp_path, slow_c
     slow_clock(1.0)
     lines: list[str] = []
     settings = replace(SMALL, time_limit=400.0, max_steps=1000)
-    run = Run(hold_out=("auto",), report=False)
+    run = Run(withhold=("auto",), report=False)
     reconstruct_into(tmp_path / "r", measurement, settings, run, voxels=8, monitor=Monitor(lines.append), live=True)
     (line,) = [line for line in lines if line.startswith("slow: ")]
     assert "the 1000 steps asked for" in line

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 
 import pytest
@@ -28,6 +27,7 @@ from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import simulate
+from refusals import refused
 
 SIDES = ("x-", "x+", "y-", "y+")
 
@@ -104,7 +104,7 @@ def test_emission_from_one_view():
 
 
 @pytest.mark.parametrize("shift", [(1.0, -0.7, 0.0), pytest.param((-1.5, 0.4, 2.0), marks=pytest.mark.slow)])
-def test_the_axis_is_found_in_the_picture_and_left_where_it_cannot_be_seen(jet, shift):
+def test_the_axis_is_found_in_the_image_and_left_where_it_cannot_be_seen(jet, shift):
     symmetry = Symmetry.about("axis", shift, (0.03, -0.02, 1.0), 0.1)
     one = find_axis(one_view(jet), symmetry, (2.0, math.radians(3.0)), SIDES)
     look = one_view(jet).cameras[0].rotation[2].double()
@@ -169,8 +169,7 @@ def test_harmonics_take_up_what_is_not_alike_around_the_axis(method):
 def test_more_harmonics_than_views_could_tell_are_refused(text, views, instead):
     box = Box.cube(50.0)
     few = simulate(Bent(), paper_rig(8)[0][:views], box, 1.00027, 0.02, 0)
-    told = rf"symmetry: expected .* views or more.*, got {views}; give --symmetry {re.escape(instead)}$"
-    with pytest.raises(InputError, match=told):
+    with refused("symmetry"):
         check_views(NeRIF(symmetry=text), few)
     check_views(NeRIF(symmetry=instead), few)
     check_views(NeRIF(), few)
@@ -208,7 +207,7 @@ def test_what_cannot_be_is_refused(jet):
     for wrong in ({"symmetry": "round"}, {"axis_sigma_mm": -1.0}, {"axis_sigma_deg": -1.0}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             Tikhonov(**wrong)
-    with pytest.raises(InputError, match="axis_point"):
+    with refused("axis_point"):
         Tikhonov(symmetry="axis", axis_point=(99.0, 0.0, 0.0), voxels=16)(one_view(jet))
 
 

@@ -23,6 +23,7 @@ from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.problem import Iterate
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
+from refusals import refused
 
 METHODS = [
     Tikhonov(voxels=24, device="cpu"),
@@ -276,16 +277,16 @@ def test_settings_that_cannot_be_right(method, changes, words):
 
 
 def test_data_that_cannot_be_reconstructed(fixed, measurement, monkeypatch):
-    with pytest.raises(InputError, match="ambient_faces: expected at least one face"):
+    with refused("ambient_faces"):
         FIXED(replace(measurement, ambient_faces=()))
-    with pytest.raises(InputError, match="flow_mask: the masks leave no voxel"):
+    with refused("flow_mask"):
         FIXED(replace(measurement, flow_mask=torch.zeros(measurement.displacement.shape[:3], dtype=torch.bool)))
-    with pytest.raises(InputError, match="open_faces: every ray crosses one"):
+    with refused("open_faces"):
         replace(FIXED, open_faces=("x-", "x+", "y-", "y+", "z-", "z+"))(measurement)
-    with pytest.raises(InputError, match="resume: the checkpoint is of another method or grid"):
+    with refused("resume"):
         replace(FIXED, voxels=30)(measurement, resume=fixed.state)
     monkeypatch.setattr(descent, "available_memory", lambda device: 1 << 16)
-    with pytest.raises(InputError, match=r"would need [\d.]+ GiB on cpu, which has 0.0 GiB free; give fewer --voxels"):
+    with refused("voxels"):
         FIXED(measurement)
 
 

@@ -64,7 +64,7 @@ def requests(driver: Any) -> list[str]:
     return [u for u in urls if not u.startswith(("data:", "blob:", "file:", "chrome:"))]
 
 
-def picture(driver: Any, selector: str) -> np.ndarray:
+def image(driver: Any, selector: str) -> np.ndarray:
     """Red, green, blue of a canvas, as it is seen."""
     import base64
     import io

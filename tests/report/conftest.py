@@ -27,7 +27,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     measurement, out = str(folder / "m.nc"), str(folder / "balls")
     box = ["--box", "50", "40", "30"]
     assert main(["simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", measurement, *RIG, *box]) == 0
-    run = ["reconstruct", measurement, "-o", out, "--hold-out", "170deg", *QUICK]
+    run = ["reconstruct", measurement, "-o", out, "--withhold", "170deg", *QUICK]
     assert main([*run, "--uncertainty", "fast", "--no-report"]) == 0
     assert main(["evaluate", out, "--truth", str(folder / "m.truth.nc")]) == 0
     assert main(["report", out]) == 0

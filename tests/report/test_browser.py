@@ -22,9 +22,9 @@ from report.browsing import (
     choose,
     drag,
     errors,
+    image,
     needs_browser,
     open_browser,
-    picture,
     press,
     requests,
     show,
@@ -52,38 +52,38 @@ def test_no_error_and_no_request(page):
 
 
 def test_the_field_in_three_dimensions_is_drawn_and_turns(page):
-    before = picture(page, "#space")
+    before = image(page, "#space")
     coloured = np.abs(before - before[0, 0]).max(axis=-1) > 12
     assert coloured.mean() > 0.02
     orange = (before[..., 0] - before[..., 2] > 60).mean()
     assert orange > 0.005  # the isosurface itself, not only lines
     drag(page, "#space", 140, 40)
-    after = picture(page, "#space")
+    after = image(page, "#space")
     assert (np.abs(after - before).max(axis=-1) > 12).mean() > 0.02
     press(page, "#space", "right", "right", "right")
-    turned = picture(page, "#space")
+    turned = image(page, "#space")
     assert (np.abs(turned - after).max(axis=-1) > 12).mean() > 0.01
     choose(page, "mode", "volume")
-    clouds = picture(page, "#space")
+    clouds = image(page, "#space")
     assert (np.abs(clouds - turned).max(axis=-1) > 12).mean() > 0.01
     assert (clouds[..., 0] - clouds[..., 2] > 60).mean() < orange
     assert errors(page) == []
 
 
 def test_the_level_moves_the_surface(page):
-    before, said = picture(page, "#space"), text(page, "#level-text")
+    before, said = image(page, "#space"), text(page, "#level-text")
     page.execute_script(
         "const s = document.getElementById('level'); s.value = 800; s.dispatchEvent(new Event('input'))"
     )
     assert text(page, "#level-text") != said
-    assert (np.abs(picture(page, "#space") - before).max(axis=-1) > 12).mean() > 0.002
+    assert (np.abs(image(page, "#space") - before).max(axis=-1) > 12).mean() > 0.002
 
 
 def test_sliders_and_keys_change_the_slices(page):
-    before, where = picture(page, "#slice-z"), text(page, "#at-z-text")
+    before, where = image(page, "#slice-z"), text(page, "#at-z-text")
     press(page, "#at-z", "right", "right", "right")
     assert text(page, "#at-z-text") != where
-    moved = picture(page, "#slice-z")
+    moved = image(page, "#slice-z")
     assert (np.abs(moved - before).max(axis=-1) > 5).mean() > 0.02
     readout = text(page, "#readout")
     press(page, "#slice-z", "right", "right", "up", "page up")
@@ -101,9 +101,9 @@ def test_switching_the_quantity_changes_the_colour_bar(page):
         assert len(ticks) >= 2
         seen.add((text(page, "#bar-label"), *ticks))
     assert len(seen) == 3
-    viridis = picture(page, "#bar")
+    viridis = image(page, "#bar")
     choose(page, "quantity", "density")
-    assert not np.array_equal(picture(page, "#bar"), viridis)
+    assert not np.array_equal(image(page, "#bar"), viridis)
 
 
 def value_at_cross(driver: Any) -> float:
@@ -137,10 +137,10 @@ def test_the_value_at_the_cross_is_that_of_the_file(page, whole):
 
 
 def test_views_are_switched(page):
-    from_held_out = "return [...document.querySelectorAll('.view')].filter(v => !v.hidden).map(v => v.dataset.view)"
-    assert page.execute_script(from_held_out) == ["170deg"]
+    from_withheld = "return [...document.querySelectorAll('.view')].filter(v => !v.hidden).map(v => v.dataset.view)"
+    assert page.execute_script(from_withheld) == ["170deg"]
     page.execute_script("document.querySelector('input[name=view][value=\"0deg\"]').click()")
-    assert page.execute_script(from_held_out) == ["0deg"]
+    assert page.execute_script(from_withheld) == ["0deg"]
     broken = "return [...document.images].filter(i => i.src && !i.closest('[hidden]') && !i.naturalWidth).length"
     assert page.execute_script(broken) == 0
 
@@ -161,12 +161,12 @@ def test_a_finger_scrolls_past_the_stage_until_a_tap_gives_it_the_finger(browser
     browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
     try:
         show(browser, whole / "report.html", 390, 844)
-        before = picture(browser, "#space")
+        before = image(browser, "#space")
         assert swipe(browser, "#space", 0, -150) > 100
-        assert np.array_equal(picture(browser, "#space"), before)
+        assert np.array_equal(image(browser, "#space"), before)
         tap(browser, "#space")
         assert swipe(browser, "#space", 0, -150) == 0
-        assert (np.abs(picture(browser, "#space") - before).max(axis=-1) > 12).mean() > 0.02
+        assert (np.abs(image(browser, "#space") - before).max(axis=-1) > 12).mean() > 0.02
         tap(browser, "#space")
         assert swipe(browser, "#space", 0, -150) > 100
         assert errors(browser) == []
@@ -192,7 +192,7 @@ def test_without_webgl_it_says_so_and_the_slices_stay(whole, tmp_path):
         wait_for(driver, "return !document.getElementById('space-message').hidden")
         assert "WebGL" in text(driver, "#space-message")
         assert errors(driver) == []
-        assert (np.abs(np.diff(picture(driver, "#slice-z"), axis=0)).max() > 0).any()
+        assert (np.abs(np.diff(image(driver, "#slice-z"), axis=0)).max() > 0).any()
     finally:
         driver.quit()
 
@@ -209,4 +209,4 @@ def test_a_field_that_is_no_index_is_drawn_as_it_is(browser, tmp_path):
     said = re.search(r"coefficient = ([\d.]+) mm⁻¹", text(browser, "#readout"))
     assert said is not None
     assert float(said[1]) == pytest.approx(float(ball.values[4, 5, 6]), rel=1e-3)
-    assert (np.ptp(picture(browser, "#space"), axis=-1) > 60).mean() > 0.005  # the isosurface
+    assert (np.ptp(image(browser, "#space"), axis=-1) > 60).mean() > 0.005  # the isosurface

@@ -59,7 +59,7 @@ def test_every_figure_is_whole(whole):
 
 
 def figure_of_a_view(size: tuple[int, int], sigma: bool) -> Figure:
-    """Of displacements on a small picture, of which the first pixel is not valid."""
+    """Of displacements on a small image, of which the first pixel is not valid."""
     ring = Ring(views=2, image_size=size, pixel_pitch=0.2)
     generator = torch.Generator().manual_seed(0)
     d = torch.randn(2, *size, 2, generator=generator)
@@ -70,7 +70,7 @@ def figure_of_a_view(size: tuple[int, int], sigma: bool) -> Figure:
 
 
 @pytest.mark.parametrize(("size", "lines"), [((1, 41), 1), ((2, 30), 2), ((41, 1), 1)])
-def test_pictures_of_few_rows_are_drawn_as_lines(size, lines):
+def test_images_of_few_rows_are_drawn_as_lines(size, lines):
     figure = figure_of_a_view(size, sigma=size[0] != 2)
     FigureCanvasAgg(figure).draw()
     panels = figure.axes
@@ -90,7 +90,7 @@ def test_pictures_of_few_rows_are_drawn_as_lines(size, lines):
     assert above.get_title() == ("row 0" if lines == 2 else "")
 
 
-def test_pictures_of_more_rows_are_maps():
+def test_images_of_more_rows_are_maps():
     figure = figure_of_a_view((20, 30), sigma=True)
     assert sum(len(axes.images) for axes in figure.axes) == 6
 
@@ -170,7 +170,7 @@ def test_names_of_views_become_names_of_files(whole):
     m = result.reprojection.measurement
     odd = ("a/b", "a b", "a$x_$", "é<")
     cameras = tuple(replace(c, name=name) for c, name in zip(m.cameras, odd, strict=True))
-    scores = {"held_out": False, "cc": 0.9, "rms": 0.1, "measured": "displacement", "unit": "px"}
+    scores = {"withheld": False, "cc": 0.9, "rms": 0.1, "measured": "displacement", "unit": "px"}
     views = [{"name": name, **scores} for name in odd]
     renamed = Result(
         whole,

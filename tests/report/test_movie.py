@@ -36,7 +36,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> VolumeSequence:
 
 
 def decoded(movie: Path, width: int, height: int) -> np.ndarray:
-    """The pictures of a movie as a player would show them."""
+    """The images of a movie as a player would show them."""
     command = [get_ffmpeg_exe(), "-v", "error", "-i", str(movie), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     raw = subprocess.run(command, check=True, capture_output=True).stdout
     return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
@@ -50,11 +50,11 @@ def test_a_movie_shows_every_frame_and_they_differ(store, tmp_path, capsys, name
     out = tmp_path / name
     assert main(["movie", str(store.path), "-o", str(out), "--style", style, *SMALL]) == 0
     assert "3 frames" in capsys.readouterr().out
-    pictures = decoded(out, 240, 180)
-    assert len(pictures) == 3
-    assert all(p.std() > 10 for p in pictures)
+    images = decoded(out, 240, 180)
+    assert len(images) == 3
+    assert all(p.std() > 10 for p in images)
     middle = (slice(50, 140), slice(70, 170))
-    assert np.abs(pictures[0][middle].astype(float) - pictures[2][middle].astype(float)).mean() > 1
+    assert np.abs(images[0][middle].astype(float) - images[2][middle].astype(float)).mean() > 1
     assert not list(tmp_path.glob(".*"))
 
 
@@ -70,7 +70,7 @@ def test_masked_voxels_are_shown_as_such(store):
     assert hidden.n_points
     for style in ("slices", "isosurface"):
         movie = Movie(style=style, quantity="density", size=(240, 180))
-        with_mask, without = (movie._picture(v, "", (0.8, 1.2), 1.0).astype(int) for v in (volume, _whole(volume)))
+        with_mask, without = (movie._image(v, "", (0.8, 1.2), 1.0).astype(int) for v in (volume, _whole(volume)))
         grey = [((p.max(-1) - p.min(-1) < 12) & (abs(p.mean(-1) - 190) < 40)).sum() for p in (with_mask, without)]
         assert grey[0] > grey[1] + 100, style
 

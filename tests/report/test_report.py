@@ -57,7 +57,7 @@ def test_figures_on_the_page_are_those_of_the_files(whole):
     result = ResultDirectory(whole).read()
     assert not result.missing
     metrics = json.loads((whole / "metrics.json").read_text())
-    held = next(v for v in metrics["views"] if v["held_out"])
+    held = next(v for v in metrics["views"] if v["withheld"])
     page = (whole / "report.html").read_text()
     assert f"CC {number(held['cc'], 5)}" in page
     assert f"{number(held['rms_px'], 3)} px = {held['rms_over_sigma']:.2f} σ" in page
@@ -126,11 +126,11 @@ def test_finer_volumes_are_averaged_down_in_their_box():
     assert packing.coarsen(fine, 20) is fine
 
 
-def test_pictures_of_views_share_their_scales(whole):
+def test_images_of_views_share_their_scales(whole):
     reprojection = ResultDirectory(whole).read().reprojection
     assert reprojection is not None
     views, [scale] = view_images(reprojection, [])
-    assert [v.held_out for v in views] == [False, False, False, True]
+    assert [v.withheld for v in views] == [False, False, False, True]
     measured = reprojection.measurement.displacement[reprojection.measurement.usable].abs()
     assert (scale.measured, scale.unit) == ("displacement", "px")
     for low, high in (scale.limits, scale.apart):
@@ -206,8 +206,8 @@ def worst(statements: list[Statement]) -> str:
     return max((s.level for s in statements), key=LEVELS.index)
 
 
-def view(held_out: bool, cc: float, noise: float | None) -> dict:
-    known = {"name": "a", "held_out": held_out, "cc": cc, "rms": 0.1, "measured": "displacement", "unit": "px"}
+def view(withheld: bool, cc: float, noise: float | None) -> dict:
+    known = {"name": "a", "withheld": withheld, "cc": cc, "rms": 0.1, "measured": "displacement", "unit": "px"}
     return known if noise is None else {**known, "rms_over_sigma": noise}
 
 
@@ -228,7 +228,7 @@ def test_leftovers_are_named_with_where_they_point(tmp_path):
     ("metrics", "level", "words"),
     [
         ({"views": [view(False, 0.99, 1.0), view(True, 0.98, 1.1)]}, "good", "has not been seen"),
-        ({"views": [view(False, 0.99, 1.0)]}, "warning", "--hold-out"),
+        ({"views": [view(False, 0.99, 1.0)]}, "warning", "--withhold"),
         ({"views": [view(False, 0.99, None), view(True, 0.98, None)]}, "note", "noise of the measurement is not known"),
         ({"views": [view(False, 0.99, 1.0), view(True, 0.9, 1.1)]}, "warning", "poorly"),
         ({"views": [view(False, 0.99, 1.0), view(True, 0.5, 3.0)]}, "bad", "poorly"),
@@ -292,7 +292,7 @@ def test_tables_of_another_kind_are_refused_not_drawn(copy, name, text, words):
     (copy / name).write_text(text)
     (gap,) = [gap for gap in ResultDirectory(copy).read().missing if gap.what == name]
     assert words in gap.sentence
-    if words != "views":  # few pictures are quicker
+    if words != "views":  # few images are quicker
         (copy / "reprojection.nc").unlink()
     assert main(["report", str(copy)]) == 0
 
@@ -337,14 +337,14 @@ def test_of_many_pixels_a_regular_lattice_is_taken(measurement):
     np.testing.assert_allclose(np.sort(some), np.sort(expected.flatten().numpy()), rtol=1e-5)
 
 
-def test_the_pictures_of_many_views_stay_small(measurement, monkeypatch):
+def test_the_images_of_many_views_stay_small(measurement, monkeypatch):
     nothing = Reprojection(measurement, {"deflection": torch.zeros_like(measurement.displacement)})
     assert {v.shrunk for v in view_images(nothing, [])[0]} == {(1, 1)}
-    monkeypatch.setattr("nerif.report.view_images.ALL_PICTURES", 6 * 5 * 13**2)
+    monkeypatch.setattr("nerif.report.view_images.ALL_IMAGES", 6 * 5 * 13**2)
     assert {v.shrunk for v in view_images(nothing, [])[0]} == {(2, 2)}
 
 
-def test_pictures_of_narrow_and_large_views():
+def test_images_of_narrow_and_large_views():
     """Shrunk along each edge by itself."""
     assert _shrink(np.ones((2, 900)), (1, 3)).shape == (2, 300)
     image = np.arange(24.0).reshape(4, 6)
@@ -353,11 +353,11 @@ def test_pictures_of_narrow_and_large_views():
     assert np.isnan(_shrink(image, (2, 3))).tolist() == [[True, False], [False, False]]
 
 
-def test_evaluating_again_keeps_what_was_held_out(copy):
+def test_evaluating_again_keeps_what_was_withheld(copy):
     measurement = json.loads((copy / "metrics.json").read_text())["measurement"]
     assert main(["evaluate", str(copy), "--measurement", measurement]) == 0
     views = json.loads((copy / "metrics.json").read_text())["views"]
-    assert [v["name"] for v in views if v["held_out"]] == ["170deg"]
+    assert [v["name"] for v in views if v["withheld"]] == ["170deg"]
 
 
 def test_masked_voxels_are_told(tmp_path):

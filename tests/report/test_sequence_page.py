@@ -20,7 +20,7 @@ from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.report import sequence_page
 from nerif.report.sequence_page import render_sequence
-from report.browsing import errors, needs_browser, picture, requests, show, text, wait_for
+from report.browsing import errors, image, needs_browser, requests, show, text, wait_for
 
 GAS = {"composition": "air", "wavelength_nm": 532.0, "pressure_pa": 101325.0}
 
@@ -29,7 +29,7 @@ def store_of(path: Path, frames: int, **attributes: object) -> VolumeSequence:
     """A flame over time as nerif sequence leaves it: frame 1 failed, the last one missing."""
     box = Box((-25.0, -25.0, -20.0), (25.0, 25.0, 20.0))
     grid = Grid.of_resolution(box, 20)
-    about = {"gas": GAS, "views": ["a", "b"], "hold_out": ["b"], "measurement": "/x/film.zarr", **attributes}
+    about = {"gas": GAS, "views": ["a", "b"], "withhold": ["b"], "measurement": "/x/film.zarr", **attributes}
     store = VolumeSequence.create(path, [i * 1e-4 for i in range(frames)], grid, ("index_excess",), 1.00027, about)
     add_frames(store.group, "status", frames, (), (), "int8", 0)
     add_frames(store.group, "reason", frames, (), (), "str", "")
@@ -83,14 +83,14 @@ def test_time_is_turned_by_slider_and_button(browser: Any, tmp_path: Path) -> No
     assert errors(browser) == []
     assert requests(browser) == []
     assert text(browser, "#time-text") == "0 ms, frame 0"
-    first, space = picture(browser, "#slice-y"), picture(browser, "#space")
+    first, space = image(browser, "#slice-y"), image(browser, "#space")
     label = text(browser, "#bar-ticks")
     browser.execute_script(
         "const t = document.getElementById('time'); t.value = 3; t.dispatchEvent(new Event('input'))"
     )
     wait_for(browser, "return document.getElementById('time-text').textContent === '0.4 ms, frame 4'")
-    assert np.abs(picture(browser, "#slice-y") - first).mean() > 0.5
-    assert np.abs(picture(browser, "#space") - space).mean() > 0.2
+    assert np.abs(image(browser, "#slice-y") - first).mean() > 0.5
+    assert np.abs(image(browser, "#space") - space).mean() > 0.2
     assert text(browser, "#bar-ticks") == label  # the same colours at all times
     browser.execute_script("document.getElementById('play').click()")
     wait_for(browser, "return document.getElementById('time').value === '1'")

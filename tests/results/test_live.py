@@ -30,21 +30,21 @@ METHODS = [NeRIF(max_steps=10, points_per_batch=256), Tikhonov(voxels=8, iterati
 
 @pytest.mark.parametrize("method", METHODS, ids=["nerif", "voxels"])
 @pytest.mark.parametrize(
-    "hold_out", [pytest.param(("45deg",), marks=pytest.mark.slow), ("auto",)], ids=["held out", "auto"]
+    "withhold", [pytest.param(("45deg",), marks=pytest.mark.slow), ("auto",)], ids=["held out", "auto"]
 )
-def test_a_run_tells_how_it_goes_on(measurement, method, hold_out, tmp_path, monkeypatch):
+def test_a_run_tells_how_it_goes_on(measurement, method, withhold, tmp_path, monkeypatch):
     monkeypatch.setattr(nerif.results.live, "FIRST", 0.0)
     for name, value in {"SHARE": 1e9, "VOXELS": 8, "SAMPLES": 16}.items():
         monkeypatch.setattr(nerif.results.live, name, value)
-    run = Run(hold_out=hold_out, report=False)
+    run = Run(withhold=withhold, report=False)
     result = reconstruct_into(tmp_path / "r", measurement, method, run, voxels=8, live=True)
     live, look = read_live(tmp_path / "r"), read_look(tmp_path / "r")
     assert live["progress"] == 1 or isinstance(method, Tikhonov)  # which may end before
     assert live["step"] >= live["curve"]["step"][-1]
-    assert live["view"] == ("45deg" if hold_out == ("45deg",) else look.view)
+    assert live["view"] == ("45deg" if withhold == ("45deg",) else look.view)
     assert len(live["curve"]["seconds"]) == len(live["curve"]["step"]) > 1
     assert look.view == live["view"]
-    assert look.held_out == (hold_out == ("45deg",))
+    assert look.withheld == (withhold == ("45deg",))
     assert look.components == ("u", "v")
     assert look.measured.shape == look.predicted.shape == (12, 18, 2)
     assert look.quantity == result.quantity
@@ -55,7 +55,7 @@ def test_a_run_tells_how_it_goes_on(measurement, method, hold_out, tmp_path, mon
 
 
 def test_only_if_asked(measurement, tmp_path):
-    reconstruct_into(tmp_path, measurement, Tikhonov(voxels=8), Run(report=False, hold_out=("none",)), force=True)
+    reconstruct_into(tmp_path, measurement, Tikhonov(voxels=8), Run(report=False, withhold=("none",)), force=True)
     assert read_live(tmp_path) == {}
     assert read_look(tmp_path) is None
 
@@ -66,13 +66,13 @@ def test_looks_take_a_share_of_the_time(measurement, tmp_path, monkeypatch):
     live = Live(tmp_path, measurement, NeRIF())
     looks = []
 
-    def look(title, step, held_out):
+    def look(title, step, withheld):
         looks.append(clock[0])
         clock[0] += 0.5
 
     monkeypatch.setattr(live, "_look", look)
     step = Step(1, 0.0, 0.0, 0.5, {"loss": 1.0}, 1.0, lambda: None, lambda: None)
-    with live.watching(QUIET, held_out=False).training("training") as told:
+    with live.watching(QUIET, withheld=False).training("training") as told:
         for i in range(4000):
             clock[0] += 0.05
             assert not told(replace(step, step=i))

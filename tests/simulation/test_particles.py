@@ -1,4 +1,4 @@
-"""A cloud of particles, its ideal volume and its pictures."""
+"""A cloud of particles, its ideal volume and its images."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from nerif.common.conventions import InputError
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.simulation.particles.cloud import Particles, quality_factor, spread
-from nerif.simulation.particles.pictures import picture, pictures
+from nerif.simulation.particles.images import image, images
 from nerif.simulation.particles.rig import four_cameras
+from refusals import refused
 
 BOX = Box((-1.0, -2.0, -1.5), (1.0, 2.0, 1.5))
 GRID = Grid(BOX, (30, 40, 20))
@@ -58,11 +59,11 @@ def test_what_falls_beside_the_array_is_lost():
     )
 
 
-def test_a_picture_has_the_particle_where_it_is_seen_and_all_its_light():
+def test_a_image_has_the_particle_where_it_is_seen_and_all_its_light():
     cameras, _ = four_cameras(64, 16)
     for camera in cameras:
         particle = one(0.3, -0.8, 0.9)
-        seen = picture(particle, camera, diameter=3.0)
+        seen = image(particle, camera, diameter=3.0)
         rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
         centroid = torch.stack([(columns * seen).sum(), (rows * seen).sum()]) / seen.sum()
         torch.testing.assert_close(centroid, camera.project(particle.positions)[0], rtol=0, atol=1e-4)
@@ -76,9 +77,9 @@ def test_a_picture_has_the_particle_where_it_is_seen_and_all_its_light():
 def test_shot_noise_has_the_sigma_that_is_told():
     cameras, box = four_cameras(64, 16)
     cloud = Particles.draw(box, 200, seed=1)
-    noisy, clean = pictures(cloud, cameras, counts=500, seed=2), pictures(cloud, cameras, counts=0)
+    noisy, clean = images(cloud, cameras, counts=500, seed=2), images(cloud, cameras, counts=0)
     assert clean.observations[0].sigma is None
-    assert not torch.equal(noisy.maps["radiance"], pictures(cloud, cameras, counts=500, seed=3).maps["radiance"])
+    assert not torch.equal(noisy.maps["radiance"], images(cloud, cameras, counts=500, seed=3).maps["radiance"])
     bright = clean.maps["radiance"] > clean.maps["radiance"].max() / 5
     error = (noisy.maps["radiance"] - clean.maps["radiance"]) / noisy.maps["radiance_sigma"]
     assert float(error[bright].square().mean().sqrt()) == pytest.approx(1, abs=0.1)
@@ -92,7 +93,7 @@ def test_four_cameras_see_the_whole_box_from_30_degrees_aside():
     for camera in cameras:
         assert camera.background is None
         assert math.degrees(math.acos(float(-camera.rotation[2, 0]))) == pytest.approx(30)
-        seen = picture(Particles.draw(box, 2000, seed=0), camera)
+        seen = image(Particles.draw(box, 2000, seed=0), camera)
         assert float(seen[0].max()) < 1e-2 * float(seen.max())
     assert box.edges[0] == pytest.approx(2.0)
     assert box.edges[1] > 5.0
@@ -104,7 +105,7 @@ def test_quality_is_one_for_the_ideal_volume_whatever_its_scale():
     assert quality_factor(3 * volume, volume) == pytest.approx(1)
     assert quality_factor(torch.zeros_like(volume), volume) == 0
     assert quality_factor(Particles.draw(BOX, 30, seed=1).volume(GRID).values, volume) < 0.3
-    with pytest.raises(InputError, match=r"ideal: expected the shape .*\(30, 40, 20\), got \(30, 40, 19\)"):
+    with refused("ideal"):
         quality_factor(volume, volume[..., 1:])
 
 
@@ -113,7 +114,7 @@ def test_a_few_particles_are_found(method):
     cameras, box = four_cameras(48, 12)
     cloud = Particles.draw(box, 40, seed=5)
     grid = Grid.of_resolution(box, 34)
-    result = method(voxels=34, basis="linear")(pictures(cloud, cameras, seed=5))
+    result = method(voxels=34, basis="linear")(images(cloud, cameras, seed=5))
     assert quality_factor(result.volume(grid).values, cloud.volume(grid).values) > 0.85
 
 
@@ -123,11 +124,11 @@ def test_a_few_particles_are_found(method):
         (lambda: Particles.draw(BOX, 0), "count: expected at least 1 particle, got 0"),
         (lambda: Particles.draw(BOX, 3, variation=-1), "variation: expected 0 or more, got -1"),
         (lambda: one(0, 0, 0).volume(GRID, diameter=0), "diameter: expected above 0, got 0"),
-        (lambda: pictures(one(0, 0, 0), four_cameras(48, 12)[0], counts=-1), "counts: expected 0 or more, got -1"),
-        (lambda: pictures(one(0, 0, 99), four_cameras(48, 12)[0]), "particles: expected some in view 'left below'"),
+        (lambda: images(one(0, 0, 0), four_cameras(48, 12)[0], counts=-1), "counts: expected 0 or more, got -1"),
+        (lambda: images(one(0, 0, 99), four_cameras(48, 12)[0]), "particles: expected some in view 'left below'"),
         (lambda: four_cameras(angle=90), "angle: expected between 0 and 80 degrees, got 90"),
         (lambda: four_cameras(depth=0), "depth: expected at least 1 px, got 0"),
-        (lambda: four_cameras(20, 100), "pixels: expected pictures that hold a box 100 px deep, got 20 px"),
+        (lambda: four_cameras(20, 100), "pixels: expected images that hold a box 100 px deep, got 20 px"),
     ],
 )
 def test_bad_input(call, message):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.common.conventions import InputError
 from nerif.fields.phantoms import Flame
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.geometry import Ring, paper_rig
 from nerif.simulation.simulate import STEPS, add_noise, simulate, view_displacement
+from refusals import refused
 
 
 def test_noise_is_a_share_of_the_rms_over_crossing_rays(ball, cameras, box):
@@ -67,5 +67,5 @@ def test_views_of_different_size_are_padded_with_nan(ball, box):
 
 
 def test_negative_noise_is_refused(measurement):
-    with pytest.raises(InputError, match="noise"):
+    with refused("noise"):
         add_noise(measurement, -0.1)

@@ -44,17 +44,17 @@ def test_one_view_is_predicted_before_it_is_used(measurement, tmp_path, method):
     reconstruct_into(out.path, measurement, method, SILENT, monitor=Monitor(said.append))
     result = out.read()
     name = best_covered(measurement.cameras)[0]
-    (unseen,) = result.metrics["first_look"]["views"]
-    assert (unseen["name"], unseen["held_out"]) == (name, True)
+    (unseen,) = result.metrics["cross_validation"]["views"]
+    assert (unseen["name"], unseen["withheld"]) == (name, True)
     assert any(line.startswith(f"{name}, not seen so far") for line in said)
     seen = {v["name"]: v for v in result.metrics["views"]}
     assert set(seen) == set(measurement.names)
-    assert not any(v["held_out"] for v in seen.values())
+    assert not any(v["withheld"] for v in seen.values())
     assert seen[name]["rms"] < unseen["rms"]
     figures = dict(trust_figures(result))
     assert {f"View {name}, while it was kept out", f"View {name}, in the end"} <= set(figures)
     assert any("A first, short run predicts" in s.text for s in trust(result))
-    assert result.settings["hold_out"] == ["auto"]
+    assert result.settings["withhold"] == ["auto"]
 
 
 def test_the_short_run_has_not_seen_the_view(measurement, tmp_path):
@@ -65,35 +65,35 @@ def test_the_short_run_has_not_seen_the_view(measurement, tmp_path):
     scores = []
     for number, data in enumerate((measurement, other)):
         reconstruct_into(tmp_path / str(number), data, VOXELS, SILENT)
-        scores.append(ResultDirectory(tmp_path / str(number)).metrics()["first_look"]["views"][0]["cc"])
+        scores.append(ResultDirectory(tmp_path / str(number)).metrics()["cross_validation"]["views"][0]["cc"])
     assert scores[0] == pytest.approx(-scores[1], abs=1e-6)
 
 
 @pytest.mark.parametrize(
     "asked",
-    [{"hold_out": ("none",)}, {"hold_out": ("72deg",)}],
+    [{"withhold": ("none",)}, {"withhold": ("72deg",)}],
     ids=["none", "named"],
 )
 def test_none_is_kept_out_first_where_that_is_asked_or_told_otherwise(measurement, tmp_path, asked):
     out = ResultDirectory(tmp_path / "r")
     reconstruct_into(out.path, measurement, VOXELS, replace(SILENT, **asked))
-    assert "first_look" not in out.metrics()
-    assert not out.first_look.path.exists()
-    held_out = [v["name"] for v in out.metrics()["views"] if v["held_out"]]
-    assert held_out == [name for name in asked.get("hold_out", ()) if name != "none"]
+    assert "cross_validation" not in out.metrics()
+    assert not out.cross_validation.path.exists()
+    withheld = [v["name"] for v in out.metrics()["views"] if v["withheld"]]
+    assert withheld == [name for name in asked.get("withhold", ()) if name != "none"]
 
 
 def test_of_three_views_none_can_be_spared(measurement, tmp_path):
     out = ResultDirectory(tmp_path / "r")
     reconstruct_into(out.path, measurement.select(measurement.names[: FEWEST - 1]), VOXELS, SILENT)
-    assert "first_look" not in out.metrics()
+    assert "cross_validation" not in out.metrics()
 
 
 def test_from_another_result_none_is_kept_out(measurement, tmp_path):
     """That one has seen them all."""
     reconstruct_into(tmp_path / "a", measurement, VOXELS, SILENT)
     reconstruct_into(tmp_path / "b", measurement, VOXELS, replace(SILENT, start_from=tmp_path / "a"))
-    assert "first_look" not in ResultDirectory(tmp_path / "b").metrics()
+    assert "cross_validation" not in ResultDirectory(tmp_path / "b").metrics()
 
 
 def test_views_may_be_called_none():
@@ -117,12 +117,12 @@ def test_interrupted_in_the_short_run(measurement, whole, tmp_path):
     first = reconstruct_into(broken.path, measurement, NETWORK, SILENT, monitor=Monitor(training=told))
     assert first.outcome.reason == "interrupted"
     name = best_covered(measurement.cameras)[0]
-    assert [v["name"] for v in broken.metrics()["views"] if v["held_out"]] == [name]
+    assert [v["name"] for v in broken.metrics()["views"] if v["withheld"]] == [name]
     reconstruct_into(broken.path, measurement, NETWORK, SILENT, resume=True)
     points = torch.rand(20, 3)
     assert torch.equal(broken.field()[0](points), whole.field()[0](points))
-    assert broken.metrics()["first_look"]["views"] == whole.metrics()["first_look"]["views"]
-    assert not any(v["held_out"] for v in broken.metrics()["views"])
+    assert broken.metrics()["cross_validation"]["views"] == whole.metrics()["cross_validation"]["views"]
+    assert not any(v["withheld"] for v in broken.metrics()["views"])
 
 
 @pytest.mark.slow
@@ -130,11 +130,11 @@ def test_interrupted_after_the_short_run(measurement, whole, tmp_path):
     broken = ResultDirectory(tmp_path / "broken")
     stopped = reconstruct_into(broken.path, measurement, NETWORK, SILENT, on_step=lambda step: step.step == 30)
     assert stopped.outcome.reason == "interrupted"
-    scores = broken.metrics()["first_look"]
+    scores = broken.metrics()["cross_validation"]
     reconstruct_into(broken.path, measurement, NETWORK, SILENT, resume=True)
     points = torch.rand(20, 3)
     assert torch.equal(broken.field()[0](points), whole.field()[0](points))
-    assert broken.metrics()["first_look"] == scores
+    assert broken.metrics()["cross_validation"] == scores
 
 
 def test_the_command_line_goes_on_with_the_short_run(measurement, tmp_path, capsys, monkeypatch):
@@ -161,5 +161,5 @@ def test_the_command_line_goes_on_with_the_short_run(measurement, tmp_path, caps
     assert sent
     assert main(["reconstruct", "--resume", "-o", str(out), "--no-report"]) == 0
     found = json.loads((out / "metrics.json").read_text())
-    assert found["first_look"]["views"][0]["name"] == best_covered(measurement.cameras)[0]
+    assert found["cross_validation"]["views"][0]["name"] == best_covered(measurement.cameras)[0]
     assert "Traceback" not in capsys.readouterr().err

@@ -1,9 +1,9 @@
-"""The two halves of a picture of an axisymmetric flow: which pixels are on which side, and how far they are alike.
+"""The two halves of an image of an axisymmetric flow: which pixels are on which side, and how far they are alike.
 
 A field about an axis looks the same from a camera when it is reflected at the plane through the camera and the axis. So
 the map of what was measured is that of itself reflected,
 
-    d(p) = M(q + d(q)) - p,     q = M(p),     M the reflection of the picture,
+    d(p) = M(q + d(q)) - p,     q = M(p),     M the reflection of the image,
 
 but for noise, and for what is not alike around the axis.
 """
@@ -26,17 +26,24 @@ from nerif.geometry import Camera
 from nerif.geometry.symmetry import Symmetry
 
 __all__ = [
-    "HALVES", "Reflection", "camera_of", "departure_sentence", "departures", "halved", "kept_half", "left_of_axis",
+    "HALVES",
+    "Reflection",
+    "asymmetry",
+    "asymmetry_sentence",
+    "camera_of",
+    "halved",
+    "kept_half",
+    "left_of_axis",
 ]  # fmt: skip
 
 HALVES = ("left", "right")
-"""Of a picture, beside the axis as it runs in its direction."""
+"""Of an image, beside the axis as it runs in its direction."""
 FEWEST = 30  # pixels that have a counterpart
 
 
 @dataclass(frozen=True)
 class Reflection:
-    """The reflection M of a picture at the plane through its camera and an axis.
+    """The reflection M of an image at the plane through its camera and an axis.
 
     Parameters
     ----------
@@ -68,7 +75,7 @@ class Reflection:
         return origin + s[:, None] * direction
 
     def _beside(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " n"]]:
-        """The plane's normal, towards what is left of the axis in the picture, and how far beside it points are."""
+        """The plane's normal, towards what is left of the axis in the image, and how far beside it points are."""
         axis = torch.tensor(self.symmetry.direction, dtype=torch.float64)
         point = torch.tensor(self.symmetry.point, dtype=torch.float64)
         sight = self.camera.sight(point.to(self.camera.rotation)).double()
@@ -117,27 +124,29 @@ def camera_of(view: str) -> str:
 
 
 def kept_half(
-    measurement: Measurement, hold_out: Sequence[str], axis: Mapping[str, Any] | Symmetry | None
+    measurement: Measurement, withhold: Sequence[str], axis: Mapping[str, Any] | Symmetry | None
 ) -> tuple[Measurement, tuple[str, ...]]:
     """Return the measurement in halves, and the names of those held out, if a half is to be; else as they are.
 
     Parameters
     ----------
     measurement : Measurement
-    hold_out : names of views, or one of HALVES, unless a view is called so
+    withhold : names of views, or one of HALVES, unless a view is called so
     axis : about which the flow is symmetric, or what the metrics of a result hold of it; None for no symmetry
     """
-    words = tuple(hold_out)
+    words = tuple(withhold)
     if len(words) != 1 or words[0] not in HALVES or words[0] in measurement.names:
         return measurement, words
     if not axis:
-        raise InputError(f"hold_out: expected half a picture ('{words[0]}') with --symmetry axis only; name views")
+        raise InputError(
+            f"expected half an image ('{words[0]}') with --symmetry axis only; name views", field="withhold"
+        )
     symmetry = axis if isinstance(axis, Symmetry) else Symmetry.kept(axis["symmetry"])
     parts = halved(measurement, symmetry)
     return parts, tuple(name for name in parts.names if name.endswith(f" {words[0]}"))
 
 
-def departures(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, Any]]:
+def asymmetry(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, Any]]:
     """Return how far what each view measured departs from what it would be of a flow alike around the axis.
 
     `cc` is the correlation of each channel with its reflection, `departure` the rms of what is odd over the rms of
@@ -155,8 +164,8 @@ def departures(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, A
     return found
 
 
-def departure_sentence(departure: Mapping[str, Any]) -> str:
-    """Return one of `departures` in words."""
+def asymmetry_sentence(departure: Mapping[str, Any]) -> str:
+    """Return one of `asymmetry` in words."""
     cc = ", ".join(f"{name} {value:.3f}" for name, value in departure["cc"].items())
     share = f"what is odd about the axis is {departure['departure']:.0%} of it"
     return f"{departure['name']}: the halves of the {departure['measured']} correlate by {cc}; {share}"

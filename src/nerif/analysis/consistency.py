@@ -117,7 +117,7 @@ def unrelated_finding(
     if best > ENOUGH * repeatable(small):
         cause = f"likely {words}: without that the agreement is {best:.2f}"
     else:
-        cause = "check units (mm), poses (world to camera), and whether each picture has the camera of its name"
+        cause = "check units (mm), poses (world to camera), and whether each image has the camera of its name"
     now = float(torch.tensor(agreements).median())
     sentence = f"no view is predicted by the others (agreement {now:.2f}, median of {len(agreements)}): {cause}"
     return Finding("unrelated", sentence, small.names)
@@ -162,9 +162,9 @@ def path_integral(small: Measurement) -> PathIntegral:
 
 
 def binned(measurement: Measurement, longest: int) -> Measurement:
-    """Return the measurement with pixels averaged in squares, so that no picture is longer than about `longest` px.
+    """Return the measurement with pixels averaged in squares, so that no image is longer than about `longest` px.
 
-    Pictures of a few rows keep one, as high as their squares would be or as they are. A square counts if half of its
+    Images of a few rows keep one, as high as their squares would be or as they are. A square counts if half of its
     pixels do; of a view so sparse that none would, if one does. Sigma and masks are left behind.
     """
     most = -(-max(max(c.image_size) for c in measurement.cameras) // longest)
@@ -328,7 +328,7 @@ def looks(measurement: Measurement, small: Measurement, valid: Sequence[float]) 
 
 
 def _of_rim(kind: type[ForwardModel], offset: Tensor, shrunk: float) -> str:
-    """What a rim says that is not at rest, in pictures that were shrunk."""
+    """What a rim says that is not at rest, in images that were shrunk."""
     if kind.background:
         u, v = (float(x) * shrunk for x in offset)
         moved = f"its rim is displaced by ({u:.2f}, {v:.2f}) px as a whole; did the camera move?"
@@ -337,8 +337,8 @@ def _of_rim(kind: type[ForwardModel], offset: Tensor, shrunk: float) -> str:
     return f"{value}; if nothing but the ambient is there, subtract it as the offset of the background"
 
 
-SORTED = "pictures and cameras were sorted differently, one by numbers (2, 10), the other by letters (10, 2)"
-REVERSED = "pictures and cameras are in opposite order"
+SORTED = "images and cameras were sorted differently, one by numbers (2, 10), the other by letters (10, 2)"
+REVERSED = "images and cameras are in opposite order"
 
 View = Callable[[Tensor], Tensor]  # (row, column, channel) to the same
 
@@ -353,7 +353,7 @@ class Change:
     words : for people
     undo : the change that undoes it
     everywhere : its name if all views have it; empty if that cannot be detected
-    square : whether it can happen to square pictures only
+    square : whether it can happen to square images only
     """
 
     code: str
@@ -367,15 +367,15 @@ def _signs(u: float, v: float) -> View:
     return lambda d: d * d.new_tensor([u, v])
 
 
-MIRRORED, UPSIDE_DOWN = "the picture is mirrored left to right", "the picture is upside down, mirrored top to bottom"
-TURNED = "the picture is turned by 180 degrees"
+MIRRORED, UPSIDE_DOWN = "the image is mirrored left to right", "the image is upside down, mirrored top to bottom"
+TURNED = "the image is turned by 180 degrees"
 
-TRANSPOSED, QUARTER = "the picture is transposed (rows and columns exchanged)", "the picture is turned by 90 degrees"
+TRANSPOSED, QUARTER = "the image is transposed (rows and columns exchanged)", "the image is turned by 90 degrees"
 
 
-def _vectors_of(picture: View, u: float, v: float) -> View:
-    """Undo what happened to a picture whose rows became columns: its vectors have the axes exchanged, and signs."""
-    return lambda d: _signs(u, v)(picture(d).flip(-1))
+def _vectors_of(image: View, u: float, v: float) -> View:
+    """Undo what happened to an image whose rows became columns: its vectors have the axes exchanged, and signs."""
+    return lambda d: _signs(u, v)(image(d).flip(-1))
 
 
 OF_VECTORS = (
@@ -394,7 +394,7 @@ OF_VECTORS = (
     Change("quarter_turn", QUARTER, _vectors_of(lambda d: d.rot90(1, (0, 1)), 1, -1), square=True),
     Change("quarter_turn", QUARTER, _vectors_of(lambda d: d.rot90(-1, (0, 1)), -1, 1), square=True),
 )
-"""Of maps with two components in the picture."""
+"""Of maps with two components in the image."""
 
 OF_SCALARS = (
     Change("mirrored", MIRRORED, lambda d: d.flip(1), MIRRORED),
@@ -419,8 +419,8 @@ class Correction:
     views : indices
     code : of its Finding
     words : for people
-    change : what undoes it in each of them; None where pictures have the places of others
-    order : of each of these views then, the number under which its picture is
+    change : what undoes it in each of them; None where images have the places of others
+    order : of each of these views then, the number under which its image is
     """
 
     views: tuple[int, ...]
@@ -442,7 +442,7 @@ class Correction:
 
 
 def _changes(observation: Observation, cameras: Sequence[Camera]) -> list[Change]:
-    """What may have happened to the pictures of these cameras."""
+    """What may have happened to the images of these cameras."""
     changes = OF_VECTORS if len(observation.technique.channels) == 2 else OF_SCALARS
     if len(observation.technique.channels) == 1 and observation.signed:
         changes = (*changes, SIGN)
@@ -456,14 +456,14 @@ def of_one_view(view: int, observation: Observation, cameras: Sequence[Camera]) 
 
 
 def exchanges(cameras: Sequence[Camera]) -> list[Correction]:
-    """Every two views of one picture size that may be exchanged."""
+    """Every two views of one image size that may be exchanged."""
     sizes = [c.image_size for c in cameras]
     pairs = [(j, i) for i in range(len(sizes)) for j in range(i) if sizes[i] == sizes[j]]
     return [Correction(pair, "exchanged", "these two views are exchanged", None, pair[::-1]) for pair in pairs]
 
 
 def orders(cameras: Sequence[Camera]) -> list[Correction]:
-    """Orders in which the pictures of all views may have been given to the cameras, where their sizes allow it."""
+    """Orders in which the images of all views may have been given to the cameras, where their sizes allow it."""
     names, sizes = [c.name for c in cameras], [c.image_size for c in cameras]
     every = tuple(range(len(names)))
     by_number = sorted(every, key=lambda i: [float(word) for word in re.findall(r"\d+(?:\.\d+)?", names[i])])
@@ -482,7 +482,7 @@ def everywhere(observation: Observation, cameras: Sequence[Camera]) -> list[Corr
     return [Correction(views, c.code, c.everywhere, c.undo) for c in changes if c.everywhere]
 
 
-LONGEST = 48  # px along the longer edge of the pictures that are compared, whatever the size of the sensor
+LONGEST = 48  # px along the longer edge of the images that are compared, whatever the size of the sensor
 BETTER = 0.97  # a mistake is one if undoing it brings the objective of the joint fit below this share
 SHORTLIST = 0.95  # worth a joint fit: undoing it brings the disagreement with the other views below this share
 NO_EXCHANGE = 1.15  # two views are not worth a joint fit if they fit each other's prediction so much worse
@@ -722,11 +722,11 @@ def _finding(correction: Correction, names: Sequence[str]) -> Finding:
 def corrected(measurement: Measurement, found: Consistency) -> Measurement:
     """Return a measurement with the corrections of `found` applied, to sigma and masks as well.
 
-    Pictures of the pattern are left out: they are not what was corrected.
+    Images of the pattern are left out: they are not what was corrected.
 
     Parameters
     ----------
-    measurement : that was compared, by one technique beside its pictures
+    measurement : that was compared, by one technique beside its images
     found : by check_consistency, of this measurement
 
     Raises
@@ -737,14 +737,18 @@ def corrected(measurement: Measurement, found: Consistency) -> Measurement:
     observations = integrals_of(measurement)
     if len(observations) > 1:
         names = " and ".join(o.technique.name for o in observations)
-        raise InputError(f"measurement: expected one technique to correct, got {names}; correct each file by itself")
+        raise InputError(
+            f"expected one technique to correct, got {names}; correct each file by itself", field="measurement"
+        )
     (observation,) = observations
     corrections = found.corrections.get(observation.technique.name, ())
     if not corrections:
-        raise InputError("measurement: nothing was found in it that can be undone")
+        raise InputError("nothing was found in it that can be undone", field="measurement")
     alone = observation.alone(measurement)
     if alone.names != measurement.names:
-        raise InputError("measurement: expected that every view measured something, for views are corrected by number")
+        raise InputError(
+            "expected that every view measured something, for views are corrected by number", field="measurement"
+        )
     for correction in corrections:
         alone = _undone(correction, alone)
     return alone

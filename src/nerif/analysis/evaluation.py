@@ -47,7 +47,7 @@ def evaluate(
     result: str | os.PathLike[str],
     truth: str | os.PathLike[str] | None = None,
     measurement: str | os.PathLike[str] | None = None,
-    hold_out: Sequence[str] | None = None,
+    withhold: Sequence[str] | None = None,
     on_view: Callable[[int, int], None] = lambda done, total: None,
     align: str = "none",
 ) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def evaluate(
     result : directory of a reconstruction
     truth : volume file (.nc, .vti) of the true index, compared on its own grid
     measurement : measurement file to re-project into
-    hold_out : views of it which the reconstruction has not seen; None for those that run.toml held out
+    withhold : views of it which the reconstruction has not seen; None for those that run.toml held out
     on_view : told how many views are re-projected, out of how many
     align : "rigid" for the errors after the best rigid motion of the field as well, under `aligned`; or "none"
 
@@ -71,11 +71,11 @@ def evaluate(
         unknown ambient or sticks out of the box, or there is no such view.
     """
     if truth is None and measurement is None:
-        raise InputError("evaluate: expected --truth VOLUME or --measurement FILE to compare with, got neither")
+        raise InputError("expected --truth VOLUME or --measurement FILE to compare with, got neither", field="evaluate")
     if align not in ALIGNMENTS:
-        raise InputError(f"align: expected one of {', '.join(ALIGNMENTS)}, got '{align}'")
+        raise InputError(f"expected one of {', '.join(ALIGNMENTS)}, got '{align}'", field="align")
     if align != "none" and truth is None:
-        raise InputError("align: expected together with --truth VOLUME, to which the field is moved, got none")
+        raise InputError("expected together with --truth VOLUME, to which the field is moved, got none", field="align")
     directory = ResultDirectory(result)
     field, box, n_ambient = directory.field()
     quantity = directory.quantity()
@@ -93,13 +93,13 @@ def evaluate(
     if data is not None:
         asked = directory.settings()
         axis = directory.metrics().get("axis") if directory.has(METRICS) else None
-        data, unseen = kept_half(data, asked.get("hold_out", ()) if hold_out is None else hold_out, axis)
-        held_out = _held_out(None if hold_out is None else unseen, {**asked, "hold_out": unseen}, data)
+        data, unseen = kept_half(data, asked.get("withhold", ()) if withhold is None else withhold, axis)
+        withheld = _withheld(None if withhold is None else unseen, {**asked, "withhold": unseen}, data)
         aperture = "off" if asked.get("aperture", "off") == "off" else "auto"
         data = with_gains(seen_through(data, aperture), gains_of(asked))
         if directory.has(METRICS):
             data = with_corrections(data, directory.metrics().get("rig", []))
-        views = reproject(field, data, held_out, on_view=on_view, model=str(asked.get("model", AUTO)))
+        views = reproject(field, data, withheld, on_view=on_view, model=str(asked.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
         metrics["measurement"] = str(Path(str(measurement)).resolve())
         directory.write_reprojection(views)
@@ -110,7 +110,7 @@ def evaluate(
 def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     """Compare every view with its prediction: cc, ssim, psnr and rms over the usable pixels that see the box.
 
-    Of pictures it is the change by the flow that is compared: what they would show without it is taken off both.
+    Of images it is the change by the flow that is compared: what they would show without it is taken off both.
 
     The rms is in the unit of what was measured, and also called rms_px where that is px. Where sigma is known,
     rms_over_sigma tells whether the residual is the noise (1) or more; leftover, where there are enough pixels, whether
@@ -131,7 +131,7 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         inside = view, slice(0, height), slice(0, width)
         mask, predicted = compared[inside], reprojection.maps[kind.name][inside]
         measured = observation.values[inside].nan_to_num(0.0, 0.0, 0.0)
-        found: dict[str, Any] = {"name": camera.name, "held_out": camera.name in reprojection.held_out}
+        found: dict[str, Any] = {"name": camera.name, "withheld": camera.name in reprojection.withheld}
         found |= {"measured": kind.measured, "unit": kind.unit}
         if kind.derived:  # what no flow would show is no merit of the field
             still = models[kind].mapped(torch.zeros(height, width, kind.integrals), view)
@@ -179,7 +179,7 @@ def score_lines(views: list[dict[str, Any]]) -> list[str]:
     measured = dict.fromkeys(v["measured"] for v in views)
     groups = (("training view", False), ("held-out view", True))
     for (group, held), name in itertools.product(groups, measured):
-        chosen = [v for v in views if v["held_out"] is held and v["measured"] == name]
+        chosen = [v for v in views if v["withheld"] is held and v["measured"] == name]
         if chosen:
             cc = min(v["cc"] for v in chosen)
             rms = rms_text(max(chosen, key=lambda v: v["rms"]))
@@ -223,8 +223,9 @@ def check_inside(path: Path, truth: Box, box: Box) -> None:
     outside = [a for a, low, high, lower, upper in sides if low < lower - 1e-6 or high > upper + 1e-6]
     if outside:
         raise InputError(
-            f"{path}: expected a volume inside the reconstructed box ({box.lower} to {box.upper} mm), "
-            f"got one that sticks out along {', '.join(outside)}"
+            f"expected a volume inside the reconstructed box ({box.lower} to {box.upper} mm), "
+            f"got one that sticks out along {', '.join(outside)}",
+            field=path,
         )
 
 
@@ -237,16 +238,16 @@ def _truth(path: Path, box: Box, n_ambient: float, quantity: str) -> Volume:
     try:
         return truth.relative_to(n_ambient)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise error.inside(path) from None
 
 
-def _held_out(asked: Sequence[str] | None, settings: dict[str, Any], measurement: Measurement) -> tuple[str, ...]:
+def _withheld(asked: Sequence[str] | None, settings: dict[str, Any], measurement: Measurement) -> tuple[str, ...]:
     """Names of the views that the reconstruction has not seen."""
     if asked is None:
-        return tuple(name for name in settings.get("hold_out", ()) if name in measurement.names)
+        return tuple(name for name in settings.get("withhold", ()) if name in measurement.names)
     unknown = [name for name in asked if name not in measurement.names]
     if unknown:
-        raise InputError(f"hold_out: expected views out of {', '.join(measurement.names)}, got '{unknown[0]}'")
+        raise InputError(f"expected views out of {', '.join(measurement.names)}, got '{unknown[0]}'", field="withhold")
     return tuple(asked)
 
 

@@ -43,9 +43,11 @@ def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> dict[str, float
     (observation, *others) = measurement.observations
     if others or not observation.technique.gains:
         names = " and ".join(o.technique.name for o in measurement.observations)
-        raise InputError(f"fit_gains: expected emission, whose cameras may be of different brightness, got {names}")
+        raise InputError(
+            f"expected emission, whose cameras may be of different brightness, got {names}", field="fit_gains"
+        )
     if len(measurement.cameras) < 2:
-        raise InputError("fit_gains: expected two views or more, got one, whose gain nothing tells")
+        raise InputError("expected two views or more, got one, whose gain nothing tells", field="fit_gains")
     rays, values, _ = measurement.rays(observation)
     view, measured = rays.view.long(), values[:, 0]
     grid, model = Grid.of_resolution(measurement.box, voxels), forward_model(observation.technique, measurement)
@@ -61,8 +63,9 @@ def fit_gains(measurement: Measurement, voxels: int = VOXELS) -> dict[str, float
         for name, gain in zip(measurement.names, (fresh / fresh.median()).tolist(), strict=True):
             if not gain > DARK:
                 raise InputError(
-                    f"fit_gains: view '{name}' shows {gain:.2g} times what the others make expect, too little to tell "
-                    f"its gain by; leave it out (--hold-out {name})"
+                    f"view '{name}' shows {gain:.2g} times what the others make expect, too little to tell "
+                    f"its gain by; leave it out (--withhold {name})",
+                    field="fit_gains",
                 )
         fresh = fresh / fresh.log().mean().exp()
         settled = float((fresh - gains).abs().max()) < SETTLED
@@ -84,7 +87,7 @@ def gains_of(run: Mapping[str, Any]) -> dict[str, float]:
     found = {str(name): gain for name, gain in run.get("about", {}).get("gains", {}).items()}
     for name, gain in found.items():
         if not isinstance(gain, int | float) or not 0 < gain < math.inf:
-            raise InputError(f"gains of run.toml: expected a number above 0 for view '{name}', got {gain!r}")
+            raise InputError(f"expected a number above 0 for view '{name}', got {gain!r}", field="gains of run.toml")
     return found
 
 

@@ -56,7 +56,7 @@ def check_sees(techniques: Sequence[type[ForwardModel]], quantity: str, what: st
         if kind.quantity != quantity:
             names = ", ".join(k.name for k in TECHNIQUES.values() if k.quantity == quantity and not k.derived)
             field = f"the field of {name_of(quantity)}"
-            raise InputError(f"{what}: expected a technique that sees {field} ({names}), got {kind.name}")
+            raise InputError(f"expected a technique that sees {field} ({names}), got {kind.name}", field=what)
 
 
 def predict_view(
@@ -144,25 +144,25 @@ def predict(
 def reproject(
     field: Field,
     measurement: Measurement,
-    held_out: Collection[str] = (),
+    withheld: Collection[str] = (),
     device: torch.device | str = "cpu",
     on_view: Callable[[int, int], None] = lambda done, total: None,
     model: str = AUTO,
 ) -> Reprojection:
     """Predict what every view of a measurement sees of a field, by every technique of the measurement.
 
-    A network is integrated along every ray where that takes some seconds only. Of larger pictures it is sampled on
+    A network is integrated along every ray where that takes some seconds only. Of larger images it is sampled on
     voxels, and the views are interpolated between rays through those (`SampledViews`); how far that is from the
     integral through the network is measured on some pixels, and told as `accuracies`.
 
     Parameters
     ----------
-    held_out : names of the views that the reconstruction has not seen
+    withheld : names of the views that the reconstruction has not seen
     on_view : told how many views are done, out of how many
     model : forward model that the field was reconstructed with
     """
     box, maps, accuracies, done = measurement.box, {}, {}, 0
-    known: dict[tuple[ForwardModel, int], Tensor] = {}  # pictures and displacements are of one integral
+    known: dict[tuple[ForwardModel, int], Tensor] = {}  # images and displacements are of one integral
     many = _work(field, measurement.cameras) > EXACT_WORK[torch.device(device).type]
     voxels = on_voxels(field, box, device) if many else None
     total = sum(len(_seeing(kind, measurement.cameras)) for kind in measurement.techniques)
@@ -192,7 +192,7 @@ def reproject(
                 integrals = [known[integral, i] for i, _ in views]
                 found = sampled.accuracy(seen_as, [camera for _, camera in views], integrals)
             accuracies[seen_as.measured] = found
-    return Reprojection(measurement, maps, tuple(held_out), tuple(accuracies.values()))
+    return Reprojection(measurement, maps, tuple(withheld), tuple(accuracies.values()))
 
 
 def _seeing(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
@@ -283,9 +283,7 @@ class SampledViews:
         bent, straight = (project(projector, self.field, rays, self.device) for projector in projectors)
         return bent - straight
 
-    def accuracy(
-        self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Sequence[Tensor]
-    ) -> Accuracy:
+    def accuracy(self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Sequence[Tensor]) -> Accuracy:
         """Compare predicted views, (row, column, c) each, with the path integral through the field, on some pixels."""
         generator = torch.Generator().manual_seed(0)
         apart = []

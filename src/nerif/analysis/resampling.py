@@ -35,8 +35,9 @@ def common_grid(first: Volume, second: Volume, most: int = MOST) -> Grid:
     upper = [min(p, q) for p, q in zip(a.box.upper, b.box.upper, strict=True)]
     if not all(p < q for p, q in zip(lower, upper, strict=True)):
         raise InputError(
-            f"volumes: expected boxes that overlap, got {a.box.lower} to {a.box.upper} and {b.box.lower} to "
-            f"{b.box.upper} mm; compare results of the same rig"
+            f"expected boxes that overlap, got {a.box.lower} to {a.box.upper} and {b.box.lower} to "
+            f"{b.box.upper} mm; compare results of the same rig",
+            field="volumes",
         )
     box = Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]))
     finest = min(*a.spacing, *b.spacing)
@@ -73,7 +74,7 @@ def difference(first: Volume, second: Volume, grid: Grid | None = None) -> Volum
         If they hold different quantities, or do not overlap.
     """
     if first.quantity != second.quantity:
-        raise InputError(f"quantity: expected the same of both, got '{first.quantity}' and '{second.quantity}'")
+        raise InputError(f"expected the same of both, got '{first.quantity}' and '{second.quantity}'", field="quantity")
     grid = grid or common_grid(first, second)
     values = resampled(second, grid).values.double() - resampled(first, grid).values.double()
     return Volume(values, grid, first.quantity, first.unit, first.attributes)

@@ -30,7 +30,7 @@ GRAIN = {BLOCK: 1.25, FINE: 1.1}  # below these what is alike is at most about h
 NAMED = {BLOCK: 0.2, FINE: 0.12}  # of what is alike, that a pattern has to take away to be named
 
 CAUSES = {
-    "offset": "the whole picture is displaced (a shaken camera): --refine shift, or nerif displacement --shake-border",
+    "offset": "the whole image is displaced (a shaken camera): --refine shift, or nerif displacement --shake-border",
     "calibration": "the view is not looked at from where the calibration says: nerif check names one that is upside "
     "down, mirrored or exchanged; where it names none, --refine cameras",
     "scale": "all of it is too large or too small: distances, pixel pitch, sensitivity, or a method that flattens",
@@ -71,7 +71,7 @@ def leftover(residual: Map, predicted: Map | None, mask: Bool[np.ndarray, "row c
     Parameters
     ----------
     residual : measured less predicted, over sigma where that is known
-    predicted : what the field predicts; None where causes leave other patterns, as in pictures
+    predicted : what the field predicts; None where causes leave other patterns, as in images
     mask : pixels that count
     """
     coarse, fine = (_tested(residual, predicted, mask, edge) for edge in (BLOCK, FINE))
@@ -179,6 +179,6 @@ def _patterns(predicted: Map) -> dict[str, list[Map]]:
         pattern[..., channel] = 1.0
     smooth = np.gradient(along, axis=1) + np.gradient(down, axis=0)
     turned = x * down - y * along
-    if channels == 2:  # vectors turn with the picture
+    if channels == 2:  # vectors turn with the image
         turned = turned * half + np.stack([d[..., 1], -d[..., 0]], axis=-1)
     return {"offset": each, "calibration": [along, down, turned], "scale": [d], "blur": [smooth]}

@@ -59,7 +59,7 @@ def check_rig(
     InputError
         If there is no such thing to refine, or the aperture is "on" and none is known.
     """
-    data = of_source(measurement, "auto", preferred="displacements")  # pictures tell more, and take longer
+    data = of_source(measurement, "auto", preferred="displacements")  # images tell more, and take longer
     settings = NeRIF(
         time_limit=seconds, refine=tuple(refine), pose_sigma_mm=pose_sigma_mm, pose_sigma_deg=pose_sigma_deg,
         aperture=aperture,

@@ -140,8 +140,8 @@ def verdict(result: Result) -> Verdict:
         return Verdict.of("do not use", None, [f"the run {outcome}"])
     views = metrics.get("views")
     views = [v for v in views if _complete(v)] if isinstance(views, list) else []
-    fitted = [v for v in views if not v["held_out"]]
-    for group, whose in ((fitted, "fitted views"), ([v for v in views if v["held_out"]], "withheld views")):
+    fitted = [v for v in views if not v["withheld"]]
+    for group, whose in ((fitted, "fitted views"), ([v for v in views if v["withheld"]], "withheld views")):
         share = _explained(group, _noise(fitted))
         if share is not None and share < EXPLAINED:
             text = f"the field explains {max(share, 0.0):.0%} of the squared signal of the {whose}, noise apart"
@@ -150,8 +150,8 @@ def verdict(result: Result) -> Verdict:
     doubt, grave = _contradiction(fitted)
     symmetry = (metrics.get("axis") or {}).get("symmetry") or {}
     alike = bool(symmetry) and not symmetry.get("harmonics")  # one view shows it all; with harmonics halves may differ
-    if alike and any(d["departure"] > ASYMMETRIC for d in metrics.get("departures") or []):
-        uneven, none = _asymmetry(metrics["departures"])
+    if alike and any(d["departure"] > ASYMMETRIC for d in metrics.get("asymmetry") or []):
+        uneven, none = _asymmetry(metrics["asymmetry"])
         doubt, grave = "; ".join(filter(None, (uneven, doubt))), grave or none
     if grave:
         return Verdict.of("do not use", None, [doubt])
@@ -245,12 +245,12 @@ def _from_views(
 ) -> tuple[Estimate | None, str]:
     """The estimate from views that were withheld, of the whole run or of others."""
     metrics = result.metrics
-    first = metrics.get("first_look") or {}
+    first = metrics.get("cross_validation") or {}
     noise = _noise(fitted)
     own = [v for v in first.get("fitted_views") or [] if _complete(v)]
     share = _explained(own, noise)
     for withheld, basis in (
-        ([v for v in views if v["held_out"]], "cross-validated on a withheld view"),
+        ([v for v in views if v["withheld"]], "cross-validated on a withheld view"),
         (first.get("views") or [], "cross-validated in a first run without a view"),
     ):
         shown = [v for v in withheld if _complete(v) and v["measured"] in noise and v["measured"] in _kinds(withheld)]
@@ -352,9 +352,9 @@ def _contradiction(fitted: Sequence[dict[str, Any]]) -> tuple[str, bool]:
     return "", False
 
 
-def _asymmetry(departures: Sequence[dict[str, Any]]) -> tuple[str, bool]:
+def _asymmetry(asymmetry: Sequence[dict[str, Any]]) -> tuple[str, bool]:
     """How far the measurement is from that of an axisymmetric flow, in words, and whether it is none."""
-    worst = max(departures, key=lambda d: d["departure"])
+    worst = max(asymmetry, key=lambda d: d["departure"])
     cc, share = min(worst["cc"].values()), worst["departure"]
     halves = f"the halves of {worst['name']} correlate by {cc:.2f}, and {share:.0%} of the signal is antisymmetric"
     none = share > NOT_SYMMETRIC

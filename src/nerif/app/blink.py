@@ -25,7 +25,7 @@ box.clock = setInterval(() => {{ if (!box.isConnected) {{ stop(); return; }}
 
 
 class Blink:
-    """Two pictures on each other, where the page is being built.
+    """Two images on each other, where the page is being built.
 
     Parameters
     ----------

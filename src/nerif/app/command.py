@@ -19,7 +19,7 @@ __all__ = ["App", "main", "run"]
 
 @dataclass(frozen=True)
 class App(Settings):
-    """Work on a folder in the browser: design, pictures, calibration, reconstruction, results.
+    """Work on a folder in the browser: design, images, calibration, reconstruction, results.
 
     Whatever is done there is a command line, which is shown; runs go on when page and server are closed.
     """
@@ -39,15 +39,17 @@ class App(Settings):
 
     def __post_init__(self) -> None:
         if not 1 <= self.port <= 65535:
-            raise InputError(f"port: expected 1 to 65535, got {self.port}")
+            raise InputError(f"expected 1 to 65535, got {self.port}", field="port")
         if self.token is not None and not re.fullmatch(r"[\w.~-]{16,}", self.token, re.ASCII):
-            raise InputError(f"token: expected 16 or more of A-Z a-z 0-9 _ . ~ -, got {len(self.token)} characters")
+            raise InputError(
+                f"expected 16 or more of A-Z a-z 0-9 _ . ~ -, got {len(self.token)} characters", field="token"
+            )
 
 
 def run(settings: App) -> None:
     """Serve until Ctrl-C."""
     if importlib.util.find_spec("nicegui") is None:
-        raise InputError(f"app: expected NiceGUI, which is not installed; {install('app')}")
+        raise InputError(f"expected NiceGUI, which is not installed; {install('app')}", field="app")
     from nerif.app.server import Address, serve
 
     serve(settings.folder, Address.of(settings.host, settings.port, settings.token), settings.browser)

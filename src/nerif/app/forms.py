@@ -94,7 +94,7 @@ class Form(Generic[T]):
         self.record, self.verb = record, tuple(verb)
         found = {f.name: f for f in _fields(record, choices or {})}
         if unknown := [name for name in only if name not in found]:
-            raise InputError(f"only: expected some of {', '.join(found)}, got {', '.join(unknown)}")
+            raise InputError(f"expected some of {', '.join(found)}, got {', '.join(unknown)}", field="only")
         kept = [found[name] for name in only] if only else list(found.values())
         self.fields = tuple(f for f in kept if f.name not in without)
 

@@ -151,7 +151,7 @@ class Jobs:
         """
         job = self._read(id) if id in self._names() else None
         if job is None:
-            raise InputError(f"job: expected one of {', '.join(self._names()) or 'none'}, got '{id}'")
+            raise InputError(f"expected one of {', '.join(self._names()) or 'none'}, got '{id}'", field="job")
         return job
 
     def log(self, id: str, lines: int = 200) -> list[str]:
@@ -210,7 +210,7 @@ class Jobs:
         out : result directory that it writes, relative to the folder
         """
         if not arguments:
-            raise InputError("arguments: expected a verb of nerif, got nothing")
+            raise InputError("expected a verb of nerif, got nothing", field="arguments")
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
         words = tuple(str(word) for word in arguments)
         job = Job(name, title, words, words, str(out), place=time.time())
@@ -233,7 +233,7 @@ class Jobs:
         """
         if not self.get(id).resumable:
             raise InputError(
-                f"job {id}: only nerif {' and '.join(RESUMABLE)} can be paused; stop it and start it again"
+                f"only nerif {' and '.join(RESUMABLE)} can be paused; stop it and start it again", field=f"job {id}"
             )
         self._ask(id, "pause")
 
@@ -289,7 +289,7 @@ class Jobs:
         """
         job = self.get(id)
         if job.state == "running":
-            raise InputError(f"job {id}: it runs; stop it first")
+            raise InputError("it runs; stop it first", field=f"job {id}")
         shutil.rmtree(self._of(job))
 
     @property
@@ -301,7 +301,7 @@ class Jobs:
     @at_once.setter
     def at_once(self, count: int) -> None:
         if not 1 <= count <= MOST:
-            raise InputError(f"at_once: expected 1 to {MOST} runs at the same time, got {count}")
+            raise InputError(f"expected 1 to {MOST} runs at the same time, got {count}", field="at_once")
         self.directory.mkdir(parents=True, exist_ok=True)
         write_json(self.directory / "settings.json", {"at_once": int(count)})
 
@@ -316,7 +316,7 @@ class Jobs:
 
     def _keep(self, job: Job) -> None:
         if job.state == "refused":
-            raise InputError(f"job {job.id}: {REFUSED}")
+            raise InputError(str(REFUSED), field=f"job {job.id}")
         kept = {name: value for name, value in asdict(job).items() if name in KEPT}
         write_json(self._of(job) / JOB, {**kept, SIGNATURE: self._signature(kept)})
 

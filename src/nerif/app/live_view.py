@@ -19,7 +19,7 @@ from nerif.common.conventions import unit_shown
 from nerif.data.volume import name_of
 from nerif.geometry import Box
 from nerif.plotting.drawing import colour_range, map_range
-from nerif.report.view_images import picture_address
+from nerif.report.view_images import image_address
 from nerif.results.directory import LIVE, LIVE_LOOK
 from nerif.results.live import Look, read_live, read_look
 
@@ -104,14 +104,14 @@ class LiveView:
             self.chart.options.clear()
             self.chart.options.update(curve_options(live["curve"]))
         if drawn is not None:
-            pictures, box, said = drawn
-            self.look.set_content(pictures)
+            images, box, said = drawn
+            self.look.set_content(images)
             if said:
                 self.surface.show(job.out, seen[LIVE_LOOK], box, said)
 
 
 def _changed(out: Path, seen: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
-    """What the run tells; of its last look, where it is not in `seen` yet, pictures, box, and its surface in words."""
+    """What the run tells; of its last look, where it is not in `seen` yet, images, box, and its surface in words."""
     stamp = _stamp(out / LIVE_LOOK)
     drawn = None
     if stamp and stamp != seen.get(LIVE_LOOK):
@@ -172,28 +172,28 @@ def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:
 
 
 def look_html(look: Look) -> str:
-    """Return the pictures of a look as HTML: view as measured and predicted, three middle slices."""
+    """Return the images of a look as HTML: view as measured and predicted, three middle slices."""
     figures = []
     unit = unit_shown(look.unit)
     for c, component in enumerate(look.components):
         measured, predicted = look.measured[..., c], look.predicted[..., c]
         limits = map_range(measured[np.isfinite(measured)], True, 0.998)
         ends = f"{limits[0]:.2g} to {limits[1]:.2g} {unit}".strip()
-        seen = "held out" if look.held_out else "not held out"
+        seen = "held out" if look.withheld else "not held out"
         known = np.isfinite(measured)
         rms = math.sqrt(float(np.mean((predicted - measured)[known] ** 2)))
         for what, image in (("measured", measured), ("predicted", np.where(known, predicted, np.nan))):
             apart = "" if what == "measured" else f"; rms apart {rms:.2g} {unit}"
             text = f"{look.view} ({seen}), {component} {what}; {ends}{apart}"
-            figures.append((picture_address(image, limits), text))
+            figures.append((image_address(image, limits), text))
     z, y, x = (n // 2 for n in look.values.shape)
     limits = colour_range(look.values)
     for normal, image in (("z", look.values[z]), ("y", look.values[:, y]), ("x", look.values[:, :, x])):
         middle = (look.lower["xyz".index(normal)] + look.upper["xyz".index(normal)]) / 2
         text = f"{name_of(look.quantity)} at {normal} = {middle:g} mm; {limits[0]:.2g} to {limits[1]:.2g}"
-        figures.append((picture_address(image[::-1], limits), text))
+        figures.append((image_address(image[::-1], limits), text))
     inside = "".join(
         f'<figure><img src="{address}" alt="{escape(text)}"><figcaption>{escape(text)}</figcaption></figure>'
         for address, text in figures
     )
-    return f"<div class=pictures>{inside}</div><p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"
+    return f"<div class=images>{inside}</div><p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"

@@ -96,7 +96,7 @@ class MaskCard:
         self._changed()
 
     def _changed(self) -> None:
-        """Keep what is drawn over a reload, and as the pictures that nerif mask reads."""
+        """Keep what is drawn over a reload, and as the images that nerif mask reads."""
         draft = self.work.draft(self.page)
         masks = {**draft.get("masks", {}), self.name: self.edits.kept}
         self.work.keep(self.page, {**draft, "masks": masks})
@@ -109,7 +109,7 @@ class MaskCard:
             await self._write()
 
     async def _write(self) -> None:
-        """Write what is drawn as pictures, beside the page, one state after the other."""
+        """Write what is drawn as images, beside the page, one state after the other."""
         async with self._writing:
             drawn, folder = self.edits.drawn, self.work.project.path(self.folder)
             sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
@@ -134,7 +134,7 @@ class MaskCard:
             address = await self.work.beside(threshold_address, self.measurement, index, settings, asked.sigma)
             with ui.dialog() as dialog, ui.card():
                 text_html(f"Flow in view {self.view.value}, by the threshold: white", "h3")
-                picture = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")
-                picture.props["src"], picture.props["alt"] = address, "Mask by the threshold"
+                image = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")
+                image.props["src"], image.props["alt"] = address, "Mask by the threshold"
                 ui.button("Close", on_click=dialog.close).props("flat no-caps")
             dialog.open()

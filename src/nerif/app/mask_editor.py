@@ -30,7 +30,7 @@ class MaskEditor:
     ----------
     name : of the view
     shape : its height and width, px
-    address : of its picture
+    address : of its image
     edits : MaskEdits that what is drawn goes into
     changed : called after each step
     """

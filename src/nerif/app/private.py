@@ -48,8 +48,9 @@ def _write(path: Path, content: bytes) -> None:
 
 def _unwritable(where: Path, error: OSError) -> InputError:
     return InputError(
-        f"{where}: expected a directory for files that you alone can read, got '{error.strerror or error}'; "
-        "set XDG_STATE_HOME to a directory that you can write to"
+        f"expected a directory for files that you alone can read, got '{error.strerror or error}'; "
+        "set XDG_STATE_HOME to a directory that you can write to",
+        field=where,
     )
 
 
@@ -74,8 +75,9 @@ def secret() -> bytes:
     if not own or len(content) != LENGTH:
         got = f"{len(content)} bytes with mode {about.st_mode & 0o777:03o} of user {about.st_uid}"
         raise InputError(
-            f"{path}: expected {LENGTH} bytes that you alone can read (mode 600), got {got}; delete it, and start "
-            "runs that wait again from their pages"
+            f"expected {LENGTH} bytes that you alone can read (mode 600), got {got}; delete it, and start "
+            "runs that wait again from their pages",
+            field=path,
         )
     return content
 

@@ -28,7 +28,7 @@ class Contents:
 
     Parameters
     ----------
-    experiments : folders of pictures that have views
+    experiments : folders of images that have views
     calibrations : calibration files (.toml)
     measurements : measurement files (.nc)
     volumes : volume files (.nc, .vti) that are no part of a result
@@ -63,7 +63,7 @@ class Project:
         self.folder = Path(folder).resolve()
         if not self.folder.is_dir():
             got = "a file" if self.folder.exists() else "none"
-            raise InputError(f"{folder}: expected a folder to work in, got {got}")
+            raise InputError(f"expected a folder to work in, got {got}", field=folder)
         self._cache: dict[tuple[str, str], tuple[tuple[int, int], object]] = {}
 
     @property
@@ -85,10 +85,10 @@ class Project:
             If it is, or a link in it leads, outside of the folder.
         """
         if "\0" in str(name):
-            raise InputError("path: expected the name of a file, got one with a zero in it")
+            raise InputError("expected the name of a file, got one with a zero in it", field="path")
         path = (self.folder / name).resolve()
         if not path.is_relative_to(self.folder):
-            raise InputError(f"path: expected something in {self.folder}, got '{name}', which is outside of it")
+            raise InputError(f"expected something in {self.folder}, got '{name}', which is outside of it", field="path")
         return path
 
     def relative(self, path: str | os.PathLike[str]) -> str:
@@ -102,7 +102,7 @@ class Project:
         return next(name for name in names if name not in taken and not self.path(name).exists())
 
     def views(self, experiment: str) -> tuple[View, ...]:
-        """Return the views of a folder of pictures; InputError where there are none."""
+        """Return the views of a folder of images; InputError where there are none."""
         return find_views(self.path(experiment))
 
     def cached(self, name: str, what: str, read: Callable[[Path], T]) -> T:

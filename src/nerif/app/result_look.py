@@ -21,7 +21,7 @@ from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError, unit_shown
 from nerif.data.volume import Volume, describe
 from nerif.plotting.drawing import DIVERGING, LABELS, map_range
-from nerif.report.slice_pictures import colours_of
+from nerif.report.slice_images import colours_of
 from nerif.results.directory import VOLUME
 
 __all__ = ["ResultLook"]
@@ -31,7 +31,7 @@ CLOSE = 0.5 + 1e-6  # of the time between frames: instants that are compared are
 
 
 class ResultLook:
-    """The pictures of one result in one tab; `build` fills the place that is being built.
+    """The images of one result in one tab; `build` fills the place that is being built.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class ResultLook:
     # -- controls ------------------------------------------------------------------------------------------------
 
     async def build(self) -> None:
-        """Build controls and pictures; InputError in words where there is nothing to see."""
+        """Build controls and images; InputError in words where there is nothing to see."""
         try:
             self.source = await self.work.beside(self._open, self.name)
             quantities = [q for q in self.source.quantities if not q.endswith("_std")]
@@ -121,7 +121,7 @@ class ResultLook:
         self.keep()
         await self.draw()
 
-    # -- pictures ------------------------------------------------------------------------------------------------
+    # -- images ------------------------------------------------------------------------------------------------
 
     @property
     def frame(self) -> int:
@@ -155,7 +155,7 @@ class ResultLook:
             return [Panel(describe(quantity)[1].capitalize(), first, limits, unit, colours)], ""
         other = self._open(against)
         if quantity not in other.quantities:
-            raise InputError(f"{against}: there is no {describe(quantity)[1]} in it to compare with")
+            raise InputError(f"there is no {describe(quantity)[1]} in it to compare with", field=against)
         second = other.volume(quantity, self._at(other, against, step))
         beside = other.limits(quantity)
         limits = min(limits[0], beside[0]), max(limits[1], beside[1])
@@ -181,8 +181,9 @@ class ResultLook:
         if abs(other.times[nearest] - now) > CLOSE * min(_interval(source.times), _interval(other.times)):
             at, closest = (f"{time * 1e3:.4g} ms" for time in (now, other.times[nearest]))
             raise InputError(
-                f"{against}: expected a frame at {at} to compare with, got {closest} as the nearest that is done; "
-                "choose another instant"
+                f"expected a frame at {at} to compare with, got {closest} as the nearest that is done; "
+                "choose another instant",
+                field=against,
             )
         return nearest
 

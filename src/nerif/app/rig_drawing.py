@@ -1,4 +1,4 @@
-"""The rig from above, to scale, as SVG: cameras, what the pictures see, backgrounds, the flow."""
+"""The rig from above, to scale, as SVG: cameras, what the images see, backgrounds, the flow."""
 
 from __future__ import annotations
 

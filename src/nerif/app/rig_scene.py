@@ -15,14 +15,14 @@ from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 from nerif.imaging.calibration.result import ImageError, read_errors, rms_of
-from nerif.report.rig_figure import COLOURS, picture_corners
+from nerif.report.rig_figure import COLOURS, image_corners
 
 __all__ = ["Rig", "read_rig", "show_rig"]
 
 SIZE = 5.0  # of the rig in the scene
 TIP = 0.18  # of the rig: length of the pyramid of a camera
 BEYOND = "#bcc5cd"  # colour of what the camera sees beyond that, as far as its background
-HEAD = ("Camera", "Picture [px]", "Focal length [px]", "Place x, y, z [mm]", "Pictures used", "rms [px]")
+HEAD = ("Camera", "Image [px]", "Focal length [px]", "Place x, y, z [mm]", "Images used", "rms [px]")
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Rig:
     cameras : those that can be drawn
     missing : what is not known of the others
     box : or None
-    errors : of the pictures it was made from, none if the file does not tell them
+    errors : of the images it was made from, none if the file does not tell them
     """
 
     cameras: tuple[Camera, ...]
@@ -64,7 +64,7 @@ def show_rig(rig: Rig) -> None:
     scene = ui.scene(width=1080, height=460, grid=False, camera=camera, background_color="#eef1f4")
     scene.classes("surface").props('role=img aria-label="The rig; drag to turn, scroll to come nearer"')
     middle = np.zeros(3) if rig.box is None else np.array(rig.box.centre)
-    seen = [picture_corners(c, middle) for c in rig.cameras]
+    seen = [image_corners(c, middle) for c in rig.cameras]
     points = np.concatenate([np.concatenate([s.start, s.end]) for s in seen] + [middle[None]])
     centre, reach = (points.max(axis=0) + points.min(axis=0)) / 2, float(np.ptp(points, axis=0).max()) or 1.0
     scale = SIZE / reach

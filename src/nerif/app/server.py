@@ -64,8 +64,9 @@ class Address:
         if not _is_local(host):
             if token is None:
                 raise InputError(
-                    f"host: expected --token together with --host {host}, got none; others can reach that address, and "
-                    "whoever knows the token can run nerif here and read and write the folder"
+                    f"expected --token together with --host {host}, got none; others can reach that address, and "
+                    "whoever knows the token can run nerif here and read and write the folder",
+                    field="host",
                 )
             say(f"note: others can reach {host}: who knows the token can run nerif here and read and write the folder;")
             say("      nothing is encrypted on the way. Safer: ssh -L 8620:127.0.0.1:8620 THIS_MACHINE")
@@ -187,7 +188,7 @@ def _free_port(host: str, port: int) -> int:
             except PermissionError:
                 reason = "ports below 1024 are for the system"
             except socket.gaierror:
-                raise InputError(f"host: expected an address of this machine, got '{host}'") from None
+                raise InputError(f"expected an address of this machine, got '{host}'", field="host") from None
             except OSError as error:
                 reason = error.strerror or reason
-    raise InputError(f"port: expected a free one from {port} on, got none: {reason}; give another --port")
+    raise InputError(f"expected a free one from {port} on, got none: {reason}; give another --port", field="port")

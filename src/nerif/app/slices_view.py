@@ -13,7 +13,7 @@ from nerif.app.range_slider import RangeSlider
 from nerif.app.workspace import Workspace
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
-from nerif.report.slice_pictures import bar_picture, slice_aspect, slice_picture
+from nerif.report.slice_images import bar_image, slice_aspect, slice_image
 
 __all__ = ["Panel", "SlicesView"]
 
@@ -50,7 +50,7 @@ class SlicesView:
         self._waiting: set[str] = set()
         self._busy = False
         self._built: tuple[Any, ...] = ()
-        self._pictures: dict[tuple[str, int], Any] = {}
+        self._images: dict[tuple[str, int], Any] = {}
         self._bars = ui.html("", sanitize=False)
         self._place = ui.element("div")
 
@@ -67,7 +67,7 @@ class SlicesView:
 
     def _build(self) -> None:
         self._place.clear()
-        self._pictures = {}
+        self._images = {}
         many = len(self.panels) > 1
         self._place.classes(replace=f"cuts {'many' if many else 'one'}")
         if not self.panels:
@@ -93,7 +93,7 @@ class SlicesView:
                 aspect = slice_aspect(panel.volume, normal)
                 with ui.element("figure"):
                     image = ui.element("img").style(f"aspect-ratio: {aspect:.4f}; --aspect: {aspect:.4f}")
-                    self._pictures[normal, number] = image
+                    self._images[normal, number] = image
                     if len(self.panels) > 1:
                         ui.html(f"<figcaption>{escape(panel.title)}</figcaption>", sanitize=False)
 
@@ -119,14 +119,14 @@ class SlicesView:
     def _put(self, normal: str, index: int, drawn: Sequence[str]) -> None:
         for number, (panel, address) in enumerate(zip(self.panels, drawn, strict=True)):
             at = float(panel.volume.grid.axis(normal)[index])
-            image = self._pictures[normal, number]
+            image = self._images[normal, number]
             image.props["src"] = address
             image.props["alt"] = f"{panel.title}, slice at {normal} = {at:.2f} mm"
             image.update()
 
 
 def _drawn(panels: Sequence[Panel], normal: str, index: int) -> list[str]:
-    return [slice_picture(p.volume, normal, index, p.limits, p.colours) for p in panels]
+    return [slice_image(p.volume, normal, index, p.limits, p.colours) for p in panels]
 
 
 def _bars(panels: Sequence[Panel]) -> str:
@@ -139,7 +139,7 @@ def _bars(panels: Sequence[Panel]) -> str:
         text = " and ".join(titles)
         bars.append(
             f"<figure><figcaption>{escape(text)}{f' [{escape(unit)}]' if unit else ''}</figcaption>"
-            f'<img src="{bar_picture(colours)}" alt="Colours from {low:.3g} to {high:.3g} {escape(unit)}">'
+            f'<img src="{bar_image(colours)}" alt="Colours from {low:.3g} to {high:.3g} {escape(unit)}">'
             f"<span>{low + 0.0:.3g}</span><span>{high + 0.0:.3g}</span></figure>"  # no -0
         )
     return f"<div class=bars>{''.join(bars)}</div>"

@@ -52,7 +52,7 @@ class Still:
     def _volumes(self) -> dict[str, Volume]:
         file = self.path / VOLUME
         if not file.is_file():
-            raise InputError(f"{self.path.name}: there is no field to show yet; it comes when the run has ended")
+            raise InputError("there is no field to show yet; it comes when the run has ended", field=self.path.name)
         return _read(str(file), file.stat().st_mtime_ns)
 
     @property
@@ -70,7 +70,7 @@ class Still:
         """
         found = self._volumes
         if quantity not in found:
-            raise InputError(f"{self.path.name}: expected one of {', '.join(found)}, got '{quantity}'")
+            raise InputError(f"expected one of {', '.join(found)}, got '{quantity}'", field=self.path.name)
         return found[quantity]
 
     def limits(self, quantity: str) -> Limits:
@@ -101,7 +101,7 @@ class Film:
         self.times, self.frames = store.times, frames_there(store)
         self.quantities = _worth_showing(store.quantities)
         if not self.frames:
-            raise InputError(f"{path.name}: no frame of it is done yet")
+            raise InputError("no frame of it is done yet", field=path.name)
 
     @property
     def _stamp(self) -> int:

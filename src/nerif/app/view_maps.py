@@ -8,7 +8,7 @@ import torch
 
 from nerif.data.measurement import Measurement, integrals_of
 from nerif.imaging.masks import MaskSettings, with_flow_masks
-from nerif.report.view_images import picture_address
+from nerif.report.view_images import image_address
 
 __all__ = ["magnitude_address", "maps_html", "threshold_address"]
 
@@ -34,39 +34,39 @@ def maps_html(measurement: Measurement) -> str:
         step = -(-max(height, width) // PIXELS)
         part = i, slice(0, height, step), slice(0, width, step)
         shown = {
-            name: picture_address(values[part][..., c].numpy(), (least, most))
+            name: image_address(values[part][..., c].numpy(), (least, most))
             for c, name in enumerate(observation.components)
         }
         if sigma is not None:
-            shown["sigma"] = picture_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
-        shown["valid"] = picture_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
+            shown["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
+        shown["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
         share = float(usable[i, :height, :width].float().mean())
         figures = "".join(
             f'<figure><img src="{address}" alt="{escape(f"{name} of view {camera.name}", quote=True)}">'
             f"<figcaption>{escape(name)}</figcaption></figure>"
             for name, address in shown.items()
         )
-        parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3><div class=pictures>{figures}</div>")
+        parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3><div class=images>{figures}</div>")
     return "".join(parts)
 
 
 def magnitude_address(measurement: Measurement, view: int) -> str:
-    """Return |value| of a view as a picture, px for px where it is small."""
+    """Return |value| of a view as an image, px for px where it is small."""
     (observation, *_), camera = integrals_of(measurement), measurement.cameras[view]
     height, width = camera.image_size
     step = -(-max(height, width) // (3 * PIXELS))
     part = view, slice(0, height, step), slice(0, width, step)
     size = observation.values[part].norm(dim=-1).where(measurement.usable[part], torch.tensor(float("nan")))
-    return picture_address(size.numpy(), (0.0, _largest(size)), "viridis")
+    return image_address(size.numpy(), (0.0, _largest(size)), "viridis")
 
 
 def threshold_address(measurement: Measurement, view: int, settings: MaskSettings, sigma: float | None) -> str:
-    """Return the mask of a view by threshold as a picture, white where the flow is."""
+    """Return the mask of a view by threshold as an image, white where the flow is."""
     name = measurement.names[view]
     masked = with_flow_masks(measurement.select([name]), settings, sigma)
     assert masked.flow_mask is not None
     height, width = measurement.cameras[view].image_size
-    return picture_address(masked.flow_mask[0, :height, :width].numpy().astype(float), (0.0, 1.0), "gray")
+    return image_address(masked.flow_mask[0, :height, :width].numpy().astype(float), (0.0, 1.0), "gray")
 
 
 def _largest(values: torch.Tensor) -> float:

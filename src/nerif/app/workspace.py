@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+from nerif.app.image_files import ImageFiles
 from nerif.app.jobs import Jobs
-from nerif.app.picture_files import PictureFiles
 from nerif.app.project import OWN, Project
 from nerif.common.files import write_json
 
@@ -40,7 +40,7 @@ class Workspace:
     def __init__(self, project: Project) -> None:
         for name in (OWN, f"{OWN}/jobs"):
             project.path(name)
-        self.project, self.jobs, self.files = project, Jobs(project.folder), PictureFiles(project)
+        self.project, self.jobs, self.files = project, Jobs(project.folder), ImageFiles(project)
         self._drafts: dict[str, dict[str, Any]] = {}
 
     @property

@@ -27,7 +27,7 @@ VERBS = {
     "report": "write a page that shows a result and says whether it can be trusted",
     "figures": "write every figure of a result as PDF and PNG at journal widths",
     "export": "write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid",
-    "app": "the whole road in a browser, on this machine: design, pictures, calibration, runs, results",
+    "app": "the whole road in a browser, on this machine: design, images, calibration, runs, results",
     "info": "print what a measurement, volume or result holds",
     "demo": "simulate, reconstruct and evaluate a small flame",
 }
@@ -73,7 +73,7 @@ def _run_nothing_of_the_folder() -> None:
 def _run(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         print("usage: nerif VERB [options]      (nerif VERB --help tells all options, units and defaults)\n")
-        print("Refractive index, density and temperature in 3-D from background-oriented schlieren pictures.\n")
+        print("Refractive index, density and temperature in 3-D from background-oriented schlieren images.\n")
         print("\n".join(f"  {verb:<13} {text}" for verb, text in VERBS.items()))
         return 0
     if words[0] == "--version":

@@ -68,7 +68,23 @@ VoxelIndex = Int[Tensor, "*batch 3"]
 
 
 class InputError(ValueError):
-    """Input that cannot be right: the message names what, what was expected, what came, and the remedy."""
+    """Invalid input: the message names the field, what was expected, what came, and the remedy.
+
+    Parameters
+    ----------
+    message : what was expected, what came, the remedy
+    field : name of the parameter, variable or file at fault, which the message then begins with
+    """
+
+    def __init__(self, message: str, *, field: object = "") -> None:
+        self.field = str(field)
+        super().__init__(f"{self.field}: {message}" if self.field else message)
+
+    def inside(self, place: object) -> InputError:
+        """Return the error with the file or view in which it occurred before its message; the field stays."""
+        error = InputError(f"{place}: {self}")
+        error.field = self.field
+        return error
 
 
 def ambient_index(value: object, name: str = "n_ambient") -> float:
@@ -80,7 +96,7 @@ def ambient_index(value: object, name: str = "n_ambient") -> float:
         If it is not a number between 0.9 and 4, as of gases, liquids and glasses.
     """
     if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < LARGEST_INDEX:
-        raise InputError(f"{name}: expected a refractive index such as 1.00027, got {value}")
+        raise InputError(f"expected a refractive index such as 1.00027, got {value}", field=name)
     return float(value)
 
 
@@ -105,5 +121,5 @@ def parse_faces(text: str | tuple[str, ...] | list[str], name: str = "ambient_fa
     words = tuple(text.replace(",", " ").split()) if isinstance(text, str) else tuple(text)
     for word in words:
         if word not in FACES:
-            raise InputError(f"{name}: expected faces out of '{' '.join(FACES)}', got '{word}'")
+            raise InputError(f"expected faces out of '{' '.join(FACES)}', got '{word}'", field=name)
     return words

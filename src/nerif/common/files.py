@@ -62,9 +62,9 @@ def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such {expected}") from None
+        raise InputError(f"no such {expected}", field=path) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise InputError(f"{path}: not a TOML file ({error})") from None
+        raise InputError(f"not a TOML file ({error})", field=path) from None
 
 
 def write_toml(path: str | os.PathLike[str], table: Mapping[str, Any], head: str = "") -> None:
@@ -87,7 +87,7 @@ def check_known(words: Iterable[str], known: Iterable[str], where: str, what: st
     for word in words:
         if word not in known:
             near = difflib.get_close_matches(word, known, n=1, cutoff=0)[0]
-            raise InputError(f"{where}: unknown {what} '{word}'; the nearest known one is '{near}'{more}")
+            raise InputError(f"unknown {what} '{word}'; the nearest known one is '{near}'{more}", field=where)
 
 
 def write_json(path: Path, entries: Mapping[str, Any]) -> None:

@@ -40,7 +40,7 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
 
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected {expected}")
+        raise InputError(f"no such file; expected {expected}", field=path)
     with reading(f"{path}: not a readable NetCDF-4 file, or truncated"):
         check_heaps(path)
         with h5py.File(path, "r") as file:
@@ -50,7 +50,7 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
         try:
             yield dataset
         except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+            raise error.inside(path) from None
 
 
 def values(variable: xr.DataArray) -> np.ndarray:
@@ -64,7 +64,7 @@ def values(variable: xr.DataArray) -> np.ndarray:
     with reading(f"variable '{variable.name}': cannot be read; is the file damaged?"):
         read = np.asarray(variable.values)
     if read.dtype.kind not in "fiub":
-        raise InputError(f"variable '{variable.name}': expected numbers, got {read.dtype}")
+        raise InputError(f"expected numbers, got {read.dtype}", field=f"variable '{variable.name}'")
     return read
 
 

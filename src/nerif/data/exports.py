@@ -29,7 +29,7 @@ def export(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """
     suffix = Path(path).suffix
     if suffix not in FORMATS:
-        raise InputError(f"{path}: expected a name ending in {', '.join(FORMATS)}, got '{suffix}'")
+        raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{suffix}'", field=path)
     FORMATS[suffix](path, volumes)
 
 

@@ -33,6 +33,7 @@ __all__ = [
     "integrals_of",
 ]
 
+
 @dataclass(frozen=True)
 class Observation:
     """What the cameras saw by one technique.
@@ -72,7 +73,7 @@ class Observation:
 
     @property
     def caption(self) -> str:
-        """What pictures of the views show."""
+        """What images of the views show."""
         kind = self.technique
         names = " and ".join(name for name in kind.channels if name)
         unit = f", in {kind.unit}" if unit_shown(kind.unit) else ""
@@ -110,7 +111,7 @@ class Observation:
 
 
 def integrals_of(measurement: Measurement) -> tuple[Observation, ...]:
-    """Return the observations whose values are path integrals: all but pictures of a pattern.
+    """Return the observations whose values are path integrals: all but images of a pattern.
 
     Raises
     ------
@@ -120,7 +121,9 @@ def integrals_of(measurement: Measurement) -> tuple[Observation, ...]:
     found = tuple(o for o in measurement.observations if not o.technique.derived)
     if not found:
         names = " and ".join(o.technique.measured for o in measurement.observations)
-        raise InputError(f"measurement: expected displacements, got {names} alone; nerif displacement finds them")
+        raise InputError(
+            f"expected displacements, got {names} alone; nerif displacement finds them", field="measurement"
+        )
     return found
 
 
@@ -156,10 +159,10 @@ def check_maps(measurement: Measurement) -> None:
     given, known = measurement.measured_maps, {kind.measured: kind for kind in TECHNIQUES.values()}
     first = next((name for name in known if name in given), None)
     if first is None:
-        raise InputError(f"measurement: expected one of {', '.join(known)}, got none of them")
+        raise InputError(f"expected one of {', '.join(known)}, got none of them", field="measurement")
     shape = given[first].shape[:3]
     if len(measurement.cameras) != shape[0] or not measurement.cameras:
-        raise InputError(f"{first}: expected one map a camera ({len(measurement.cameras)}), got {shape[0]}")
+        raise InputError(f"expected one map a camera ({len(measurement.cameras)}), got {shape[0]}", field=first)
     expected = {"valid": tuple(shape), "flow_mask": tuple(shape)}
     for kind in known.values():
         whole = (*shape, len(kind.channels)) if len(kind.channels) > 1 else tuple(shape)
@@ -168,10 +171,10 @@ def check_maps(measurement: Measurement) -> None:
             expected[name] = (*shape, channels) if channels > 1 else tuple(shape)
     for name, value in {**given, "valid": measurement.valid, "flow_mask": measurement.flow_mask}.items():
         if name not in expected:
-            raise InputError(f"maps: expected names out of {', '.join(sorted(expected))}, got '{name}'")
+            raise InputError(f"expected names out of {', '.join(sorted(expected))}, got '{name}'", field="maps")
         if value is not None and tuple(value.shape) != expected[name]:
             axes = "view, row, column" + ", component" * (len(expected[name]) - 3)
-            raise InputError(f"{name}: expected ({axes}) = {expected[name]}, got {tuple(value.shape)}")
+            raise InputError(f"expected ({axes}) = {expected[name]}, got {tuple(value.shape)}", field=name)
 
 
 def check_observations(measurement: Measurement) -> None:
@@ -185,7 +188,9 @@ def check_observations(measurement: Measurement) -> None:
     observations = measurement.observations
     names = " and ".join(o.technique.name for o in observations)
     if len({o.technique.quantity for o in observations}) > 1:
-        raise InputError(f"technique: expected techniques of one field, got {names}; split them into two measurements")
+        raise InputError(
+            f"expected techniques of one field, got {names}; split them into two measurements", field="technique"
+        )
     _check_backgrounds(measurement, names)
     for o in observations:
         forward_model(o.technique, measurement)  # refuses what it lacks
@@ -193,7 +198,7 @@ def check_observations(measurement: Measurement) -> None:
             try:
                 o.technique.check(o.values[i], None if o.sigma is None else o.sigma[i], usable)
             except InputError as error:
-                raise InputError(f"view '{name}': {error}") from None
+                raise error.inside(f"view '{name}'") from None
 
 
 def _check_backgrounds(measurement: Measurement, names: str) -> None:
@@ -201,14 +206,15 @@ def _check_backgrounds(measurement: Measurement, names: str) -> None:
     for i, camera in enumerate(measurement.cameras):
         if camera.background is not None and not needed:
             raise InputError(
-                f"background of view '{camera.name}': expected none for {names}, got one; leave out "
-                "background_normal and background_offset"
+                f"expected none for {names}, got one; leave out background_normal and background_offset",
+                field=f"background of view '{camera.name}'",
             )
         for o in measurement.observations:
             if o.technique.background and camera.background is None and bool(o.measured(i).any()):
                 raise InputError(
-                    f"background of view '{camera.name}': expected a plane for {o.technique.name}, got none; give "
-                    "background_normal and background_offset, or say which technique it is"
+                    f"expected a plane for {o.technique.name}, got none; give "
+                    "background_normal and background_offset, or say which technique it is",
+                    field=f"background of view '{camera.name}'",
                 )
 
 
@@ -260,14 +266,16 @@ class Measurement:
         self._check_shapes()
         ambient_index(self.n_ambient)
         if self.wavelength_nm is not None and not LIMITS_NM[0] <= self.wavelength_nm <= LIMITS_NM[1]:
-            raise InputError(f"wavelength_nm: expected nanometres such as 532, got {self.wavelength_nm}")
+            raise InputError(f"expected nanometres such as 532, got {self.wavelength_nm}", field="wavelength_nm")
         parse_faces(self.ambient_faces)
         check_observations(self)
         good = self.usable.flatten(1).sum(dim=1)
         for name, count in zip(self.names, good.tolist(), strict=True):
             if count == 0:
                 what = " and ".join(o.technique.measured for o in self.observations)
-                raise InputError(f"{what} of view '{name}': no valid pixel; leave the view out or mend its mask")
+                raise InputError(
+                    "no valid pixel; leave the view out or mend its mask", field=f"{what} of view '{name}'"
+                )
         self._check_geometry()
 
     def _check_shapes(self) -> None:
@@ -275,14 +283,16 @@ class Measurement:
         check_maps(self)
         shape = self.shape
         if len(set(self.names)) < len(self.names):
-            raise InputError(f"view: expected different names, got {', '.join(self.names)}")
+            raise InputError(f"expected different names, got {', '.join(self.names)}", field="view")
         if len({camera.lens is None for camera in self.cameras}) > 1:
-            raise InputError("aperture_diameter: expected of every view or of none (0 is a thin ray), got it of some")
+            raise InputError(
+                "expected of every view or of none (0 is a thin ray), got it of some", field="aperture_diameter"
+            )
         for camera in self.cameras:
             if camera.image_size[0] > shape[1] or camera.image_size[1] > shape[2]:
                 raise InputError(
-                    f"image_size of view '{camera.name}': expected at most {shape[1:3]} (height, width) px, "
-                    f"got {camera.image_size}"
+                    f"expected at most {shape[1:3]} (height, width) px, got {camera.image_size}",
+                    field=f"image_size of view '{camera.name}'",
                 )
 
     def _check_geometry(self) -> None:
@@ -335,7 +345,7 @@ class Measurement:
         """
         if self.displacement is None:
             names = " and ".join(o.technique.measured for o in self.observations)
-            raise InputError(f"displacement: expected a measurement of displacements, got {names}")
+            raise InputError(f"expected a measurement of displacements, got {names}", field="displacement")
         return self.displacement
 
     @property
@@ -468,10 +478,10 @@ class Measurement:
         """
         for name in names:
             if name not in self.names:
-                raise InputError(f"view: expected one of {', '.join(self.names)}, got '{name}'")
+                raise InputError(f"expected one of {', '.join(self.names)}, got '{name}'", field="view")
         index = [i for i, name in enumerate(self.names) if name in names]
         if not index:
-            raise InputError(f"view: expected at least one of {', '.join(self.names)}, got none")
+            raise InputError(f"expected at least one of {', '.join(self.names)}, got none", field="view")
         if len(index) == len(self.cameras):
             return self
 
@@ -488,7 +498,7 @@ class Measurement:
             flow_mask=pick(self.flow_mask),
         )
 
-    def without(self, held_out: Sequence[str]) -> Measurement:
+    def without(self, withheld: Sequence[str]) -> Measurement:
         """Return the measurement that is left to reconstruct from when some views are held out.
 
         Raises
@@ -496,19 +506,19 @@ class Measurement:
         InputError
             If there is no view of that name, or none is left.
         """
-        for name in held_out:
+        for name in withheld:
             if name not in self.names:
-                raise InputError(f"hold_out: expected views out of {', '.join(self.names)}, got '{name}'")
-        kept = [name for name in self.names if name not in held_out]
+                raise InputError(f"expected views out of {', '.join(self.names)}, got '{name}'", field="withhold")
+        kept = [name for name in self.names if name not in withheld]
         if not kept:
-            raise InputError("hold_out: every view is held out, so none is left to reconstruct from")
+            raise InputError("every view is held out, so none is left to reconstruct from", field="withhold")
         return self.select(kept)
 
-    def summary(self, held_out: int = 0) -> list[tuple[str, str]]:
-        """Return what was measured as names and values with units; `held_out` of the views were not used."""
+    def summary(self, withheld: int = 0) -> list[tuple[str, str]]:
+        """Return what was measured as names and values with units; `withheld` of the views were not used."""
         from nerif.data.measurement_summary import summary
 
-        return summary(self, held_out)
+        return summary(self, withheld)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the maps of the views, and the summary."""

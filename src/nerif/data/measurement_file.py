@@ -169,12 +169,12 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
     found = dataset.attrs.get("Conventions")
     if not known_conventions(found):
         raise InputError(
-            f"attribute Conventions: expected '{PLAIN}' or '{CONVENTIONS}', got '{found}'; is it a measurement?"
+            f"expected '{PLAIN}' or '{CONVENTIONS}', got '{found}'; is it a measurement?", field="attribute Conventions"
         )
     _check_variables(dataset)
     faces = dataset.attrs.get("ambient_faces", " ".join(DEFAULT_AMBIENT_FACES))
     if not isinstance(faces, str):
-        raise InputError(f"attribute ambient_faces: expected a text such as 'x- x+ y- y+', got {faces!r}")
+        raise InputError(f"expected a text such as 'x- x+ y- y+', got {faces!r}", field="attribute ambient_faces")
     own = ("displacement", "sigma", *MASKS)
     maps = {name: _map(dataset, name) for name in map_names() if name in dataset and name not in own}
     for kind in TECHNIQUES.values():
@@ -197,7 +197,7 @@ def _techniques(dataset: xr.Dataset) -> tuple[type[ForwardModel], ...]:
     """The techniques of a file: those its attribute names, each of which needs its variable, else those it holds."""
     named = dataset.attrs.get("technique", "")
     if not isinstance(named, str):
-        raise InputError(f"attribute technique: expected one of {', '.join(TECHNIQUES)}, got {named!r}")
+        raise InputError(f"expected one of {', '.join(TECHNIQUES)}, got {named!r}", field="attribute technique")
     kinds = tuple(technique(name) for name in named.replace(",", " ").split())
     return kinds or tuple(k for k in TECHNIQUES.values() if k.measured in dataset) or (Deflection,)
 
@@ -211,32 +211,36 @@ def _check_variables(dataset: xr.Dataset) -> None:
         if name not in dataset:
             if name not in needed:
                 continue
-            raise InputError(f"variable '{name}': expected on ({', '.join(dimensions)}) in {unit}, got none")
+            raise InputError(f"expected on ({', '.join(dimensions)}) in {unit}, got none", field=f"variable '{name}'")
         variable = dataset[name]
         if sorted(map(str, variable.dims)) != sorted(dimensions):
             got = tuple(map(str, variable.dims))
-            raise InputError(f"variable '{name}': expected dimensions {dimensions}, got {got}")
+            raise InputError(f"expected dimensions {dimensions}, got {got}", field=f"variable '{name}'")
         for dimension in dimensions:
             size, given_size = sizes.get(dimension), variable.sizes[dimension]
             if given_size == 0 or (size is not None and given_size != size):
-                raise InputError(f"variable '{name}': expected {size or 'some'} along {dimension}, got {given_size}")
+                raise InputError(
+                    f"expected {size or 'some'} along {dimension}, got {given_size}", field=f"variable '{name}'"
+                )
         given, units = variable.attrs.get("units", unit), [unit]
         if name == "intrinsics":
             units = list(dict.fromkeys([unit, *(_spelled(p.unit) for p in _projections(dataset))]))
         words = " ".join(given.replace(",", " ").split()) if isinstance(given, str) else ""
         if _spelled(words) not in units:
-            raise InputError(f"variable '{name}': expected units '{' or '.join(units)}', got '{given}'")
+            raise InputError(f"expected units '{' or '.join(units)}', got '{given}'", field=f"variable '{name}'")
     views, rows, columns = (dataset.sizes[name] for name in ("view", "row", "column"))
     if views * rows * columns > MOST_PIXELS:
         shape = f"{views} x {rows} x {columns}"
-        raise InputError(f"variable '{kinds[0].measured}': expected views of some megapixels, got {shape}")
+        raise InputError(f"expected views of some megapixels, got {shape}", field=f"variable '{kinds[0].measured}'")
 
 
 def _array(dataset: xr.Dataset, name: str, gaps: bool = False) -> Tensor:
     """A small variable in double precision, in the order of its dimensions, every number finite unless gaps may be."""
     numbers = values(dataset[name].transpose(*variables()[name][0])).astype(np.float64)
     if not gaps and not np.isfinite(numbers).all():
-        raise InputError(f"variable '{name}': expected finite numbers, got {numbers[~np.isfinite(numbers)][0]}")
+        raise InputError(
+            f"expected finite numbers, got {numbers[~np.isfinite(numbers)][0]}", field=f"variable '{name}'"
+        )
     return torch.from_numpy(np.ascontiguousarray(numbers))
 
 
@@ -253,7 +257,7 @@ def _map(dataset: xr.Dataset, name: str) -> Tensor:
             with np.errstate(over="ignore"):  # too large for single precision is not a displacement either
                 numbers = numbers.astype(np.float32, copy=False)
         elif numbers.dtype.kind == "f" and np.isnan(numbers).any():
-            raise InputError(f"variable '{name}': expected 0 or 1, got NaN")
+            raise InputError("expected 0 or 1, got NaN", field=f"variable '{name}'")
         else:
             numbers = numbers != 0
         result[i] = torch.from_numpy(np.ascontiguousarray(numbers))
@@ -286,7 +290,7 @@ def _projections(dataset: xr.Dataset) -> list[Projection]:
         return [PERSPECTIVE] * len(names)
     found = dataset["projection"]
     if found.dims != ("view",):
-        raise InputError(f"variable 'projection': expected one name a view, got dimensions {found.dims}")
+        raise InputError(f"expected one name a view, got dimensions {found.dims}", field="variable 'projection'")
     return [projection_named(p, f"projection of view '{n}'") for n, p in zip(names, _texts(found), strict=True)]
 
 
@@ -333,7 +337,7 @@ def _lenses(dataset: xr.Dataset, names: list[str]) -> list[Lens | None]:
         try:
             found.append(Lens(diameter, None if math.isnan(depth) else depth, window=edge))
         except InputError as error:
-            raise InputError(f"view '{name}': {error}") from None
+            raise error.inside(f"view '{name}'") from None
     return found if any(lens is not None and lens.wide for lens in found) else [None] * len(names)
 
 
@@ -343,11 +347,12 @@ def _plane(normal: Tensor, offset: Tensor, view: str) -> Plane | None:
         return None
     length = float(normal.norm())
     if not 0.99 < length < 1.01:
-        raise InputError(f"background_normal of view '{view}': expected a unit vector, got length {length:g}")
+        raise InputError(f"expected a unit vector, got length {length:g}", field=f"background_normal of view '{view}'")
     if not bool(offset.isfinite()):
         raise InputError(
-            f"background_offset of view '{view}': expected a finite number in mm beside background_normal, "
-            f"got {float(offset)}; give it, or leave out background_normal of a view without a background"
+            f"expected a finite number in mm beside background_normal, "
+            f"got {float(offset)}; give it, or leave out background_normal of a view without a background",
+            field=f"background_offset of view '{view}'",
         )
     return Plane(normal / length, float(offset) / length)
 
@@ -356,5 +361,5 @@ def _number(dataset: xr.Dataset, name: str, what: str, otherwise: float | None =
     value = dataset.attrs.get(name, otherwise)
     if not isinstance(value, int | float | np.number):
         got = "none" if value is None else repr(value)
-        raise InputError(f"attribute {name}: expected a number ({what}), got {got}")
+        raise InputError(f"expected a number ({what}), got {got}", field=f"attribute {name}")
     return float(value)

@@ -44,7 +44,7 @@ def require_zarr() -> None:
     try:
         import zarr  # noqa: F401
     except ImportError:
-        raise InputError(f"sequences: zarr is not installed; {install('sequence')}") from None
+        raise InputError(f"zarr is not installed; {install('sequence')}", field="sequences") from None
 
 
 MEASURED = ("a measurement over time", WRITTEN)
@@ -61,7 +61,7 @@ def check_store(path: Path, kind: tuple[str, str]) -> None:
     if not os.path.lexists(path):
         return
     what, mark = kind
-    other = InputError(f"{path}: exists already, is not {what}, and was left as it is; give another --out")
+    other = InputError(f"exists already, is not {what}, and was left as it is; give another --out", field=path)
     try:
         about = json.loads((path / "zarr.json").read_text())
         known = mark in about["attributes"] or (path / mark / "zarr.json").is_file()
@@ -73,7 +73,7 @@ def check_store(path: Path, kind: tuple[str, str]) -> None:
     strange = sorted({found.name for found in path.iterdir()} - parts)
     if strange:
         raise InputError(
-            f"{path}: not overwritten, since {', '.join(strange)} in it is no part of the store; move it elsewhere"
+            f"not overwritten, since {', '.join(strange)} in it is no part of the store; move it elsewhere", field=path
         )
 
 
@@ -127,18 +127,18 @@ class MeasurementSequence:
             found = dataset.attrs.get("Conventions")
             if not known_conventions(found):
                 raise InputError(
-                    f"{path}: attribute Conventions: expected '{PLAIN}' or '{CONVENTIONS}', got '{found}'"
+                    f"attribute Conventions: expected '{PLAIN}' or '{CONVENTIONS}', got '{found}'", field=path
                 )
             names = _measured(dataset) or ("displacement",)
             for name in names:
                 got = dataset[name].dims if name in dataset else "none"
                 if got[:1] != ("time",):
-                    raise InputError(f"{path}: variable '{name}': expected a leading dimension time, got {got}")
+                    raise InputError(f"variable '{name}': expected a leading dimension time, got {got}", field=path)
             count = dataset.sizes["time"]
             given = values(dataset["time"]).tolist() if "time" in dataset.coords else range(count)
         times = tuple(float(t) for t in given)
         if not times or not math.isfinite(sum(times)) or any(not b > a for a, b in pairwise(times)):
-            raise InputError(f"{path}: coordinate time: expected increasing instants in s, got {_short(times)}")
+            raise InputError(f"coordinate time: expected increasing instants in s, got {_short(times)}", field=path)
         return cls(path, times)
 
     def frame(self, index: int) -> Measurement:
@@ -153,7 +153,7 @@ class MeasurementSequence:
 
         with _opened(self.path) as dataset, reading(f"{self.path}, frame {index}: cannot be read; is it damaged?"):
             if WRITTEN in dataset and not bool(dataset[WRITTEN][index]):
-                raise InputError(f"{self.path}, frame {index}: nothing was measured then, or not to its end")
+                raise InputError("nothing was measured then, or not to its end", field=f"{self.path}, frame {index}")
             one = dataset.isel(time=index).load() if "time" in dataset.dims else dataset.load()
         try:
             known = variables()
@@ -163,7 +163,7 @@ class MeasurementSequence:
                 one = one.isel(view=seeing) if seeing.any() else one
             return Measurement.from_dataset(one.drop_vars(["time", WRITTEN], errors="ignore"))
         except InputError as error:
-            raise InputError(f"{self.path}, frame {index}: {error}") from None
+            raise error.inside(f"{self.path}, frame {index}") from None
 
     def fullest(self) -> Measurement:
         """Return the first frame with all the views and techniques of the store: its cameras and box are those of all.
@@ -211,9 +211,9 @@ class MeasurementSequence:
 
         path = Path(path)
         if any(not b > a for a, b in pairwise(times)) or not len(times):
-            raise InputError(f"times: expected increasing instants in s, got {_short(times)}")
+            raise InputError(f"expected increasing instants in s, got {_short(times)}", field="times")
         if path.exists() and not force:
-            raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
+            raise InputError("exists already and was left as it is; give another --out, or --force", field=path)
         check_store(path, MEASURED)
         dataset = like.to_dataset()
         # the static variables by xarray, those of each frame as empty arrays of one chunk a frame
@@ -247,12 +247,16 @@ class MeasurementSequence:
         names = [str(name) for name in group["view"][:]]
         for name in measurement.names:
             if name not in names:
-                raise InputError(f"{self.path}, frame {index}: expected views out of {', '.join(names)}, got '{name}'")
+                raise InputError(
+                    f"expected views out of {', '.join(names)}, got '{name}'", field=f"{self.path}, frame {index}"
+                )
         places = [names.index(name) for name in measurement.names]
         for name in map_names():
             if (name in dataset) != (name in group):
                 has = "with" if name in group else "without"
-                raise InputError(f"{self.path}, frame {index}: expected a measurement {has} '{name}' as the others")
+                raise InputError(
+                    f"expected a measurement {has} '{name}' as the others", field=f"{self.path}, frame {index}"
+                )
         if WRITTEN in group:
             group[WRITTEN][index] = 0
         for name in (name for name in reversed(map_names()) if name in dataset):
@@ -295,7 +299,7 @@ def _opened(path: Path) -> xr.Dataset:
 
     require_zarr()
     if not path.exists():
-        raise InputError(f"{path}: no such store; expected a measurement sequence (Zarr, {CONVENTIONS})")
+        raise InputError(f"no such store; expected a measurement sequence (Zarr, {CONVENTIONS})", field=path)
     with reading(f"{path}: not a readable Zarr store"):
         return xr.open_dataset(
             path, engine="zarr", chunks=None, consolidated=False, decode_times=False, zarr_format=ZARR_FORMAT

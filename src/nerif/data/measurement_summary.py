@@ -12,12 +12,12 @@ from nerif.plotting.notebook import PIXELS, number, panel, show_views
 __all__ = ["as_html", "summary"]
 
 
-def summary(measurement: Measurement, held_out: int = 0) -> list[tuple[str, str]]:
-    """Return what was measured as names and values with units; `held_out` of the views were not used."""
+def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]]:
+    """Return what was measured as names and values with units; `withheld` of the views were not used."""
     cameras = measurement.cameras
     sizes = sorted({c.image_size for c in cameras})
     inside = sum(height * width for height, width in (c.image_size for c in cameras))
-    held = f", of which {held_out} held out" if held_out else ""
+    held = f", of which {withheld} held out" if withheld else ""
     light = f" at {measurement.wavelength_nm:g} nm" if measurement.wavelength_nm else ""
     of_index = measurement.quantity == Deflection.quantity
     ambient = [("Ambient index", f"{measurement.n_ambient:.7g}{light}")] if of_index else []
@@ -41,7 +41,7 @@ def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str
     """How large values and noise of a technique are."""
     kind, usable = observation.technique, measurement.usable_for(observation)
     squares, noise, largest = 0.0, 0.0, 0.0
-    for i, mask in enumerate(usable):  # view by view: pictures may be large
+    for i, mask in enumerate(usable):  # view by view: images may be large
         values = observation.values[i][mask].double()
         if len(values):
             squares, largest = squares + float(values.square().sum()), max(largest, float(values.abs().max()))
@@ -58,11 +58,11 @@ def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str
 
 def as_html(measurement: Measurement) -> str:
     """Return what a notebook shows: the maps of the views by every technique, and the summary."""
-    shown = [(_picture(measurement, o), o.caption) for o in measurement.observations]
+    shown = [(_image(measurement, o), o.caption) for o in measurement.observations]
     return panel("Measurement", measurement.summary(), *shown)
 
 
-def _picture(measurement: Measurement, observation: Observation) -> str:
+def _image(measurement: Measurement, observation: Observation) -> str:
     """The maps of the views that measured something by a technique, coarsened."""
     usable, names, maps = measurement.usable_for(observation), [], []
     for i, camera in enumerate(measurement.cameras):

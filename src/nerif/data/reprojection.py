@@ -65,13 +65,13 @@ class Reprojection:
     ----------
     measurement : Measurement
     maps : (view, row, column, c) predicted, by the name of the technique; 0 where a ray misses the box
-    held_out : names of the views that the reconstruction has not seen
+    withheld : names of the views that the reconstruction has not seen
     accuracies : of what is predicted, of each technique; none where that is not known, as of a file
     """
 
     measurement: Measurement
     maps: Mapping[str, Float[Tensor, "view row column c"]]
-    held_out: tuple[str, ...] = ()
+    withheld: tuple[str, ...] = ()
     accuracies: tuple[Accuracy, ...] = ()
 
     @property
@@ -80,7 +80,7 @@ class Reprojection:
         return self.maps[self.measurement.observations[0].technique.name]
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a measurement file of what is predicted, with `measured` and `held_out` in it, atomically."""
+        """Write a measurement file of what is predicted, with `measured` and `withheld` in it, atomically."""
         import numpy as np
 
         measurement = self.measurement
@@ -91,12 +91,12 @@ class Reprojection:
             like = dataset[o.technique.measured]
             about = {"units": o.technique.unit, "long_name": f"measured {o.technique.measured}"}
             dataset[_measured(o.technique)] = (like.dims, o.values.float().numpy().reshape(like.shape), about)
-        held = np.array([name in self.held_out for name in self.measurement.names], dtype=np.int8)
+        held = np.array([name in self.withheld for name in self.measurement.names], dtype=np.int8)
         about = {"units": "1", "long_name": "1 where the reconstruction has not seen it"}
-        dataset["held_out"] = (("view",), held, about)
+        dataset["withheld"] = (("view",), held, about)
         for accuracy in self.accuracies:
             dataset.attrs["predicted_by"] = accuracy.how
-            if accuracy.technique.measured in dataset:  # a displacement may have been seen in pictures alone
+            if accuracy.technique.measured in dataset:  # a displacement may have been seen in images alone
                 dataset[accuracy.technique.measured].attrs["predicted_error"] = accuracy.error
             if accuracy.technique.in_pixels():
                 dataset.attrs["predicted_error_px"] = accuracy.error
@@ -117,17 +117,17 @@ class Reprojection:
         with opened(path, "a re-projection") as data:
             predicted = Measurement(**from_dataset(data))
             names = {o.technique.name: _measured(o.technique) for o in predicted.observations}
-            for name in (*names.values(), "held_out"):
+            for name in (*names.values(), "withheld"):
                 if name not in data:
-                    raise InputError(f"expected variables '{name}' and 'held_out', got a plain measurement")
+                    raise InputError(f"expected variables '{name}' and 'withheld', got a plain measurement")
             maps = {o.technique.name: o.values for o in predicted.observations}
             sigmas = {o.technique.name: o.sigma for o in predicted.observations}
             measured = {
                 kind: torch.from_numpy(np.asarray(data[name].values, dtype=np.float32)).reshape(maps[kind].shape)
                 for kind, name in names.items()
             }
-            held_out = tuple(n for n, held in zip(predicted.names, data["held_out"].values, strict=True) if held)
-        return cls(predicted.observed(measured, sigmas), maps, held_out)
+            withheld = tuple(n for n, held in zip(predicted.names, data["withheld"].values, strict=True) if held)
+        return cls(predicted.observed(measured, sigmas), maps, withheld)
 
 
 def _measured(kind: type[ForwardModel]) -> str:

@@ -76,8 +76,8 @@ class Volume:
     def __post_init__(self) -> None:
         if tuple(self.values.shape) != self.grid.shape:
             raise InputError(
-                f"volume '{self.quantity}': expected values of shape {self.grid.shape} (z, y, x), "
-                f"got {tuple(self.values.shape)}"
+                f"expected values of shape {self.grid.shape} (z, y, x), got {tuple(self.values.shape)}",
+                field=f"volume '{self.quantity}'",
             )
 
     @classmethod

@@ -43,7 +43,9 @@ def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     attributes: dict[str, float | str] = {}
     for v in volumes:
         if v.grid != grid:
-            raise InputError(f"volume '{v.quantity}': expected the grid of '{volumes[0].quantity}', got another")
+            raise InputError(
+                f"expected the grid of '{volumes[0].quantity}', got another", field=f"volume '{v.quantity}'"
+            )
         about = {"units": v.unit, "long_name": describe(v.quantity)[1], **_cf(v.quantity, volumes), **v.notes}
         data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), about)
         attributes |= v.attributes
@@ -85,18 +87,21 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
         quantity = known[0] if known else only
     if quantity is None or quantity not in arrays:
         raise InputError(
-            f"{path}: expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}"
+            f"expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}",
+            field=path,
         )
     volume = _volume(quantity, arrays[quantity], grid, attributes)
     index = quantity in ("index_excess", "n")
     if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
-        raise InputError(f"{path}: variable '{quantity}' holds NaN or infinite values; fill them first")
+        raise InputError(f"variable '{quantity}' holds NaN or infinite values; fill them first", field=path)
     if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
-        raise InputError(f"{path}: variable '{quantity}': expected refractive indices, got some beyond {LARGEST_INDEX}")
+        raise InputError(
+            f"variable '{quantity}': expected refractive indices, got some beyond {LARGEST_INDEX}", field=path
+        )
     try:
         n_ambient = volume.n_ambient
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise error.inside(path) from None
     if quantity == "n" and n_ambient is not None:
         return Volume((volume.values - n_ambient).float(), grid, "index_excess", "1", volume.attributes)
     return volume
@@ -117,13 +122,13 @@ def read_volumes(path: str | os.PathLike[str]) -> dict[str, Volume]:
 def _read(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
     """Arrays by name, and attributes: those of one quantity as density.assumption and the like."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a volume (.nc or .vti)")
+        raise InputError("no such file; expected a volume (.nc or .vti)", field=path)
     if path.suffix == ".nc":
         with opened(path, "a volume (.nc or .vti)") as dataset:
             return _contents(dataset)
     if path.suffix == ".vti":
         return read_vti(path)
-    raise InputError(f"{path}: expected a volume in .nc or .vti, got '{path.suffix or path.name}'")
+    raise InputError(f"expected a volume in .nc or .vti, got '{path.suffix or path.name}'", field=path)
 
 
 def _volume(quantity: str, values: Tensor, grid: Grid, attributes: dict[str, float | str]) -> Volume:
@@ -147,7 +152,7 @@ def _contents(dataset: xr.Dataset) -> tuple[dict[str, Tensor], Grid, dict[str, f
         if set(variable.dims) == {"z", "y", "x"}:
             expected = describe(name)[0]
             if name in QUANTITIES and unit is not None and not (isinstance(unit, str) and unit == expected):
-                raise InputError(f"variable '{name}': expected units '{expected}', got '{unit}'")
+                raise InputError(f"expected units '{expected}', got '{unit}'", field=f"variable '{name}'")
             numbers = values(variable.transpose("z", "y", "x"))
             kind = np.float32 if numbers.dtype.itemsize <= 4 else np.float64
             arrays[name] = torch.from_numpy(np.ascontiguousarray(numbers.astype(kind)))
@@ -166,10 +171,10 @@ def _ends(dataset: xr.Dataset, axis: str) -> tuple[float, float]:
     """Where the box begins and ends along an axis, mm, by the attributes where they fit, else by the voxel centres."""
     unit = dataset[axis].attrs.get("units", "mm")
     if not (isinstance(unit, str) and unit == "mm"):
-        raise InputError(f"coordinate '{axis}': expected units 'mm', got '{unit}'")
+        raise InputError(f"expected units 'mm', got '{unit}'", field=f"coordinate '{axis}'")
     centres = values(dataset[axis]).astype(np.float64)
     if not (np.abs(centres) <= LARGEST_LENGTH).all():
-        raise InputError(f"coordinate '{axis}': expected voxel centres in mm, got {centres.tolist()[:4]} ...")
+        raise InputError(f"expected voxel centres in mm, got {centres.tolist()[:4]} ...", field=f"coordinate '{axis}'")
     corners = [np.asarray(dataset.attrs.get(name)) for name in ("box_lower_mm", "box_upper_mm")]
     if len(centres) and all(c.shape == (3,) and c.dtype.kind in "fiu" for c in corners):
         lower, upper = (float(c["xyz".index(axis)]) for c in corners)

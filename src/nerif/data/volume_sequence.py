@@ -72,14 +72,15 @@ class VolumeSequence:
 
         self.path = Path(path)
         if not self.path.is_dir():
-            raise InputError(f"{path}: no such store; expected volumes over time (Zarr)")
+            raise InputError("no such store; expected volumes over time (Zarr)", field=path)
         with reading(f"{path}: expected volumes over time, written by nerif"):
             self.group: zarr.Group = zarr.open_group(self.path, mode="r+", zarr_format=ZARR_FORMAT)
             self.attributes: dict[str, Any] = dict(self.group.attrs)
         if missing := {"box_lower_mm", "box_upper_mm", "n_ambient"} - set(self.attributes):
             raise InputError(
-                f"{path}: expected volumes over time, written by nerif, got a store without {min(missing)}; "
-                "nerif sequence makes volumes of measurements"
+                f"expected volumes over time, written by nerif, got a store without {min(missing)}; "
+                "nerif sequence makes volumes of measurements",
+                field=path,
             )
         with reading(f"{path}: expected volumes over time, written by nerif"):
             z, y, x = (self.array(a).shape[0] for a in "zyx")
@@ -191,6 +192,6 @@ class VolumeSequence:
         import torch
 
         if quantity not in self.quantities:
-            raise InputError(f"{self.path}: expected one of {', '.join(self.quantities)}, got '{quantity}'")
+            raise InputError(f"expected one of {', '.join(self.quantities)}, got '{quantity}'", field=self.path)
         values = torch.from_numpy(self.read(quantity, index))
         return Volume.of(values, self.grid, quantity, self.n_ambient)

@@ -90,9 +90,9 @@ def read_vti(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], Grid, dic
     try:
         return _Image(content).read()
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise error.inside(path) from None
     except (ElementTree.ParseError, ArithmeticError, LookupError, ValueError, TypeError, zlib.error) as error:
-        raise InputError(f"{path}: not a VTK image file (.vti), or truncated ({error})") from None
+        raise InputError(f"not a VTK image file (.vti), or truncated ({error})", field=path) from None
 
 
 TYPES = {"Float32": "f4", "Float64": "f8", "String": "u1"}
@@ -141,7 +141,7 @@ class _Image:
                 values = np.frombuffer(self.data(element), kind).astype(kind.newbyteorder("="))
                 name = str(element.get("Name"))
                 if values.size != nx * ny * nz:
-                    raise InputError(f"array '{name}': expected {nx} x {ny} x {nz} numbers, got {values.size}")
+                    raise InputError(f"expected {nx} x {ny} x {nz} numbers, got {values.size}", field=f"array '{name}'")
                 if values.dtype.kind != "f":
                     values = values.astype(np.float64)
                 arrays[name] = torch.from_numpy(values.reshape(nz, ny, nx))
@@ -187,8 +187,10 @@ class _Image:
             return whole
         count, block, _ = words(3)
         header = words(3 + count)
-        packed = source[len(header) * size :] if raw else base64.b64decode(
-            source[-(-len(header) * size // 3) * 4 :][: -(-sum(header[3:]) // 3) * 4]
+        packed = (
+            source[len(header) * size :]
+            if raw
+            else base64.b64decode(source[-(-len(header) * size // 3) * 4 :][: -(-sum(header[3:]) // 3) * 4])
         )
         parts, at = [], 0
         for length in header[3:]:

@@ -35,11 +35,13 @@ class VoxelField(Field):
 
     def __init__(self, coefficients: Float[Tensor, "zp yp xp"], grid: Grid, degree: int) -> None:
         if degree not in DEGREES.values():
-            raise InputError(f"degree: expected one of {', '.join(map(str, DEGREES.values()))}, got {degree}")
+            raise InputError(f"expected one of {', '.join(map(str, DEGREES.values()))}, got {degree}", field="degree")
         self.grid, self.degree, self.layers = grid, degree, (degree + 1) // 2
         shape = tuple(n + 2 * self.layers for n in grid.shape)
         if tuple(coefficients.shape) != shape:
-            raise InputError(f"coefficients: expected the shape {shape} (z, y, x), got {tuple(coefficients.shape)}")
+            raise InputError(
+                f"expected the shape {shape} (z, y, x), got {tuple(coefficients.shape)}", field="coefficients"
+            )
         self.coefficients = coefficients
 
     @classmethod
@@ -51,7 +53,9 @@ class VoxelField(Field):
     def through(cls, values: Float[Tensor, "z y x"], grid: Grid) -> VoxelField:
         """Return the cubic spline that passes through `values` at the voxel centres, mirrored about the outermost."""
         if tuple(values.shape) != grid.shape:
-            raise InputError(f"volume: expected values of shape {grid.shape} (z, y, x), got {tuple(values.shape)}")
+            raise InputError(
+                f"expected values of shape {grid.shape} (z, y, x), got {tuple(values.shape)}", field="volume"
+            )
         coefficients = values.to(torch.float64)
         for axis in range(3):
             coefficients = _prefilter(coefficients, axis)
@@ -116,7 +120,9 @@ class Boundary:
     ) -> Float[Tensor, "zp yp xp"]:
         """Return the values with `layers` more beyond each face, or those across some of the axes z, y, x."""
         if min(values.shape[axis] for axis in axes) < layers:
-            raise InputError(f"grid: expected at least {layers} voxels along each edge, got {tuple(values.shape)}")
+            raise InputError(
+                f"expected at least {layers} voxels along each edge, got {tuple(values.shape)}", field="grid"
+            )
         for axis in axes:
             first, last = values.narrow(axis, 0, layers), values.narrow(axis, values.shape[axis] - layers, layers)
             if self.around and axis == 1:

@@ -36,6 +36,7 @@ __all__ = [
     "wave_vectors",
 ]
 
+
 def _unit(count: int) -> list[tuple[float, ...]]:
     """Directions, up to their sign, with so many components other than 0, all equal in size."""
     found = [v for v in itertools.product((1, 0, -1), repeat=3) if sum(map(abs, v)) == count]
@@ -50,7 +51,7 @@ DIRECTIONS = {3: AXES, 9: [*AXES, *_unit(2)], 13: [*AXES, *_unit(2), *_unit(3)]}
 def check_directions(count: int) -> None:
     """Raise InputError unless there are DIRECTIONS of that number."""
     if count not in DIRECTIONS:
-        raise InputError(f"directions: expected one of {', '.join(map(str, DIRECTIONS))}, got {count}")
+        raise InputError(f"expected one of {', '.join(map(str, DIRECTIONS))}, got {count}", field="directions")
 
 
 def wave_vectors(octaves: int, directions: int) -> tuple[Float[Tensor, "w 3"], Int[Tensor, " w"]]:
@@ -169,10 +170,10 @@ class NetworkShape:
 
     def __post_init__(self) -> None:
         if self.activation not in ACTIVATIONS:
-            raise InputError(f"activation: expected one of {', '.join(ACTIVATIONS)}, got '{self.activation}'")
+            raise InputError(f"expected one of {', '.join(ACTIVATIONS)}, got '{self.activation}'", field="activation")
         for name, least in (("depth", 1), ("width", 1), ("octaves", 0), ("skip", 0), ("head_width", 0)):
             if getattr(self, name) < least:
-                raise InputError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+                raise InputError(f"expected at least {least}, got {getattr(self, name)}", field=name)
         check_directions(self.directions)
 
     def without_waves_below(self, length: float) -> NetworkShape:
@@ -321,7 +322,9 @@ class Network(nn.Module):
 
     def _gradient_heads(self, p: Tensor, h: Tensor) -> Tensor:
         if not self.shape.gradient_head:
-            raise InputError("gradient_head: this network was made without gradient heads, so they cannot be asked")
+            raise InputError(
+                "this network was made without gradient heads, so they cannot be asked", field="gradient_head"
+            )
         activate = ACTIVATIONS[self.shape.activation]
         return torch.stack([self._head(i, h, activate)[0] for i in (1, 2, 3)], dim=1)
 

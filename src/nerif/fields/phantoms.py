@@ -209,6 +209,7 @@ def make_phantom(name: str, box: Box, seed: int = 0, time: float = 0.0) -> Field
     if name in AXISYMMETRIC:
         return AXISYMMETRIC[name](box)
     raise InputError(
-        f"phantom: expected gaussians, flame, octahedron, turbulence, fire, {', '.join(AXISYMMETRIC)}, "
-        f"1-7 (the paper's) or a .nc or .vti volume, got '{name}'"
+        f"expected gaussians, flame, octahedron, turbulence, fire, {', '.join(AXISYMMETRIC)}, "
+        f"1-7 (the paper's) or a .nc or .vti volume, got '{name}'",
+        field="phantom",
     )

@@ -35,7 +35,7 @@ class SymmetricNetwork(Network):
         self.layered = symmetry.angles == 1  # type: ignore[misc]
         if not self.layered:
             if shape.gradient_head:
-                raise InputError("gradient_head: expected none with harmonics of the angle (--symmetry axis+N)")
+                raise InputError("expected none with harmonics of the angle (--symmetry axis+N)", field="gradient_head")
             output = self.outputs[0]
             assert isinstance(output, nn.Linear)
             self.outputs[0] = nn.Linear(output.in_features, symmetry.angles)
@@ -88,7 +88,7 @@ class SymmetricVoxels(Field):
 
     def __init__(self, parts: Sequence[VoxelField], symmetry: Symmetry) -> None:
         if len(parts) != symmetry.angles:
-            raise InputError(f"parts: expected {symmetry.angles} of the symmetry, got {len(parts)}")
+            raise InputError(f"expected {symmetry.angles} of the symmetry, got {len(parts)}", field="parts")
         self.parts, self.symmetry = tuple(parts), symmetry
 
     @classmethod

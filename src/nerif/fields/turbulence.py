@@ -38,7 +38,7 @@ def inertial_scalar(
         If the range of wavelengths is empty.
     """
     if not 0 < shortest < longest:
-        raise InputError(f"shortest: expected a share of the edge between 0 and {longest}, got {shortest}")
+        raise InputError(f"expected a share of the edge between 0 and {longest}, got {shortest}", field="shortest")
     edge = min(box.edges)
     shape = [math.ceil(2 * length / (shortest * edge)) for length in reversed(box.edges)]  # z, y, x
     generator = torch.Generator().manual_seed(seed)

@@ -27,7 +27,7 @@ from nerif.geometry import Rays
 __all__ = ["Absorption", "Intensity", "absorbance"]
 
 TOLERATED = 0.01  # share of pixels with what cannot be
-LEAST = -0.25  # absorbance by which light that varies from picture to picture leads below 0
+LEAST = -0.25  # absorbance by which light that varies from image to image leads below 0
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Absorption(LineIntegral):
     tomography = "absorption tomography"
     measured, sigma = "absorbance", "absorbance_sigma"
     quantity = "extinction"
-    misscaled = "another reference picture, or another wavelength"
+    misscaled = "another reference image, or another wavelength"
     additive = True
     bounds = (0.0, math.inf)
 
@@ -60,8 +60,9 @@ class Absorption(LineIntegral):
         share = share_below(LEAST, values, sigma, usable)
         if share > TOLERATED:
             raise InputError(
-                f"absorbance: expected -ln(I / I0) of 0 or more, as I is at most I0; {share:.0%} of the pixels are "
-                f"far below (to {float(values[usable].min()):.3g}): subtract the offset of pixels beside the medium"
+                f"expected -ln(I / I0) of 0 or more, as I is at most I0; {share:.0%} of the pixels are "
+                f"far below (to {float(values[usable].min()):.3g}): subtract the offset of pixels beside the medium",
+                field="absorbance",
             )
 
     @classmethod
@@ -70,7 +71,7 @@ class Absorption(LineIntegral):
     ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
         """Return absorbances of so many quanta a pixel without the medium; the reference has no noise."""
         passed = torch.poisson(counts * torch.exp(-values.nan_to_num()), generator)
-        found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_pictures=math.inf)
+        found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_images=math.inf)
         seen = torch.where(values.isnan(), values, torch.from_numpy(found).to(values))
         return seen, torch.from_numpy(sigma).to(values)
 
@@ -118,9 +119,9 @@ def absorbance(
     dark: Float[np.ndarray, "*n"] | float = 0.0,
     electrons_per_count: float = 1.0,
     read_noise: float = 0.0,
-    reference_pictures: float = 1.0,
+    reference_images: float = 1.0,
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Return absorbance and its standard deviation from pictures with and without the medium.
+    """Return absorbance and its standard deviation from images with and without the medium.
 
         A = -ln((I - D) / (I0 - D)),    sigma^2 = var(I) / (I - D)^2 + var(I0) / (I0 - D)^2 / N,
         var(I) = (I - D) / g + r^2
@@ -134,32 +135,33 @@ def absorbance(
     dark : D, counts without light
     electrons_per_count : g, the detected quanta that one count stands for
     read_noise : r, standard deviation, counts
-    reference_pictures : N, pictures that the reference is the mean of
+    reference_images : N, images that the reference is the mean of
 
     Raises
     ------
     InputError
         If shapes disagree, intensities are negative, or I exceeds I0, by more than their noise.
     """
-    for name, picture in (("reference", reference), ("dark", np.asarray(dark))):
-        if picture.shape != intensity.shape and (name, picture.shape) != ("dark", ()):
-            raise InputError(f"{name}: expected pictures of shape {intensity.shape}, got {picture.shape}")
+    for name, image in (("reference", reference), ("dark", np.asarray(dark))):
+        if image.shape != intensity.shape and (name, image.shape) != ("dark", ()):
+            raise InputError(f"expected images of shape {intensity.shape}, got {image.shape}", field=name)
     if not (electrons_per_count > 0 and read_noise >= 0):
-        raise InputError("electrons_per_count, read_noise: expected above 0 and 0 or more")
+        raise InputError("expected above 0 and 0 or more", field="electrons_per_count, read_noise")
     passed, whole = (np.asarray(x, dtype=np.float64) - dark for x in (intensity, reference))
     quantum = 1 / electrons_per_count
     one, many = (np.maximum(x, quantum) * quantum + read_noise**2 for x in (passed, whole))
-    noise = [one, many / reference_pictures]
+    noise = [one, many / reference_images]
     for name, x, variance in (("intensity", passed, noise[0]), ("reference", whole, noise[1])):
         negative = float(np.mean(x < -IMPOSSIBLE * np.sqrt(variance)))
         if negative > TOLERATED:
             where = f"{negative:.0%} of the pixels"
-            raise InputError(f"{name}: expected counts of 0 or more, got negative ones at {where}; is dark right?")
+            raise InputError(f"expected counts of 0 or more, got negative ones at {where}; is dark right?", field=name)
     brighter = float(np.mean(passed - whole > IMPOSSIBLE * np.sqrt(noise[0] + noise[1])))
     if brighter > TOLERATED:
         raise InputError(
-            f"intensity: expected at most the reference I0, got more at {brighter:.0%} of the pixels; "
-            "are the two exchanged, or did the light change? Scale them by pixels beside the medium"
+            f"expected at most the reference I0, got more at {brighter:.0%} of the pixels; "
+            "are the two exchanged, or did the light change? Scale them by pixels beside the medium",
+            field="intensity",
         )
     passed, whole = np.maximum(passed, 0.5 * quantum), np.where(whole > 0, whole, np.nan)
     return -np.log(passed / whole), np.sqrt(noise[0] / passed**2 + noise[1] / whole**2)

@@ -143,7 +143,7 @@ class ForwardModel(ABC):
     windowed: ClassVar[bool] = False
     """Whether a pixel may have measured the mean over a window of pixels."""
     derived: ClassVar[str] = ""
-    """Technique whose values are found in these, such as displacements in pictures, by a window's reach of them."""
+    """Technique whose values are found in these, such as displacements in images, by a window's reach of them."""
     guess: ClassVar[str] = ""
     """Map that holds what those values are about."""
     outlier: ClassVar[float] = math.inf
@@ -164,7 +164,7 @@ class ForwardModel(ABC):
 
     @classmethod
     def in_pixels(cls) -> bool:
-        """Return whether values are lengths in the picture, which shrink with it."""
+        """Return whether values are lengths in the image, which shrink with it."""
         return cls.unit == "px"
 
     @property
@@ -235,7 +235,7 @@ class ForwardModel(ABC):
         InputError
             If the noise of the technique is not that of quanta.
         """
-        raise InputError(f"counts: expected a technique that counts quanta, got {cls.name}; give --noise")
+        raise InputError(f"expected a technique that counts quanta, got {cls.name}; give --noise", field="counts")
 
     def reading(
         self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None, rays: Rays
@@ -260,7 +260,7 @@ class ForwardModel(ABC):
         inverse_sigma: Float[Tensor, "n c"],
         rays: Rays,
     ) -> None:
-        """Fit what is open beside the field, such as the brightness of pictures, to the integral that is predicted."""
+        """Fit what is open beside the field, such as the brightness of images, to the integral that is predicted."""
         return
 
     @property
@@ -284,9 +284,7 @@ class ForwardModel(ABC):
         return dict(maps)
 
     @classmethod
-    def softened(
-        cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float
-    ) -> dict[str, Tensor]:
+    def softened(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
         """Return maps blurred by a Gaussian of that standard deviation; as they are, where that makes them no easier.
 
         Parameters

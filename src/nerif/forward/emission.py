@@ -1,6 +1,6 @@
 """Emission: light that a medium gives off, such as chemiluminescence, radiance per length e.
 
-    L = integral e ds,       optically thin: the medium does not absorb its own light
+L = integral e ds,       optically thin: the medium does not absorb its own light
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nerif.forward.line_integral import LineIntegral, share_below
 
 __all__ = ["Emission"]
 
-NEGATIVE = 0.05  # of the largest radiance, by which a dark picture may be a little off
+NEGATIVE = 0.05  # of the largest radiance, by which a dark image may be a little off
 TOLERATED = 0.01  # share of such pixels
 
 
@@ -63,6 +63,7 @@ class Emission(LineIntegral):
         share = share_below(-NEGATIVE * largest, values, sigma, usable)
         if share > TOLERATED:
             raise InputError(
-                f"radiance: expected 0 or more, got less at {share:.0%} of the pixels; "
-                "is the dark picture that was subtracted the right one?"
+                f"expected 0 or more, got less at {share:.0%} of the pixels; "
+                "is the dark image that was subtracted the right one?",
+                field="radiance",
             )

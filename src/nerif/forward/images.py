@@ -30,7 +30,7 @@ from nerif.forward.base import ForwardModel, Light, Weights
 from nerif.forward.deflection import LeverArm
 from nerif.geometry import Rays
 
-__all__ = ["LEAST", "LinearPictures", "Pictures", "References", "around", "difference_variance", "grey_variance"]
+__all__ = ["LEAST", "Images", "LinearImages", "References", "around", "difference_variance", "grey_variance"]
 
 DEGREE = 4
 """Of the polynomials of gain and offset, in total."""
@@ -41,26 +41,26 @@ PAD = 2  # rows and columns that the spline takes beyond the edges, mirrored
 
 
 class References:
-    """The pictures without flow of all views.
+    """The images without flow of all views.
 
     Parameters
     ----------
-    pictures : (view, row, column) grey values; NaN where not seen
-    sizes : (height, width) of each view's picture, px; what is beyond is padding
+    images : (view, row, column) grey values; NaN where not seen
+    sizes : (height, width) of each view's image, px; what is beyond is padding
     """
 
-    def __init__(self, pictures: Float[Tensor, "view row column"], sizes: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, images: Float[Tensor, "view row column"], sizes: Sequence[tuple[int, int]]) -> None:
         from scipy.ndimage import spline_filter
 
-        views, height, width = pictures.shape
+        views, height, width = images.shape
         self.width = width + 2 * PAD
         self.area = (height + 2 * PAD) * self.width
         coefficients = torch.zeros(views, height + 2 * PAD, self.width)
         self.good = torch.zeros(views, height, width, dtype=torch.bool)
         for i, (h, w) in enumerate(sizes):
-            picture = pictures[i, :h, :w].double()
-            self.good[i, :h, :w] = good = picture.isfinite()
-            filled = torch.where(good, picture, picture[good].mean() if bool(good.any()) else 0.0)
+            image = images[i, :h, :w].double()
+            self.good[i, :h, :w] = good = image.isfinite()
+            filled = torch.where(good, image, image[good].mean() if bool(good.any()) else 0.0)
             own = spline_filter(filled.numpy(), order=3, mode="mirror")
             padded = np.pad(own, PAD, mode="reflect")  # PyTorch's takes no more rows than there are
             coefficients[i, : h + 2 * PAD, : w + 2 * PAD] = torch.from_numpy(padded).float()
@@ -72,7 +72,7 @@ class References:
         self.brightness[:, 0, 0] = 1
 
     def to(self, device: torch.device) -> None:
-        """Move the pictures to a device."""
+        """Move the images to a device."""
         for name in ("coefficients", "good", "sizes", "brightness"):
             setattr(self, name, getattr(self, name).to(device))
 
@@ -99,7 +99,7 @@ class References:
         return torch.stack(self._sum(view, place, True), dim=-1)
 
     def known(self, view: Int[Tensor, " n"], place: Float[Tensor, "n 2"]) -> Bool[Tensor, " n"]:
-        """Return where places are within a picture that was seen there."""
+        """Return where places are within an image that was seen there."""
         self._follow(place)
         last = self.sizes[view.long()].flip(-1) - 1
         inside = ((place >= 0) & (place <= last)).all(dim=-1)
@@ -122,7 +122,7 @@ class References:
         flow: Float[Tensor, " n"],
         inverse_sigma: Float[Tensor, " n"],
     ) -> None:
-        """Fit gain and offset of every view that has pixels to the flow picture, given the displacement there.
+        """Fit gain and offset of every view that has pixels to the flow image, given the displacement there.
 
             min over a, b of sum w^2 (flow - sum_k (a_k P_k reference(p - d) + b_k P_k))^2,     P_k Legendre's
 
@@ -154,7 +154,7 @@ class References:
             self.brightness[i] = torch.stack([gain / scale.float(), offset])
 
     def match(self, flow: Float[Tensor, "view row column"]) -> None:
-        """Set gain and offset of every view so that mean and spread of the reference are those of the flow picture."""
+        """Set gain and offset of every view so that mean and spread of the reference are those of the flow image."""
         for i, (h, w) in enumerate(self.sizes.tolist()):
             column, row = torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy")
             place = torch.stack([column, row], dim=-1).reshape(-1, 2).float()
@@ -189,7 +189,7 @@ class References:
         return [torch.einsum("nij,ni,nj->n", taken, rows, columns) for rows, columns in pairs]
 
     def _terms(self, view: Int[Tensor, " n"], pixel: Float[Tensor, "n 2"]) -> Float[Tensor, "n k"]:
-        """Products of Legendre polynomials, the picture mapped to [-1, 1]."""
+        """Products of Legendre polynomials, the image mapped to [-1, 1]."""
         half = (self.sizes[view.long()].flip(-1).to(pixel) - 1).clamp(min=1) / 2
         x, y = (_legendre(column) for column in (pixel / half - 1).unbind(-1))
         return torch.stack([x[i] * y[j] for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], dim=-1)
@@ -224,12 +224,12 @@ AROUND = 4.0  # px, standard deviation of the window of means
 
 FEWEST = 256  # pixels that show whether there is a pattern
 PATCHES, LARGEST_PATCH = 64, 4
-"""Patches that a picture keeps along its shorter side, and their largest edge, px: a displacement for each."""
+"""Patches that an image keeps along its shorter side, and their largest edge, px: a displacement for each."""
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures(LeverArm):
-    """Grey values of the flow picture, by the reference picture moved.
+class Images(LeverArm):
+    """Grey values of the flow image, by the reference image moved.
 
     Parameters
     ----------
@@ -238,8 +238,8 @@ class Pictures(LeverArm):
     sizes : (height, width) of each view, px
     """
 
-    name = "pictures"
-    measured, sigma = "flow", "picture_sigma"
+    name = "images"
+    measured, sigma = "flow", "image_sigma"
     beside = MappingProxyType({"reference": (1, "grey value"), GUESS: (2, "px")})
     channels = ("",)
     integrals = 2
@@ -262,8 +262,9 @@ class Pictures(LeverArm):
         reference, flow = light.maps.get("reference"), light.maps.get(cls.measured)
         if reference is None or flow is None:
             raise InputError(
-                "reference: expected pictures without flow (variable reference) beside those with it (flow), got none; "
-                "nerif displacement writes both"
+                "expected images without flow (variable reference) beside those with it (flow), got none; "
+                "nerif displacement writes both",
+                field="reference",
             )
         return cls(light.n_ambient, light.maps, tuple(camera.image_size for camera in light.cameras))
 
@@ -275,11 +276,11 @@ class Pictures(LeverArm):
         usable: Bool[Tensor, "row column"],
     ) -> None:
         if int(usable.sum()) >= FEWEST and not float(values[usable].std(correction=0)) > 0:
-            raise InputError("flow: expected a picture of a pattern, got one of a single grey")
+            raise InputError("expected an image of a pattern, got one of a single grey", field="flow")
 
     @cached_property
     def references(self) -> References:
-        """The reference pictures, as bright as the flow pictures."""
+        """The reference images, as bright as the flow images."""
         found = References(self.maps["reference"], self.sizes)
         found.match(self.maps["flow"])
         if GUESS in self.maps:
@@ -306,7 +307,7 @@ class Pictures(LeverArm):
 
     @property
     def linear_twin(self) -> ForwardModel:
-        return LinearPictures(self.n_ambient, self.maps, self.sizes)
+        return LinearImages(self.n_ambient, self.maps, self.sizes)
 
     def read(self, prediction: Float[Tensor, "n k"], rays: Rays) -> Float[Tensor, "n c"]:
         return self.references.seen(rays.view, rays.pixel, prediction)[:, None]
@@ -342,7 +343,7 @@ class Pictures(LeverArm):
 
     @classmethod
     def completed(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return the maps, with picture_sigma by the noise of the cameras where a file tells that instead.
+        """Return the maps, with image_sigma by the noise of the cameras where a file tells that instead.
 
         That of `difference_variance`, read = read_noise^2 and shot = 1 / electrons_per_grey_value, by one reference.
         """
@@ -354,7 +355,9 @@ class Pictures(LeverArm):
             value = np.asarray(attributes.get(name, default))
             good = value.dtype.kind in "fiu" and value.shape in ((), (1,), (views,))
             if not good or not bool(np.all(value > 0 if name == names[1] else value >= 0)):
-                raise InputError(f"attribute {name}: expected a number, or one for each of {views} views, got {value}")
+                raise InputError(
+                    f"expected a number, or one for each of {views} views, got {value}", field=f"attribute {name}"
+                )
             of_view.append(np.broadcast_to(value.astype(np.float64), (views,)))
         sigma = torch.full_like(maps[cls.measured], math.nan)
         for i, (flow, reference) in enumerate(zip(maps[cls.measured], maps["reference"], strict=True)):
@@ -364,15 +367,13 @@ class Pictures(LeverArm):
         return {**maps, cls.sigma: sigma}
 
     @classmethod
-    def softened(
-        cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float
-    ) -> dict[str, Tensor]:
+    def softened(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
         from scipy.ndimage import gaussian_filter
 
-        def blurred(picture: Float[Tensor, "row column"], squares: bool) -> Tensor:
-            good = picture.isfinite()
+        def blurred(image: Float[Tensor, "row column"], squares: bool) -> Tensor:
+            good = image.isfinite()
             weight = torch.from_numpy(gaussian_filter(good.double().numpy(), px)).clamp(min=1e-6)
-            filled = torch.where(good, picture, 0.0).double()
+            filled = torch.where(good, image, 0.0).double()
             filled = filled.square() if squares else filled
             mean = torch.from_numpy(gaussian_filter(filled.numpy(), px)) / weight
             # so many pixels have that much less of the noise
@@ -392,7 +393,7 @@ class Pictures(LeverArm):
         _ = self.references
 
     def mapped(self, integral: Float[Tensor, "row column k"], view: int) -> Float[Tensor, "row column c"]:
-        """Return the flow picture that displacements make, gain and offset fitted to the one that was taken."""
+        """Return the flow image that displacements make, gain and offset fitted to the one that was taken."""
         height, width, _ = integral.shape
         row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         pixel = torch.stack([column, row], dim=-1).reshape(-1, 2).float()
@@ -412,7 +413,7 @@ class Pictures(LeverArm):
         return self.integral.field_scale(rays, torch.full((len(rays), 2), self._displaced()))
 
     def _displaced(self) -> float:
-        """The rms displacement, px: as guessed, else by the difference of the pictures over their gradient."""
+        """The rms displacement, px: as guessed, else by the difference of the images over their gradient."""
         if GUESS in self.maps:
             d = self.maps[GUESS]
             return float(d[d.isfinite().all(dim=-1)].square().mean().sqrt())
@@ -428,7 +429,7 @@ class Pictures(LeverArm):
 
 
 @dataclass(frozen=True, eq=False)
-class LinearPictures(Pictures):
+class LinearImages(Images):
     """The same, linear around the displacement that is guessed, or around none."""
 
     linear = True
@@ -509,8 +510,8 @@ def difference_variance(
     ----------
     flow, reference : grey values; NaN where not known
     read, shot : variance without light, grey values squared, and what a grey value adds, grey values
-    gain : factor that makes the reference as bright as the flow picture
-    repeats : pictures that the reference is the mean of
+    gain : factor that makes the reference as bright as the flow image
+    repeats : images that the reference is the mean of
     """
     return around(grey_variance(flow, read, shot) + gain**2 * grey_variance(reference, read, shot) / repeats)
 
@@ -527,7 +528,7 @@ def around(squares: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row c
 
 
 def _gain(flow: Float[np.ndarray, "row column"], reference: Float[np.ndarray, "row column"]) -> float:
-    """How much more contrast the flow picture has than the reference; 1 where that cannot be told."""
+    """How much more contrast the flow image has than the reference; 1 where that cannot be told."""
     both = np.isfinite(flow) & np.isfinite(reference)
     spread = float(reference[both].std()) if bool(both.any()) else 0.0
     return float(flow[both].std()) / spread if spread > 0 else 1.0

@@ -1,6 +1,6 @@
 """Interferometry: the phase, in fringes, by which light through the flow lags behind light through the ambient.
 
-    y = (1 / wavelength) integral (n - n_ambient) ds
+y = (1 / wavelength) integral (n - n_ambient) ds
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MM_PER_NM = 1e-6
 WITHIN = (0.8, 1.01)  # fringes from the least to the largest of a wrapped phase
 JUMP, LARGEST_JUMP, NOISE = 0.6, 0.8, 5.0  # fringes between neighbours; where there is noise, so many of its deviations
 ENOUGH = 100_000  # pixels to tell the noise from
-TOLERATED = 0.1  # jumps, times the shorter side of the picture: fewer than the outline of a small spot
+TOLERATED = 0.1  # jumps, times the shorter side of the image: fewer than the outline of a small spot
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Interferometry(LineIntegral):
     @classmethod
     def of(cls, light: Light, model: str) -> ForwardModel:
         if light.wavelength_nm is None:
-            raise InputError("wavelength_nm: expected the wavelength of the interferometer in nm, got none")
+            raise InputError("expected the wavelength of the interferometer in nm, got none", field="wavelength_nm")
         return cls(light.wavelength_nm)
 
     @property
@@ -66,8 +66,9 @@ class Interferometry(LineIntegral):
         ):
             if _wrapped(values / fringe):
                 raise InputError(
-                    f"fringes: expected an unwrapped phase in fringes, got one in {unit} that jumps by a whole fringe "
-                    f"between neighbours and stays within one; unwrap it ({remedy})"
+                    f"expected an unwrapped phase in fringes, got one in {unit} that jumps by a whole fringe "
+                    f"between neighbours and stays within one; unwrap it ({remedy})",
+                    field="fringes",
                 )
 
 

@@ -1,6 +1,6 @@
 """The straight-ray integral shared by absorption, emission and interferometry.
 
-    y = weight integral f ds
+y = weight integral f ds
 """
 
 from __future__ import annotations

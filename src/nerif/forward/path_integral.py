@@ -49,7 +49,7 @@ class PathIntegral(Projector):
 
     def __post_init__(self) -> None:
         if self.samples < 1:
-            raise InputError(f"samples: expected at least one sample along a ray, got {self.samples}")
+            raise InputError(f"expected at least one sample along a ray, got {self.samples}", field="samples")
 
     @property
     def channels(self) -> int:  # type: ignore[override]

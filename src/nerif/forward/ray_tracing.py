@@ -89,7 +89,7 @@ class CurvedRays(Projector):
 
     def __post_init__(self) -> None:
         if self.steps < 1:
-            raise InputError(f"steps: expected at least one step through the box, got {self.steps}")
+            raise InputError(f"expected at least one step through the box, got {self.steps}", field="steps")
 
     def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n 2"]:
         if rays.lens is not None:

@@ -10,7 +10,7 @@ from nerif.forward.absorption import Absorption
 from nerif.forward.base import ForwardModel, Light
 from nerif.forward.deflection import Deflection
 from nerif.forward.emission import Emission
-from nerif.forward.images import Pictures
+from nerif.forward.images import Images
 from nerif.forward.interferometry import Interferometry
 
 __all__ = [
@@ -19,7 +19,7 @@ __all__ = [
 ]  # fmt: skip
 
 TECHNIQUES: dict[str, type[ForwardModel]] = {
-    c.name: c for c in (Deflection, Pictures, Absorption, Emission, Interferometry)
+    c.name: c for c in (Deflection, Images, Absorption, Emission, Interferometry)
 }
 """By the name that files have for them; a technique of your own is one entry more."""
 
@@ -29,7 +29,7 @@ ASSUMED = Deflection
 AUTO = "auto"
 MODELS: dict[str, tuple[str, ...]] = {
     Deflection.name: tuple(deflection.MODELS),
-    Pictures.name: ("lever_arm",),
+    Images.name: ("lever_arm",),
     Absorption.name: tuple(absorption.MODELS),
 }
 """Names of the models of those techniques that have several, the default first."""
@@ -44,15 +44,17 @@ def technique(name: str) -> type[ForwardModel]:
         If there is none of that name.
     """
     if name not in TECHNIQUES:
-        raise InputError(f"technique: expected one of {', '.join(TECHNIQUES)}, got '{name}'")
+        raise InputError(f"expected one of {', '.join(TECHNIQUES)}, got '{name}'", field="technique")
     return TECHNIQUES[name]
 
 
 def check_simulated(kinds: Sequence[type[ForwardModel]]) -> None:
-    """Refuse techniques whose maps need more than field and cameras, such as pictures of a pattern."""
+    """Refuse techniques whose maps need more than field and cameras, such as images of a pattern."""
     for kind in kinds:
         if kind.derived:
-            raise InputError(f"technique: {kind.name} show a pattern, and are made by nerif render; got '{kind.name}'")
+            raise InputError(
+                f"{kind.name} show a pattern, and are made by nerif render; got '{kind.name}'", field="technique"
+            )
 
 
 def technique_of(quantity: str) -> type[ForwardModel]:
@@ -64,7 +66,7 @@ def check_model(model: str) -> None:
     """Refuse a name that no technique has a model of."""
     known = (AUTO, *(name for names in MODELS.values() for name in names))
     if model not in known:
-        raise InputError(f"model: expected one of {', '.join(known)}, got '{model}'")
+        raise InputError(f"expected one of {', '.join(known)}, got '{model}'", field="model")
 
 
 def model_of(kind: type[ForwardModel], name: str) -> str:
@@ -100,11 +102,13 @@ def forward_models(
     if model != AUTO and model not in offered:
         names = " and ".join(kind.name for kind in kinds)
         instead = "; give --from displacements" if any(kind.derived for kind in kinds) else ""
-        raise InputError(f"model: expected one of {', '.join((AUTO, *offered))} for {names}, got '{model}'{instead}")
+        raise InputError(
+            f"expected one of {', '.join((AUTO, *offered))} for {names}, got '{model}'{instead}", field="model"
+        )
     models = tuple(forward_model(kind, light, model) for kind in kinds)
     if not linear:
         return models
     for kind, found in zip(kinds, models, strict=True):
         if not found.linear and model in MODELS.get(kind.name, ()):
-            raise InputError(f"model: expected a linear one, got '{model}', which only --method nerif can fit")
+            raise InputError(f"expected a linear one, got '{model}', which only --method nerif can fit", field="model")
     return tuple(found.linear_twin for found in models)

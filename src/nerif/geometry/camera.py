@@ -124,7 +124,7 @@ class Projection(ABC):
     begin: ClassVar[float]
     """Path length before which there is no ray, mm."""
     shows_depth: ClassVar[bool]
-    """Whether a picture changes with the depth of what it shows."""
+    """Whether an image changes with the depth of what it shows."""
     scale: ClassVar[str]
     """What fx and fy of K are called."""
     unit: ClassVar[str]
@@ -239,12 +239,12 @@ def projection_named(name: object, what: str = "projection") -> Projection:
         If there is none of that name.
     """
     if not isinstance(name, str) or name not in PROJECTIONS:
-        raise InputError(f"{what}: expected one of {', '.join(PROJECTIONS)}, got {name!r}")
+        raise InputError(f"expected one of {', '.join(PROJECTIONS)}, got {name!r}", field=what)
     return PROJECTIONS[name]
 
 
 LARGEST_IMAGE = 100_000  # px
-EVENLY = 33  # pixels along either edge that stand for a picture
+EVENLY = 33  # pixels along either edge that stand for an image
 
 
 @dataclass(frozen=True)
@@ -312,36 +312,38 @@ class Camera:
                 )
         if plane is not None and not abs(float(plane.normal.norm()) - 1) < 1e-2:
             raise InputError(
-                f"background_normal of view '{self.name}': expected a unit vector, got {plane.normal.tolist()}"
+                f"expected a unit vector, got {plane.normal.tolist()}", field=f"background_normal of view '{self.name}'"
             )
         r = self.rotation
         error = float((r @ r.T - torch.eye(3, dtype=r.dtype)).abs().max())
         determinant = float(torch.linalg.det(r))
         if not (error < 1e-4 and determinant > 0):
             raise InputError(
-                f"rotation of view '{self.name}': expected a rotation matrix (R R^T = 1, det = +1), "
-                f"got |R R^T - 1| = {error:.2g}, det = {determinant:.3g}; check for a swapped or mirrored axis"
+                f"expected a rotation matrix (R R^T = 1, det = +1), "
+                f"got |R R^T - 1| = {error:.2g}, det = {determinant:.3g}; check for a swapped or mirrored axis",
+                field=f"rotation of view '{self.name}'",
             )
         k = self.intrinsics
         if not min(float(k[0, 0]), float(k[1, 1])) >= self.projection.least_scale:
             raise InputError(
-                f"intrinsics of view '{self.name}': expected positive {self.projection.scale}s in "
-                f"{self.projection.unit}, got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}"
+                f"expected positive {self.projection.scale}s in "
+                f"{self.projection.unit}, got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}",
+                field=f"intrinsics of view '{self.name}'",
             )
         if abs(float(k[2, 2]) - 1) > 1e-9 or float(k[2, :2].abs().max()) > 0 or float(k[1, 0]) != 0:
             raise InputError(
-                f"intrinsics of view '{self.name}': expected K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; "
-                "a transposed K (MATLAB) has to be transposed back"
+                "expected K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; a transposed K (MATLAB) has to be transposed back",
+                field=f"intrinsics of view '{self.name}'",
             )
         if not (min(self.image_size) > 0 and max(self.image_size) <= LARGEST_IMAGE):
             raise InputError(
-                f"image_size of view '{self.name}': expected (height, width) between 1 and {LARGEST_IMAGE} px, "
-                f"got {self.image_size}"
+                f"expected (height, width) between 1 and {LARGEST_IMAGE} px, got {self.image_size}",
+                field=f"image_size of view '{self.name}'",
             )
         if self.pose_sigma is not None and not bool(((self.pose_sigma >= 0) & (self.pose_sigma < torch.inf)).all()):
             raise InputError(
-                f"pose_sigma of view '{self.name}': expected standard deviations of 0 or more, got "
-                f"{self.pose_sigma.tolist()}"
+                f"expected standard deviations of 0 or more, got {self.pose_sigma.tolist()}",
+                field=f"pose_sigma of view '{self.name}'",
             )
         if self.lens is not None and self.lens.diameter > 0:
             self._check_focus(self.lens)
@@ -350,14 +352,16 @@ class Camera:
         """Refuse a lens of which it is not known where it is in focus, or that is in focus where it is."""
         if lens.focus is None and self.background is None:
             raise InputError(
-                f"focus_distance of view '{self.name}': expected mm along the optical axis for a lens of "
-                f"{lens.diameter:g} mm that looks at no background, got none"
+                f"expected mm along the optical axis for a lens of "
+                f"{lens.diameter:g} mm that looks at no background, got none",
+                field=f"focus_distance of view '{self.name}'",
             )
         depth = self.depth(self.plane) if lens.focus is None else lens.focus
         if not (depth > 0 or (depth < 0 and not self.projection.shows_depth)):
             raise InputError(
-                f"focus_distance of view '{self.name}': expected a lens in focus before the camera, got a depth of "
-                f"{depth:g} mm; check background_offset, or give the distance"
+                f"expected a lens in focus before the camera, got a depth of "
+                f"{depth:g} mm; check background_offset, or give the distance",
+                field=f"focus_distance of view '{self.name}'",
             )
 
     @property
@@ -391,7 +395,9 @@ class Camera:
             If the camera has none.
         """
         if self.background is None:
-            raise InputError(f"background of view '{self.name}': expected a plane, normal . x = offset, got none")
+            raise InputError(
+                "expected a plane, normal . x = offset, got none", field=f"background of view '{self.name}'"
+            )
         return self.background
 
     def pixel_grid(self) -> Float[Tensor, "row column 2"]:
@@ -402,18 +408,19 @@ class Camera:
 
     @property
     def unseen(self) -> float:
-        """Share of the picture for which the distortion cannot be inverted, by EVENLY x EVENLY of its pixels."""
+        """Share of the image for which the distortion cannot be inverted, by EVENLY x EVENLY of its pixels."""
         height, width = self.image_size
         u, v = (torch.linspace(0, n - 1, min(n, EVENLY), dtype=torch.float64) for n in (width, height))
         rays = self.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False)
         return 1 - float((rays.origin + rays.direction).isfinite().all(dim=-1).double().mean())
 
     def check_distortion(self) -> None:
-        """Refuse a distortion that cannot be inverted over most of the picture."""
+        """Refuse a distortion that cannot be inverted over most of the image."""
         if self.unseen > 0.5:
             raise InputError(
-                f"distortion of view '{self.name}': expected coefficients that can be inverted over the image, "
-                f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)"
+                f"expected coefficients that can be inverted over the image, "
+                f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)",
+                field=f"distortion of view '{self.name}'",
             )
 
     def project(self, points: Points) -> Pixels:
@@ -459,7 +466,7 @@ class Camera:
         f_number : focal length over aperture; of a telecentric lens that on the sensor's side; 0 for thin rays
         """
         if not f_number >= 0:
-            raise InputError(f"f_number: expected above 0, or 0 for thin rays, got {f_number}")
+            raise InputError(f"expected above 0, or 0 for thin rays, got {f_number}", field="f_number")
         if f_number == 0:
             return replace(self, lens=None)
         depth = self.depth(self.plane)

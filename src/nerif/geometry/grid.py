@@ -37,10 +37,12 @@ class Box:
 
     def __post_init__(self) -> None:
         if not len(self.lower) == len(self.upper) == 3:
-            raise InputError(f"box: expected corners (x, y, z) in mm, got {self.lower} to {self.upper}")
+            raise InputError(f"expected corners (x, y, z) in mm, got {self.lower} to {self.upper}", field="box")
         largest = max(abs(c) for c in (*self.lower, *self.upper))
         if not (largest <= LARGEST_LENGTH and all(e > SHORTEST_EDGE * largest for e in self.edges)):
-            raise InputError(f"box: expected lower < upper along x, y and z (mm), got {self.lower} to {self.upper}")
+            raise InputError(
+                f"expected lower < upper along x, y and z (mm), got {self.lower} to {self.upper}", field="box"
+            )
 
     @classmethod
     def cube(cls, edge: float) -> Box:
@@ -54,9 +56,7 @@ class Box:
         return cls((-x, -y, -z), (x, y, z))
 
     @classmethod
-    def between(
-        cls, lower: tuple[float, float, float] | None, upper: tuple[float, float, float] | None
-    ) -> Box | None:
+    def between(cls, lower: tuple[float, float, float] | None, upper: tuple[float, float, float] | None) -> Box | None:
         """Return the box between two corners (mm) that may be left out, together: None then.
 
         Raises
@@ -65,7 +65,7 @@ class Box:
             If one of them is there and the other is not.
         """
         if (lower is None) != (upper is None):
-            raise InputError("lower, upper: expected both corners of the box or neither")
+            raise InputError("expected both corners of the box or neither", field="lower, upper")
         return None if lower is None or upper is None else cls(lower, upper)
 
     @property
@@ -109,7 +109,7 @@ class Grid:
 
     def __post_init__(self) -> None:
         if len(self.shape) != 3 or not all(isinstance(n, int) and n > 0 for n in self.shape):
-            raise InputError(f"grid: expected three positive voxel counts (z, y, x), got {self.shape}")
+            raise InputError(f"expected three positive voxel counts (z, y, x), got {self.shape}", field="grid")
 
     @classmethod
     def of_resolution(cls, box: Box, voxels: int) -> Grid:
@@ -121,7 +121,7 @@ class Grid:
             If that is less than one.
         """
         if not voxels >= 1:
-            raise InputError(f"voxels: expected at least 1 along the longest edge, got {voxels}")
+            raise InputError(f"expected at least 1 along the longest edge, got {voxels}", field="voxels")
         size = max(box.edges) / voxels
         nx, ny, nz = (max(1, round(e / size)) for e in box.edges)
         return cls(box, (nz, ny, nx))

@@ -1,8 +1,8 @@
 """The ray bundle of a pixel: rays from the lens aperture that meet in the plane in focus, over a window of pixels.
 
-    L = O + r (x e_1 + y e_2),  |(x, y)| <= 1        a point of the aperture about the camera's centre O, radius r
-    X_f = O + s_f t                                  in focus on the pixel's own ray, O + s t
-    p' = p + w (a, b),  |a|, |b| <= 1                a pixel of the window about p, w half its edge
+L = O + r (x e_1 + y e_2),  |(x, y)| <= 1        a point of the aperture about the camera's centre O, radius r
+X_f = O + s_f t                                  in focus on the pixel's own ray, O + s t
+p' = p + w (a, b),  |a|, |b| <= 1                a pixel of the window about p, w half its edge
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Lens:
         in focus where it passes z_cam = 0; mm; 0 for a thin ray a pixel
     focus : depth of the plane in focus along the optical axis, mm, below 0 only of a telecentric lens; None for the
         background's
-    points : number of points on the disc, where pictures are rendered and measurements simulated
+    points : number of points on the disc, where images are rendered and measurements simulated
     window : edge of the square of pixels over which a displacement is the mean, px; 0 for that of its own pixel
 
     Raises
@@ -80,13 +80,15 @@ class Lens:
 
     def __post_init__(self) -> None:
         if not 0 <= self.diameter <= LARGEST_LENGTH:
-            raise InputError(f"aperture_diameter: expected a lens of 0 mm or more, got {self.diameter}")
+            raise InputError(f"expected a lens of 0 mm or more, got {self.diameter}", field="aperture_diameter")
         if self.focus is not None and not 0 < abs(self.focus) <= LARGEST_LENGTH:
-            raise InputError(f"focus_distance: expected a lens in focus elsewhere than at 0 mm, got {self.focus}")
+            raise InputError(
+                f"expected a lens in focus elsewhere than at 0 mm, got {self.focus}", field="focus_distance"
+            )
         if self.points < 1:
-            raise InputError(f"points: expected at least one point on the lens, got {self.points}")
+            raise InputError(f"expected at least one point on the lens, got {self.points}", field="points")
         if not 0 <= self.window <= LARGEST_WINDOW:
-            raise InputError(f"window: expected an edge of 0 to {LARGEST_WINDOW} px, got {self.window}")
+            raise InputError(f"expected an edge of 0 to {LARGEST_WINDOW} px, got {self.window}", field="window")
 
     @property
     def wide(self) -> bool:

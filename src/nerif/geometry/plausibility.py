@@ -22,10 +22,10 @@ from nerif.geometry.rays import Rays
 __all__ = ["Suspect", "background_cuts", "likely_cause", "rays_on_lattice", "rig_findings", "suspects"]
 
 LEAST, MOST = 1.0, 1e4  # mm, of the longest edge of a box that is plausible
-ACROSS, ALONG = 33, 65  # pixels along an edge of a picture that are traced, and points along each of their rays
-COARSE = 9  # the same pixels where the points along their rays are projected into the other pictures
-BESIDE = 0.1  # of the rays that cross the box, and of the box that is in the picture: below both a camera looks past it
-MARGIN = 0.1  # of the picture that a point may be outside and still count as seen by two views
+ACROSS, ALONG = 33, 65  # pixels along an edge of an image that are traced, and points along each of their rays
+COARSE = 9  # the same pixels where the points along their rays are projected into the other images
+BESIDE = 0.1  # of the rays that cross the box, and of the box that is in the image: below both a camera looks past it
+MARGIN = 0.1  # of the image that a point may be outside and still count as seen by two views
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def likely_cause(cameras: Sequence[Camera], box: Box, which: Sequence[int] | Non
 
 
 def rig_findings(cameras: Sequence[Camera], box: Box) -> list[Finding]:
-    """Return what cannot be right in a rig, whatever the pictures show.
+    """Return what cannot be right in a rig, whatever the images show.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def rig_findings(cameras: Sequence[Camera], box: Box) -> list[Finding]:
 
 
 def rays_on_lattice(camera: Camera, box: Box, across: int = ACROSS) -> Rays:
-    """Return the rays of some pixels, evenly over the picture, clipped to the box."""
+    """Return the rays of some pixels, evenly over the image, clipped to the box."""
     u, v = (torch.linspace(0, n - 1, min(n, across), dtype=torch.float64) for n in reversed(camera.image_size))
     return camera.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False).clip(box)
 
@@ -186,13 +186,13 @@ def _inside(camera: Camera, box: Box) -> bool:
 
 
 def _looks_past(camera: Camera, box: Box) -> bool:
-    """Whether hardly a ray crosses the box, and hardly any of the box is in the picture."""
+    """Whether hardly a ray crosses the box, and hardly any of the box is in the image."""
     crossing = float(rays_on_lattice(camera, box).crosses.double().mean())
-    return crossing < BESIDE and float(_in_picture(camera, _points(box)).double().mean()) < BESIDE
+    return crossing < BESIDE and float(_in_image(camera, _points(box)).double().mean()) < BESIDE
 
 
-def _in_picture(camera: Camera, points: Points, margin: float = 0.0) -> Bool[Tensor, "*batch"]:
-    """Which points a camera has in its picture, or within that share of it outside."""
+def _in_image(camera: Camera, points: Points, margin: float = 0.0) -> Bool[Tensor, "*batch"]:
+    """Which points a camera has in its image, or within that share of it outside."""
     points = points.to(camera.rotation)
     size = torch.tensor(camera.image_size[::-1], dtype=points.dtype)
     beyond = 0.5 + (margin * size).clamp_min(1.0) * (margin > 0)
@@ -212,7 +212,7 @@ def _without_company(cameras: Sequence[Camera], box: Box) -> list[int]:
         share = torch.linspace(0, 1, ALONG, dtype=torch.float64)
         points = rays.at(rays.near[:, None] + share * (rays.far - rays.near)[:, None]).reshape(-1, 3)
         others = (other for j, other in enumerate(cameras) if j != i)
-        if len(points) and not any(bool(_in_picture(other, points, MARGIN).any()) for other in others):
+        if len(points) and not any(bool(_in_image(other, points, MARGIN).any()) for other in others):
             alone.append(i)
     return alone
 

@@ -116,7 +116,9 @@ class Rays(Columns):
             If they have none.
         """
         if self.background is None:
-            raise InputError("background: expected cameras that look at a background, got some without; name its plane")
+            raise InputError(
+                "expected cameras that look at a background, got some without; name its plane", field="background"
+            )
         return self.background
 
     @property
@@ -158,7 +160,7 @@ class Rays(Columns):
             If the rays pass no lens.
         """
         if self.lens is None:
-            raise InputError("aperture_diameter: expected rays through a lens, got thin ones")
+            raise InputError("expected rays through a lens, got thin ones", field="aperture_diameter")
         each, ends, shift = points.shape[1], self.background, self.lens.points(points[..., :2])
         start, toward, reach = self._of_window(points[..., 2:])
         # of either sign: a telecentric camera's z_cam = 0 may be behind what is in focus
@@ -189,10 +191,26 @@ class Rays(Columns):
 
     def _of_window(
         self, square: Float[Tensor, "n k 2"]
-    ) -> tuple[Float[Tensor, (n #k 3
-)], Float[Tensor, (n #k 3
-)], Float[Tensor, (n #k 1
-)]]:
+    ) -> tuple[
+        Float[
+            Tensor,
+            (
+                n  # k 3
+            ),
+        ],
+        Float[
+            Tensor,
+            (
+                n  # k 3
+            ),
+        ],
+        Float[
+            Tensor,
+            (
+                n  # k 1
+            ),
+        ],
+    ]:
         """Where thin rays of other pixels start, mm from the origin, their directions, and how far off they end.
 
         The last is a share of the path length of the ray in the middle.

@@ -45,18 +45,19 @@ class Ring:
     def __post_init__(self) -> None:
         for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
             if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+                raise InputError(f"expected a positive number, got {getattr(self, name)}", field=name)
         for name in ("arc", "extra_angles", "elevation"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
-                raise InputError(f"{name}: expected degrees, got {getattr(self, name)}")
+                raise InputError(f"expected degrees, got {getattr(self, name)}", field=name)
         perspective = self.kind.shows_depth
         if self.magnification is not None and (perspective or not 0 < self.magnification < math.inf):
             raise InputError(
-                f"magnification: expected a positive number, with projection = telecentric, got {self.magnification} "
-                f"with {self.projection}"
+                f"expected a positive number, with projection = telecentric, got {self.magnification} "
+                f"with {self.projection}",
+                field="magnification",
             )
         if min(self.image_size) < 1:
-            raise InputError(f"image_size: expected (height, width) > 0 px, got {self.image_size}")
+            raise InputError(f"expected (height, width) > 0 px, got {self.image_size}", field="image_size")
 
     @property
     def kind(self) -> Projection:
@@ -85,7 +86,7 @@ class Ring:
         """
         names = [f"{angle:g}deg" for angle in self.angles]
         if len(set(names)) < len(names):
-            raise InputError(f"views: expected cameras at different angles, got {', '.join(names)}")
+            raise InputError(f"expected cameras at different angles, got {', '.join(names)}", field="views")
         cameras = (self._camera(angle, name) for angle, name in zip(self.angles, names, strict=True))
         return tuple(camera.stopped_down(self.pixel_pitch, f_number) for camera in cameras)
 
@@ -116,7 +117,7 @@ def paper_rig(pixels: int = 200, extra_angles: tuple[float, ...] = ()) -> tuple[
     """Return the cameras and the box of the paper's numerical study (paper, Tab. I).
 
     Nine views at 0-170 degrees, 200 x 200 pixels of 20 um, a 50 mm lens, a 50 mm cube seen whole. The paper leaves the
-    two distances open; 700 mm to the centre and 500 mm on to the background fit the cube in the picture. With other
+    two distances open; 700 mm to the centre and 500 mm on to the background fit the cube in the image. With other
     `pixels` the sensor keeps its size and its pixels grow.
     """
     ring = Ring(pixel_pitch=0.02 * 200 / pixels, image_size=(pixels, pixels), extra_angles=extra_angles)

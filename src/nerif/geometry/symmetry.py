@@ -110,8 +110,9 @@ def parse_symmetry(text: str) -> tuple[str, int] | None:
     found = re.fullmatch(r"(planar)|axis(?:\+(\d+))?", text)
     if not found or int(found[2] or 0) > MOST_HARMONICS:
         raise InputError(
-            f"symmetry: expected {NO_SYMMETRY}, axis, axis+N (N harmonics of the angle, at most {MOST_HARMONICS}) or "
-            f"planar, got '{text}'"
+            f"expected {NO_SYMMETRY}, axis, axis+N (N harmonics of the angle, at most {MOST_HARMONICS}) or "
+            f"planar, got '{text}'",
+            field="symmetry",
         )
     return found[1] or "axis", int(found[2] or 0)
 
@@ -146,7 +147,7 @@ class Symmetry:
         kind, harmonics = parsed
         line = torch.tensor(direction, dtype=torch.float64)
         if not float(line.norm()) > 0:
-            raise InputError(f"axis_direction: expected a direction (x, y, z), got {direction}")
+            raise InputError(f"expected a direction (x, y, z), got {direction}", field="axis_direction")
         line = line / line.norm()
         # e1 as near as may be to the first coordinate that is not along the line
         first = torch.eye(3, dtype=torch.float64)[1 if abs(float(line[0])) > ALONG else 0]
@@ -301,6 +302,6 @@ class Symmetry:
                     face = box.upper[axis] if sign > 0 else box.lower[axis]
                     high[0] = min(high[0], sign * (face - self.point[axis]))
             if not high[0] > 0:
-                raise InputError(f"axis_point: expected the axis within the box, got {self.point} mm")
+                raise InputError(f"expected the axis within the box, got {self.point} mm", field="axis_point")
         width = (high[0] - low[0]) / 2
         return Box((low[0], -width, low[2]), (high[0], width, high[2]))

@@ -87,12 +87,16 @@ class LineScan:
     def __post_init__(self) -> None:
         shape = (len(self.angles), len(self.positions))
         if self.readings.shape != shape:
-            raise InputError(f"readings: expected one for each angle and position {shape}, got {self.readings.shape}")
+            raise InputError(
+                f"expected one for each angle and position {shape}, got {self.readings.shape}", field="readings"
+            )
         if min(shape) < 4:
-            raise InputError(f"readings: expected four angles and positions or more, got {shape}")
+            raise InputError(f"expected four angles and positions or more, got {shape}", field="readings")
         steps = np.diff(self.positions)
         if not (steps.mean() > 0 and np.abs(steps - steps.mean()).max() < EVEN * steps.mean()):
-            raise InputError("positions: expected evenly spaced, rising positions in mm; interpolate them first")
+            raise InputError(
+                "expected evenly spaced, rising positions in mm; interpolate them first", field="positions"
+            )
 
     @property
     def spacing(self) -> float:
@@ -135,7 +139,9 @@ class LineScan:
         """Return k, and how much the totals of complete angles scatter, as a share, without it and with it."""
         chosen = self.readings[self.complete]
         if len(chosen) < 3:
-            raise InputError(f"readings: expected three angles or more that hold all of the medium, got {len(chosen)}")
+            raise InputError(
+                f"expected three angles or more that hold all of the medium, got {len(chosen)}", field="readings"
+            )
         tried = np.linspace(0, LARGEST_BEND, BENDS)
         totals = [(chosen + k * chosen**2).sum(axis=1) for k in tried]
         scatter = [float(t.std() / t.mean()) for t in totals]
@@ -163,7 +169,9 @@ class LineScan:
         """Its middle, and how far the complete angles are from it, mm."""
         chosen = self.complete
         if len(chosen) < 4:
-            raise InputError(f"readings: expected four angles or more that hold all of the medium, got {len(chosen)}")
+            raise InputError(
+                f"expected four angles or more that hold all of the medium, got {len(chosen)}", field="readings"
+            )
         total = self.readings[chosen].sum(axis=1)
         centre = (self.readings[chosen] * self.positions).sum(axis=1) / total
         turn = np.stack([np.ones(len(chosen)), np.cos(self.angles[chosen]), np.sin(self.angles[chosen])], axis=1)
@@ -189,7 +197,9 @@ class LineScan:
         cameras = [self._camera(float(angle), axis) for angle in self.angles]
         name, times = Counter(camera.name for camera in cameras).most_common(1)[0]
         if times > 1:
-            raise InputError(f"angles: expected different angles, got {name} {times} times; average their readings")
+            raise InputError(
+                f"expected different angles, got {name} {times} times; average their readings", field="angles"
+            )
         values = torch.from_numpy(self.readings).float()[:, None, :, None]
         measurement = measurement_of(
             {Absorption: values}, cameras, Box((-half, -half, -thickness), (half, half, thickness)), 1.0

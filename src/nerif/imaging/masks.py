@@ -55,13 +55,15 @@ class MaskShape:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError(f"kind: expected {' or '.join(KINDS)}, got '{self.kind}'")
+            raise InputError(f"expected {' or '.join(KINDS)}, got '{self.kind}'", field="kind")
         if len(self.points) < KINDS[self.kind]:
-            raise InputError(f"points: expected {KINDS[self.kind]} or more of a {self.kind}, got {len(self.points)}")
+            raise InputError(
+                f"expected {KINDS[self.kind]} or more of a {self.kind}, got {len(self.points)}", field="points"
+            )
         if not np.isfinite(np.array(self.points, dtype=float)).all():
-            raise InputError(f"points: expected finite numbers, got {self.points}")
+            raise InputError(f"expected finite numbers, got {self.points}", field="points")
         if not self.width > 0:
-            raise InputError(f"width: expected px above 0, got {self.width}")
+            raise InputError(f"expected px above 0, got {self.width}", field="width")
 
 
 def mask_of(shapes: Sequence[MaskShape], shape: tuple[int, int]) -> Bool[np.ndarray, "row column"]:
@@ -74,8 +76,8 @@ def mask_of(shapes: Sequence[MaskShape], shape: tuple[int, int]) -> Bool[np.ndar
     """
     from PIL import Image, ImageDraw
 
-    picture = Image.new("1", (shape[1], shape[0]), 0)
-    draw = ImageDraw.Draw(picture)
+    image = Image.new("1", (shape[1], shape[0]), 0)
+    draw = ImageDraw.Draw(image)
     for s in shapes:
         if s.kind == "polygon":
             draw.polygon(list(s.points), fill=int(s.inside), outline=int(s.inside))
@@ -85,7 +87,7 @@ def mask_of(shapes: Sequence[MaskShape], shape: tuple[int, int]) -> Bool[np.ndar
         for x, y in s.points:  # round ends and joints
             r = (s.width - 1) / 2
             draw.ellipse((x - r, y - r, x + r, y + r), fill=int(s.inside))
-    return np.asarray(picture, dtype=bool)
+    return np.asarray(image, dtype=bool)
 
 
 def write_masks(
@@ -108,11 +110,15 @@ def write_masks(
 
     for name in drawn:
         if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
-            raise InputError(f"view: expected names that files can have, without / and \\, got {name!r}; rename it")
+            raise InputError(
+                f"expected names that files can have, without / and \\, got {name!r}; rename it", field="view"
+            )
     masks = {name: mask_of(own, shapes[name]) for name, own in drawn.items() if own}
     for name, mask in masks.items():
         if mask.all() or not mask.any():
-            raise InputError(f"mask of view '{name}': expected some of it, got {'all' if mask.any() else 'nothing'}")
+            raise InputError(
+                f"expected some of it, got {'all' if mask.any() else 'nothing'}", field=f"mask of view '{name}'"
+            )
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for name, mask in masks.items():
@@ -139,7 +145,7 @@ class MaskSettings:
     def __post_init__(self) -> None:
         for name in ("threshold", "smooth", "smallest", "grow"):
             if not getattr(self, name) >= 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+                raise InputError(f"expected 0 or more, got {getattr(self, name)}", field=name)
 
 
 STANDARD = MaskSettings()
@@ -178,7 +184,7 @@ def flow_mask(
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"]:
-    """Read a mask drawn as a picture: anything above half of its range counts.
+    """Read a mask drawn as an image: anything above half of its range counts.
 
     Raises
     ------
@@ -188,17 +194,18 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
     image = open_frames(path)[0]
     if image.shape != shape:
         raise InputError(
-            f"{path}: expected a mask of {shape[0]} x {shape[1]} px (height x width) as the view, got "
-            f"{image.shape[0]} x {image.shape[1]}"
+            f"expected a mask of {shape[0]} x {shape[1]} px (height x width) as the view, got "
+            f"{image.shape[0]} x {image.shape[1]}",
+            field=path,
         )
     low, high = float(image.min()), float(image.max())
     if low == high:
-        raise InputError(f"{path}: expected a mask with black and white in it, got one grey of {high:g}")
+        raise InputError(f"expected a mask with black and white in it, got one grey of {high:g}", field=path)
     return np.asarray(image > (low + high) / 2)
 
 
 def drawn_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
-    """Return the pictures of masks in a folder, VIEW.png and the like, by the names of their views.
+    """Return the images of masks in a folder, VIEW.png and the like, by the names of their views.
 
     Raises
     ------
@@ -206,11 +213,11 @@ def drawn_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
         If there is no such folder, or none for any view.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; expected one with VIEW.png for each view")
+        raise InputError("no such folder; expected one with VIEW.png for each view", field=folder)
     found = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix in (".png", ".tif", ".tiff", ".bmp")}
     known = {name: found[name] for name in names if name in found}
     if not known:
-        raise InputError(f"{folder}: expected pictures named as the views, {', '.join(names)}, found none")
+        raise InputError(f"expected images named as the views, {', '.join(names)}, found none", field=folder)
     return known
 
 
@@ -230,7 +237,7 @@ def with_flow_masks(
     measurement : what was measured; pixels that are not usable are in the mask
     settings : of the threshold
     sigma : noise, in the unit of what was measured, in the place of the measurement's own
-    drawn : pictures of masks by the names of views
+    drawn : images of masks by the names of views
     on_view : called with the number of views done
 
     Raises
@@ -242,7 +249,9 @@ def with_flow_masks(
     observations = integrals_of(measurement)
     if sigma is not None and len(observations) > 1:
         names = " and ".join(o.technique.measured for o in observations)
-        raise InputError(f"sigma: expected none for {names}, which have units and noise of their own, got {sigma:g}")
+        raise InputError(
+            f"expected none for {names}, which have units and noise of their own, got {sigma:g}", field="sigma"
+        )
     seen = [(o, measurement.usable_for(o)) for o in observations]
     masks = torch.zeros(measurement.shape, dtype=torch.bool)
     for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
@@ -257,7 +266,9 @@ def with_flow_masks(
                 flow |= _mask_by(o, (i, *inside), own, settings, sigma, name) & own
                 known |= own
             if not flow.any():
-                raise InputError(f"threshold: no flow is left in view '{name}'; give less than {settings.threshold:g}")
+                raise InputError(
+                    f"no flow is left in view '{name}'; give less than {settings.threshold:g}", field="threshold"
+                )
             mask = flow | ~known
         masks[i][inside] = torch.from_numpy(mask)
         on_view(i + 1)
@@ -273,8 +284,9 @@ def _mask_by(
     if sigma is None and observation.sigma is None:
         unit = f" in {kind.unit}" if unit_shown(kind.unit) else ""
         raise InputError(
-            f"sigma: the measurement holds no noise to measure the {kind.measured} of view '{name}' by; give it{unit}, "
-            "or drawn masks of all views"
+            f"the measurement holds no noise to measure the {kind.measured} of view '{name}' by; give it{unit}, "
+            "or drawn masks of all views",
+            field="sigma",
         )
     values = np.where(known[..., None], observation.values[inside].numpy(), np.nan)
     own = observation.sigma[inside].numpy() if sigma is None and observation.sigma is not None else sigma

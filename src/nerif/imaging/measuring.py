@@ -20,7 +20,7 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.displacement.displacement import AtRest, DisplacementMap, DisplacementSettings, measure_against
 from nerif.imaging.displacement.exposure import check_exposure
 from nerif.imaging.masks import MaskSettings, flow_mask
-from nerif.imaging.readers.views import View, good_pictures
+from nerif.imaging.readers.views import View, good_images
 from nerif.imaging.workers import cores, work
 
 __all__ = ["Recording", "RestingView", "Scene", "Surroundings", "camera_of", "join_views", "measure_instant"]
@@ -49,17 +49,17 @@ class Scene:
 
 
 def join_views(
-    views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], scene: Scene, pictures: bool = False
+    views: Iterable[tuple[Camera, DisplacementMap, Mask | None]], scene: Scene, images: bool = False
 ) -> Measurement:
-    """Return one measurement of all views; smaller pictures are padded.
+    """Return one measurement of all views; smaller images are padded.
 
-    With pictures a pixel is valid where one of the two says something, and the other is NaN there.
+    With images a pixel is valid where one of the two says something, and the other is NaN there.
 
     Parameters
     ----------
     views : camera, displacement and flow mask (or None) of each, held one at a time
     scene : box and surroundings
-    pictures : whether to keep those that the displacements were found in
+    images : whether to keep those that the displacements were found in
     """
     cameras: list[Camera] = []
     maps: dict[str, list[np.ndarray]] = {"displacement": [], "sigma": [], "valid": [], "flow_mask": []}
@@ -70,10 +70,10 @@ def join_views(
         masked |= mask is not None
         own = {"displacement": found.displacement, "sigma": found.sigma, "valid": found.valid}
         own["flow_mask"] = everywhere if mask is None else mask
-        if pictures and found.pair is not None:
+        if images and found.pair is not None:
             own["displacement"] = np.where(found.valid[..., None], found.displacement, np.float32(np.nan))
             own["valid"] = found.valid | np.isfinite(found.pair.flow)
-            own |= {"reference": found.pair.reference, "flow": found.pair.flow, "picture_sigma": found.pair.sigma}
+            own |= {"reference": found.pair.reference, "flow": found.pair.flow, "image_sigma": found.pair.sigma}
         for name, array in own.items():
             maps.setdefault(name, []).append(array)
     size = tuple(max(v.shape[k] for v in maps["valid"]) for k in range(2))
@@ -94,31 +94,31 @@ def join_views(
         n_ambient=scene.surroundings.n_ambient,
         sigma=stack("sigma"),
         valid=stack("valid"),
-        maps={name: stack(name) for name in ("reference", "flow", "picture_sigma") if name in maps},
+        maps={name: stack(name) for name in ("reference", "flow", "image_sigma") if name in maps},
         flow_mask=stack("flow_mask") if masked else None,
         wavelength_nm=scene.surroundings.wavelength_nm,
         ambient_faces=scene.surroundings.ambient_faces,
     )
 
 
-WORTH_PROCESSES = 2**22  # pixels of all pictures together
+WORTH_PROCESSES = 2**22  # pixels of all images together
 
 Found = tuple[Camera, DisplacementMap, Bool[np.ndarray, "row column"] | None]
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Pictures of all views, and how they are to be measured.
+    """Images of all views, and how they are to be measured.
 
     Parameters
     ----------
-    views : where the pictures are (views.find_views)
+    views : where the images are (views.find_views)
     cameras : calibrated, by the names of the views (importers.import_cameras, cameras_file.read_cameras)
     scene : box and surroundings of the measurement
     method : of the displacements
     masks : of the flow, or None; views with a drawn mask have that
-    references : most reference pictures to look at; 0 for all
-    pictures : whether a measurement of one instant keeps the pictures beside the displacements
+    references : most reference images to look at; 0 for all
+    images : whether a measurement of one instant keeps the images beside the displacements
     """
 
     views: tuple[View, ...]
@@ -127,22 +127,23 @@ class Recording:
     method: DisplacementSettings = field(default_factory=DisplacementSettings)
     masks: MaskSettings | None = None
     references: int = 100
-    pictures: bool = True
+    images: bool = True
 
     def __post_init__(self) -> None:
         for view in self.views:
             if view.name not in self.cameras:
                 raise InputError(
-                    f"calibration: no camera named '{view.name}', only {', '.join(self.cameras)}; "
-                    "rename the view's folder, or choose --views"
+                    f"no camera named '{view.name}', only {', '.join(self.cameras)}; "
+                    "rename the view's folder, or choose --views",
+                    field="calibration",
                 )
         if self.references < 0:
-            raise InputError(f"references: expected 0 or more, got {self.references}")
+            raise InputError(f"expected 0 or more, got {self.references}", field="references")
 
-    def processes(self, tasks: int, pictures: int) -> int:
-        """Return how many processes are worth it for tasks on so many pictures in all."""
+    def processes(self, tasks: int, images: int) -> int:
+        """Return how many processes are worth it for tasks on so many images in all."""
         sizes = [c.image_size for c in self.cameras.values() if c.image_size is not None]
-        pixels = pictures * max((height * width for height, width in sizes), default=WORTH_PROCESSES)
+        pixels = images * max((height * width for height, width in sizes), default=WORTH_PROCESSES)
         return min(cores(), tasks) if pixels >= WORTH_PROCESSES else 1
 
 
@@ -152,13 +153,13 @@ class RestingView:
 
     Parameters
     ----------
-    view : where its pictures are
-    camera : of its pictures
+    view : where its images are
+    camera : of its images
     rest : what the reference says
     masks : of the flow by threshold, or None
     region : (row, column) where the background is seen, or None
     drawn : (row, column) drawn mask of the flow, or None
-    pictures : whether a displacement keeps the pictures that it was found in
+    images : whether a displacement keeps the images that it was found in
     """
 
     view: View
@@ -167,55 +168,63 @@ class RestingView:
     masks: MaskSettings | None = None
     region: Bool[np.ndarray, "row column"] | None = None
     drawn: Bool[np.ndarray, "row column"] | None = None
-    pictures: bool = True
+    images: bool = True
 
     @classmethod
     def of(
         cls, recording: Recording, view: View, averaged: int = 1, say: Callable[[str], None] = lambda line: None
     ) -> RestingView:
-        """Look at the reference pictures of a view.
+        """Look at the reference images of a view.
 
         Parameters
         ----------
-        averaged : number of flow pictures whose displacements will be averaged
-        say : is told of pictures that cannot be used
+        averaged : number of flow images whose displacements will be averaged
+        say : is told of images that cannot be used
 
         Raises
         ------
         InputError
-            If none can be used, or they do not fit the flow pictures or the calibrated camera.
+            If none can be used, or they do not fit the flow images or the calibrated camera.
         """
         view.check_alike()
-        reference = good_pictures(view, "reference", say, recording.references)
+        reference = good_images(view, "reference", say, recording.references)
         shape = (reference[0].shape[0], reference[0].shape[1])
         camera = camera_of(view, recording.cameras[view.name], shape)
         rest = AtRest.of(reference, recording.method, view.full_scale, averaged)
-        return cls(view, camera, rest, recording.masks, view.drawn("region", shape), view.drawn("mask", shape),
-                   recording.pictures)
+        return cls(
+            view,
+            camera,
+            rest,
+            recording.masks,
+            view.drawn("region", shape),
+            view.drawn("mask", shape),
+            recording.images,
+        )
 
     def measure(
         self, numbers: Sequence[int], say: Callable[[str], None] = lambda line: None
     ) -> tuple[DisplacementMap, Bool[np.ndarray, "row column"] | None]:
-        """Return the displacement, averaged over flow pictures of these numbers, and the flow mask.
+        """Return the displacement, averaged over flow images of these numbers, and the flow mask.
 
         Raises
         ------
         InputError
-            If a picture cannot be read, or no pixel holds.
+            If an image cannot be read, or no pixel holds.
         """
         frames, full = self.view.open("flow"), self.rest.full_scale
-        pictures = []
+        images = []
         for i in numbers:
-            pictures.append(self.view.cropped(frames[i], frames.name(i)))
-            exposure = check_exposure(pictures[-1], full, frames.name(i))
+            images.append(self.view.cropped(frames[i], frames.name(i)))
+            exposure = check_exposure(images[-1], full, frames.name(i))
             if exposure:
                 say(f"note: {exposure}")
-        found = measure_against(self.rest, pictures, self.region, self.pictures)
+        found = measure_against(self.rest, images, self.region, self.images)
         if not found.valid.any():
             method = self.rest.settings
             raise InputError(
-                f"{frames.name(numbers[0])}: no pixel holds (noise above {method.max_sigma:g} px or correlation below "
-                f"{method.min_correlation:g} everywhere); do the pictures show the same pattern, in focus?"
+                f"no pixel holds (noise above {method.max_sigma:g} px or correlation below "
+                f"{method.min_correlation:g} everywhere); do the images show the same pattern, in focus?",
+                field=frames.name(numbers[0]),
             )
         if self.drawn is not None or self.masks is None:
             return found, self.drawn
@@ -223,33 +232,36 @@ class RestingView:
 
 
 def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) -> Camera:
-    """Return the camera of a view's pictures, which may be a crop of those it was calibrated with.
+    """Return the camera of a view's images, which may be a crop of those it was calibrated with.
 
     Raises
     ------
     InputError
-        If pictures and calibration do not fit, or the camera has no background to see displaced.
+        If images and calibration do not fit, or the camera has no background to see displaced.
     """
     if calibrated.background is None:
         raise InputError(
-            f"view '{view.name}': its camera has no background plane, which displacements need; calibrate it with a "
-            "target laid on the background, or give nerif calibrate --background-distance"
+            "its camera has no background plane, which displacements need; calibrate it with a "
+            "target laid on the background, or give nerif calibrate --background-distance",
+            field=f"view '{view.name}'",
         )
     crop, frame = view.crop, view.open("flow").shape
     turned = crop is not None and bool(crop.flip or crop.rotate)
     if calibrated.image_size is None and crop is not None and (turned or frame != shape):
         raise InputError(
-            f"view '{view.name}': its pictures are a part of their frames, or turned (views.toml), and its camera has "
+            f"its images are a part of their frames, or turned (views.toml), and its camera has "
             "no image size, so it does not show whether it was calibrated with the same part; give it one: nerif "
-            f"calibrate FILE --image-size {shape[0]} {shape[1]} for the part, {frame[0]} {frame[1]} for the whole frame"
+            f"calibrate FILE --image-size {shape[0]} {shape[1]} (the part) or {frame[0]} {frame[1]} (the whole frame)",
+            field=f"view '{view.name}'",
         )
     if calibrated.image_size in (None, shape):
         return calibrated.camera(image_size=shape)
     if crop is not None and calibrated.image_size == frame and not turned:
         return calibrated.camera().view(crop.row, crop.column, *shape)
     raise InputError(
-        f"view '{view.name}': its pictures have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
-        f"with {calibrated.image_size}; calibrate with the same crop, or with the whole frame and no flip"
+        f"its images have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
+        f"with {calibrated.image_size}; calibrate with the same crop, or with the whole frame and no flip",
+        field=f"view '{view.name}'",
     )
 
 
@@ -264,10 +276,10 @@ def measure_instant(
 
     Parameters
     ----------
-    numbers : of the flow pictures, whose displacements are averaged
-    say : is told which views and pictures had to be left out, and why
+    numbers : of the flow images, whose displacements are averaged
+    say : is told which views and images had to be left out, and why
     on_view : called with the number of views done
-    processes : 1 for none but this; by default as many as there are processors, if the pictures are large
+    processes : 1 for none but this; by default as many as there are processors, if the images are large
 
     Raises
     ------
@@ -290,10 +302,10 @@ def measure_instant(
             found[i] = result
         on_view(done)
     if not found:
-        raise InputError(f"displacement: no view could be used; the first: {lost[0]}")
+        raise InputError(f"no view could be used; the first: {lost[0]}", field="displacement")
     order = sorted(found)
     noise = {views[i].name: found[i][1].noise_from for i in order}
-    kept = recording.pictures and len(numbers) == 1
+    kept = recording.images and len(numbers) == 1
     return join_views((found.pop(i) for i in order), recording.scene, kept), noise
 
 
@@ -305,8 +317,9 @@ def _view(recording: Recording, task: tuple[View, Sequence[int]]) -> tuple[Found
         there = len(view.open("flow"))
         if not 0 <= min(numbers) <= max(numbers) < there:
             raise InputError(
-                f"frame, average: expected numbers within the {there} flow pictures of view '{view.name}', got "
-                f"{min(numbers)} to {max(numbers)}"
+                f"expected numbers within the {there} flow images of view '{view.name}', got "
+                f"{min(numbers)} to {max(numbers)}",
+                field="frame, average",
             )
         resting = RestingView.of(recording, view, len(numbers), lines.append)
         return (resting.camera, *resting.measure(numbers, lines.append)), lines

@@ -1,4 +1,4 @@
-"""Many flow pictures to a measurement sequence, several instants at once; what is there already is not done again."""
+"""Many flow images to a measurement sequence, several instants at once; what is there already is not done again."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ROUNDING = 1e-9  # of the largest number of what is compared
 
 @dataclass(frozen=True)
 class RestingRecording:
-    """All views, with what is known of them before the first flow picture.
+    """All views, with what is known of them before the first flow image.
 
     Parameters
     ----------
@@ -46,8 +46,8 @@ class RestingRecording:
         on_view: Callable[[int], None] = lambda done: None,
         processes: int | None = None,
     ) -> RestingRecording:
-        """Look at the reference pictures of all views; see RestingView.of."""
-        views, recording = recording.views, replace(recording, pictures=False)  # a store of frames has none
+        """Look at the reference images of all views; see RestingView.of."""
+        views, recording = recording.views, replace(recording, images=False)  # a store of frames has none
         if processes is None:
             processes = recording.processes(len(views), len(views))
         found: dict[int, RestingView] = {}
@@ -61,7 +61,7 @@ class RestingRecording:
         return cls(tuple(found[i] for i in sorted(found)), recording.scene)
 
     def measure(self, number: int) -> tuple[Measurement, list[str]]:
-        """Return the measurement of one flow picture, and what is wrong with the views it had to do without.
+        """Return the measurement of one flow image, and what is wrong with the views it had to do without.
 
         Raises
         ------
@@ -88,12 +88,12 @@ def _rest(recording: Recording, view: View) -> tuple[RestingView | InputError, l
 
 
 def frame_numbers(text: str, views: Sequence[View]) -> range:
-    """Return the flow pictures that "all" or FIRST:LAST (LAST not included) stands for.
+    """Return the flow images that "all" or FIRST:LAST (LAST not included) stands for.
 
     Raises
     ------
     InputError
-        If that is not within the pictures of every view.
+        If that is not within the images of every view.
     """
     counts = {view.name: len(view.open("flow")) for view in views}
     least = min(counts, key=lambda name: counts[name])
@@ -104,9 +104,9 @@ def frame_numbers(text: str, views: Sequence[View]) -> range:
         if not 0 <= first < last:
             raise ValueError
     except ValueError:
-        raise InputError(f"frames: expected all, or FIRST:LAST such as 0:400, got '{text}'") from None
+        raise InputError(f"expected all, or FIRST:LAST such as 0:400, got '{text}'", field="frames") from None
     if last > counts[least]:
-        raise InputError(f"frames: expected numbers within the {counts[least]} of view '{least}', got '{text}'")
+        raise InputError(f"expected numbers within the {counts[least]} of view '{least}', got '{text}'", field="frames")
     return range(first, last)
 
 
@@ -122,7 +122,9 @@ def instants_of(numbers: range, view: View, frame_rate: float) -> tuple[float, .
         return tuple(i / frame_rate for i in numbers)
     recorded = view.open("flow").times
     if recorded is None:
-        raise InputError("frame_rate: expected frames per second, as the pictures do not tell their times; got none")
+        raise InputError(
+            "expected frames per second, as the images do not tell their times; got none", field="frame_rate"
+        )
     return tuple(float(recorded[i]) for i in numbers)
 
 
@@ -141,7 +143,7 @@ def measure_recording(
 
     Parameters
     ----------
-    numbers : of the flow pictures
+    numbers : of the flow images
     times : when they were taken, s
     out : Zarr store, made if it is not there
     settings : kept in the store; a store begun with others, or with other cameras, is refused
@@ -185,7 +187,7 @@ def _begun(out: Path, wanted: dict[str, Any]) -> MeasurementSequence:
 
     sequence = MeasurementSequence.read(out)
     if zarr.open_group(out, mode="r").attrs.get("displacement") != wanted:
-        raise InputError(f"{out}: exists already, made with other settings; give another --out, or --force")
+        raise InputError("exists already, made with other settings; give another --out, or --force", field=out)
     return sequence
 
 
@@ -205,8 +207,9 @@ def _check_cameras(out: Path, cameras: Sequence[Camera]) -> None:
                 other.append(f"{what} of view '{camera.name}'")
     if other:
         raise InputError(
-            f"{out}: expected the cameras that the store was begun with, got other {other[0]}; was the calibration "
-            "made anew? Give another --out, or --force"
+            f"expected the cameras that the store was begun with, got other {other[0]}; was the calibration "
+            "made anew? Give another --out, or --force",
+            field=out,
         )
 
 

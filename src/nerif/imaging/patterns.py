@@ -45,7 +45,7 @@ class Background:
     height: float = 200.0
     """Height of the pattern, mm."""
     dot: float = 1.0
-    """Diameter of a dot, or the smallest feature of a noise, mm: 2 to 5 px in the picture (nerif design)."""
+    """Diameter of a dot, or the smallest feature of a noise, mm: 2 to 5 px in the image (nerif design)."""
     fill: float = 0.35
     """Share of the paper that dots cover."""
     seed: int = 0
@@ -53,15 +53,16 @@ class Background:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError(f"kind: expected one of {', '.join(KINDS)}, got '{self.kind}'")
+            raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="kind")
         for name in ("width", "height", "dot"):
             if not 0 < getattr(self, name) < 1e5:
-                raise InputError(f"{name}: expected a positive length in mm, got {getattr(self, name)}")
+                raise InputError(f"expected a positive length in mm, got {getattr(self, name)}", field=name)
         if not 0 < self.fill <= 0.6:
-            raise InputError(f"fill: expected a share of the paper between 0 and 0.6, got {self.fill}")
+            raise InputError(f"expected a share of the paper between 0 and 0.6, got {self.fill}", field="fill")
         if 4 * self.dot > min(self.width, self.height):
             raise InputError(
-                f"dot: expected a quarter of the pattern ({min(self.width, self.height):g} mm) or less, got {self.dot}"
+                f"expected a quarter of the pattern ({min(self.width, self.height):g} mm) or less, got {self.dot}",
+                field="dot",
             )
 
     @property
@@ -87,7 +88,7 @@ class Background:
             If a pixel is longer than half a dot, which it could not show.
         """
         if not 0 < pixel <= self.dot / 2:
-            raise InputError(f"pixel: expected half the dot size ({self.dot / 2:g} mm) or less, got {pixel} mm")
+            raise InputError(f"expected half the dot size ({self.dot / 2:g} mm) or less, got {pixel} mm", field="pixel")
         shape = (max(1, round(self.height / pixel)), max(1, round(self.width / pixel)))
         if self.kind == "dots":
             return self._draw_dots(shape, pixel)
@@ -179,14 +180,16 @@ def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: floa
         If the name ends in neither, or the raster would be too large.
     """
     if path.suffix not in (".pdf", ".png"):
-        raise InputError(f"out: expected a name ending in .pdf or .png, got '{path.name}'")
+        raise InputError(f"expected a name ending in .pdf or .png, got '{path.name}'", field="out")
     if not dpi > 0:
-        raise InputError(f"dpi: expected a positive number, got {dpi}")
+        raise InputError(f"expected a positive number, got {dpi}", field="dpi")
     pixel = pattern.raster_pixel(25.4 / dpi)
     width, height = pattern.size
     pixels = width * height / pixel**2
     if pixels > LARGEST:
-        raise InputError(f"width, height: expected at most {LARGEST:.0e} pixels, got {pixels:.1e}; give fewer --dpi")
+        raise InputError(
+            f"expected at most {LARGEST:.0e} pixels, got {pixels:.1e}; give fewer --dpi", field="width, height"
+        )
     raster = pattern.raster(pixel)
     with atomic(path) as part:
         if path.suffix == ".png":

@@ -124,21 +124,22 @@ def _known(species: str) -> str:
     spellings = {key.lower(): key for key in GASES} | {gas.name.split(",")[0]: key for key, gas in GASES.items()}
     near = difflib.get_close_matches(species.lower(), spellings, n=1)
     hint = f"; did you mean '{spellings[near[0]]}'?" if near else "; give its mixture, or compute K from its own data"
-    raise InputError(f"composition: expected gases out of '{' '.join(GASES)}', got '{species}'{hint}")
+    raise InputError(f"expected gases out of '{' '.join(GASES)}', got '{species}'{hint}", field="composition")
 
 
 def _positive(name: str, value: float, unit: str, remedy: str) -> float:
     """Return `value` as a Python float, which leaves the dtype of an array it meets alone."""
     if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{name}: expected a positive number in {unit}, got {value:g}; {remedy}")
+        raise InputError(f"expected a positive number in {unit}, got {value:g}; {remedy}", field=name)
     return float(value)
 
 
 def _refractivity(n_ambient: float) -> float:
     if not (math.isfinite(n_ambient) and n_ambient >= 1):
         raise InputError(
-            f"n_ambient: expected a refractive index of at least 1, got {n_ambient:g}; "
-            "give n itself, not n - 1 (ambient_index computes it)"
+            f"expected a refractive index of at least 1, got {n_ambient:g}; "
+            "give n itself, not n - 1 (ambient_index computes it)",
+            field="n_ambient",
         )
     return float(n_ambient) - 1.0
 
@@ -167,15 +168,17 @@ def parse_mixture(composition: Composition) -> dict[str, float]:
     for word, number in pairs:
         species = _known(word.strip())
         if species in fractions:
-            raise InputError(f"composition: expected each gas once, got '{species}' twice; add its fractions up")
+            raise InputError(
+                f"expected each gas once, got '{species}' twice; add its fractions up", field="composition"
+            )
         try:
             fractions[species] = float(number)
         except (TypeError, ValueError):
             fractions[species] = math.nan
         if not fractions[species] >= 0:
             raise InputError(
-                f"composition: expected a mole fraction >= 0 for {species}, got '{number}'; "
-                "write it as in 'CH4:0.112, O2:0.888'"
+                f"expected a mole fraction >= 0 for {species}, got '{number}'; write it as in 'CH4:0.112, O2:0.888'",
+                field="composition",
             )
     total = sum(fractions.values())
     if not abs(total - 1) <= _FRACTION_TOLERANCE:
@@ -216,8 +219,9 @@ def gladstone_dale(composition: Composition, wavelength_nm: float) -> float:
         low, high = gas.wavelength_range
         if not low <= wavelength_nm <= high:
             raise InputError(
-                f"wavelength_nm: expected {low:g} to {high:g} nm for {species} ({gas.source}), got {wavelength_nm:g}; "
-                "give nanometres, or the nearest end of the range (K changes by a few per cent over the visible)"
+                f"expected {low:g} to {high:g} nm for {species} ({gas.source}), got {wavelength_nm:g}; "
+                "give nanometres, or the nearest end of the range (K changes by a few per cent over the visible)",
+                field="wavelength_nm",
             )
         density = gas.pressure * gas.molar_mass / (GAS_CONSTANT * gas.temperature)
         constant = gas.refractivity(wavelength_nm / 1000) / density

@@ -56,7 +56,7 @@ class GasSettings:
 
     def __post_init__(self) -> None:
         if not 0 < self.pressure_pa < math.inf:
-            raise InputError(f"pressure_pa: expected a positive pressure in Pa, got {self.pressure_pa}")
+            raise InputError(f"expected a positive pressure in Pa, got {self.pressure_pa}", field="pressure_pa")
 
     def for_measurement(self, measurement: Measurement) -> GasSettings:
         """Return the settings at the wavelength of a measurement, if it tells one.
@@ -129,7 +129,7 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
     """
     known = quantities_of(excess.quantity)
     if quantity not in known:
-        raise InputError(f"quantity: expected one of {', '.join(known)}, got '{quantity}'")
+        raise InputError(f"expected one of {', '.join(known)}, got '{quantity}'", field="quantity")
     if quantity == excess.quantity:
         return excess
     n_ambient = float(excess.attributes["n_ambient"])

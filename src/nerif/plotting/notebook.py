@@ -1,4 +1,4 @@
-"""What a notebook shows of a noun: a picture and a short table, as HTML that loads nothing; and numbers for people."""
+"""What a notebook shows of a noun: an image and a short table, as HTML that loads nothing; and numbers for people."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from nerif.plotting.drawing import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["number", "panel", "percent", "picture", "show_slices", "show_views", "span"]
+__all__ = ["image", "number", "panel", "percent", "show_slices", "show_views", "span"]
 
 VIEWS = 9  # that are drawn: of more, as many, evenly spread
 PIXELS = 120  # along an edge of a view, beyond which nothing more is seen
@@ -60,22 +60,20 @@ def span(values: Float[np.ndarray, ...], unit: str = "1", digits: int = 3) -> st
     return f"{with_unit(f'{low} to {high}', unit)}{masked}"
 
 
-def panel(title: str, rows: Sequence[tuple[str, str]], *pictures: tuple[str, str]) -> str:
-    """Return a title, pictures (data addresses, each described in words) and a table of names and values as HTML."""
+def panel(title: str, rows: Sequence[tuple[str, str]], *images: tuple[str, str]) -> str:
+    """Return a title, images (data addresses, each described in words) and a table of names and values as HTML."""
     cells = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in rows
     )
-    images = "".join(
-        f'<img src="{picture}" alt="{escape(describes)}" style="display:block;max-width:100%">'
-        for picture, describes in pictures
+    tags = "".join(
+        f'<img src="{image}" alt="{escape(describes)}" style="display:block;max-width:100%">'
+        for image, describes in images
     )
-    return f"<div><p><b>{escape(title)}</b></p>{images}<table><tbody>{cells}</tbody></table></div>"
+    return f"<div><p><b>{escape(title)}</b></p>{tags}<table><tbody>{cells}</tbody></table></div>"
 
 
-def picture(
-    draw: Callable[[Figure], object], width: float, height: float, size: float = 8.0, form: str = "png"
-) -> str:
+def image(draw: Callable[[Figure], object], width: float, height: float, size: float = 8.0, form: str = "png") -> str:
     """Return a figure of that size (inches), with text of `size` points, as a PNG or SVG in a data address."""
     from matplotlib.figure import Figure
 
@@ -96,7 +94,7 @@ def show_slices(volume: Drawable) -> str:
         draw_slices(line, volume, colour_range(shown(volume)))
         add_colour_bar(line, label_of(volume.quantity))
 
-    return picture(draw, 8.5, 2.8)
+    return image(draw, 8.5, 2.8)
 
 
 def show_views(
@@ -128,4 +126,4 @@ def show_views(
             grid[0, column].set_title(names[view], parse_math=False)
         add_colour_bar(list(grid.ravel()), label)
 
-    return picture(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 0.5 + 1.15 * len(components))
+    return image(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 0.5 + 1.15 * len(components))

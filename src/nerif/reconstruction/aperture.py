@@ -20,7 +20,7 @@ OF_AREA, MOST = 2, 12
 def check_aperture(aperture: str) -> None:
     """Raise InputError unless it is one of APERTURES."""
     if aperture not in APERTURES:
-        raise InputError(f"aperture: expected one of {', '.join(APERTURES)}, got '{aperture}'")
+        raise InputError(f"expected one of {', '.join(APERTURES)}, got '{aperture}'", field="aperture")
 
 
 def seen_through(measurement: Measurement, aperture: str) -> Measurement:
@@ -39,8 +39,9 @@ def seen_through(measurement: Measurement, aperture: str) -> Measurement:
     lenses = [camera.lens for camera in measurement.cameras if camera.lens is not None]
     if aperture == "on" and not any(lens.diameter > 0 for lens in lenses):
         raise InputError(
-            "aperture: expected a measurement that knows aperture_diameter (mm), got one that does not; add it to the "
-            "calibration (nerif calibrate --aperture-diameter) or measurement file, or leave --aperture on out"
+            "expected a measurement that knows aperture_diameter (mm), got one that does not; add it to the "
+            "calibration (nerif calibrate --aperture-diameter) or measurement file, or leave --aperture on out",
+            field="aperture",
         )
     if (aperture != "off" and any(lens.wide for lens in lenses)) or not lenses:
         return measurement

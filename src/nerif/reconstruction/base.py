@@ -162,9 +162,9 @@ class Reconstruction:
             if name in last:
                 rows.append(("Misfit", f"{number(last[name], 3)} {meaning}"))
                 break
-        picture = show_slices(volume)
+        image = show_slices(volume)
         caption = f"{describe(self.quantity)[1].capitalize()} in the three middle slices"
-        return panel("Reconstruction", rows + volume.summary(), (picture, caption))
+        return panel("Reconstruction", rows + volume.summary(), (image, caption))
 
 
 class Reconstructor(ABC):
@@ -177,7 +177,7 @@ class Reconstructor(ABC):
     aperture: str
     """Whether pixels see through the whole of their lens (aperture.py)."""
     source: str
-    """Whether it goes by pictures, displacements or both (sources.py)."""
+    """Whether it goes by images, displacements or both (sources.py)."""
 
     @abstractmethod
     def __call__(

@@ -21,8 +21,9 @@ def check_bounds(lower: float | None, upper: float | None) -> None:
     low, high = -math.inf if lower is None else lower, math.inf if upper is None else upper
     if not low <= 0 <= high or low == high:
         raise InputError(
-            f"lower, upper: expected bounds of the field around 0, the ambient, got {lower} to {upper}; those of an "
-            "index are of the excess over the ambient"
+            f"expected bounds of the field around 0, the ambient, got {lower} to {upper}; those of an "
+            "index are of the excess over the ambient",
+            field="lower, upper",
         )
 
 
@@ -40,8 +41,9 @@ def field_bounds(measurement: Measurement, lower: float | None, upper: float | N
     if not low <= 0 <= high or low == high:
         names = " and ".join(name for name, value in asked.items() if value is not None)
         raise InputError(
-            f"{names}: expected to leave a range around 0, got {low:g} to {high:g} with the bounds of "
-            f"{technique.quantity}, {least:g} to {most:g}; give another value, or none"
+            f"expected to leave a range around 0, got {low:g} to {high:g} with the bounds of "
+            f"{technique.quantity}, {least:g} to {most:g}; give another value, or none",
+            field=names,
         )
     return low, high
 
@@ -57,8 +59,9 @@ def check_resumed(began: tuple[float, float], asked: tuple[float, float]) -> Non
     if not all(math.isclose(a, b, rel_tol=1e-4) for a, b in zip(began, asked, strict=True)):
         first, other = (f"{low:g} to {high:g}" for low, high in (began, asked))
         raise InputError(
-            f"resume: expected the bounds that the run began with, {first}, got {other}; give the same --lower and "
-            "--upper, or start without --resume"
+            f"expected the bounds that the run began with, {first}, got {other}; give the same --lower and "
+            "--upper, or start without --resume",
+            field="resume",
         )
 
 

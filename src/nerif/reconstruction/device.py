@@ -207,15 +207,16 @@ def resolve_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise InputError(f"device: expected auto, cpu, cuda or cuda:N, got '{name}'") from None
+        raise InputError(f"expected auto, cpu, cuda or cuda:N, got '{name}'", field="device") from None
     if device.type not in ("cpu", "cuda"):
-        raise InputError(f"device: expected auto, cpu, cuda or cuda:N, got '{name}'")
+        raise InputError(f"expected auto, cpu, cuda or cuda:N, got '{name}'", field="device")
     if name == "cuda":
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))  # torchrun: a GPU for each process
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise InputError(
-            f"device: expected one of {torch.cuda.device_count()} GPUs, got '{name}'; use --device cpu, "
-            "or install the CUDA build of torch"
+            f"expected one of {torch.cuda.device_count()} GPUs, got '{name}'; use --device cpu, "
+            "or install the CUDA build of torch",
+            field="device",
         )
     return device
 

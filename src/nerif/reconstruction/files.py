@@ -42,6 +42,7 @@ __all__ = [
     "write_state",
 ]
 
+
 def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
     """Return a digest of each part of what a reconstruction sees of a measurement, by the part's name.
 
@@ -82,14 +83,16 @@ def check_fingerprint(kept: dict[str, str] | None, asked: dict[str, str]) -> Non
     """
     if kept is None:
         raise InputError(
-            "resume: the checkpoint does not tell which data it belongs to, so it is of another version of nerif; "
-            "start without --resume"
+            "the checkpoint does not tell which data it belongs to, so it is of another version of nerif; "
+            "start without --resume",
+            field="resume",
         )
     changed = [name for name in asked if kept.get(name) != asked[name]]
     if changed:
         raise InputError(
-            f"resume: expected the data that the run began with, got other {', '.join(changed)}; "
-            "give the same measurement, --hold-out and --open-faces, or start without --resume"
+            f"expected the data that the run began with, got other {', '.join(changed)}; "
+            "give the same measurement, --withhold and --open-faces, or start without --resume",
+            field="resume",
         )
 
 
@@ -153,7 +156,7 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
     path = directory / FIELD
     if not path.is_file():
         what = "the directory has no" if directory.is_dir() else "no such directory with a"
-        raise InputError(f"{directory}: expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first")
+        raise InputError(f"expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first", field=directory)
     tensors, about = _load(path)
     try:
         lower, upper = about["box"]
@@ -173,7 +176,9 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         network.eval().requires_grad_(False)
         return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path}: not a field of this version of nerif ({type(error).__name__}: {error})") from None
+        raise InputError(
+            f"not a field of this version of nerif ({type(error).__name__}: {error})", field=path
+        ) from None
 
 
 def read_quantity(directory: Path) -> str:
@@ -210,7 +215,7 @@ def read_state(directory: Path) -> State:
     """
     path = directory / CHECKPOINT
     if not path.is_file():
-        raise InputError(f"{directory}: expected {CHECKPOINT} to resume from, got none; start without --resume")
+        raise InputError(f"expected {CHECKPOINT} to resume from, got none; start without --resume", field=directory)
     tensors, scalars = _load(path)
     return State(tensors, scalars)
 
@@ -234,4 +239,4 @@ def _load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
             about = json.loads((file.metadata() or {})["nerif"])
             return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: damaged or not written by nerif ({error})") from None
+        raise InputError(f"damaged or not written by nerif ({error})", field=path) from None

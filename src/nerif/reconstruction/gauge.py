@@ -34,8 +34,9 @@ def check_gauge(measurement: Measurement, faces: tuple[str, ...], hull: bool = T
     """Refuse a reconstruction that leaves a constant open, and of which nothing is known to be ambient."""
     if is_open(measurement) and not faces and not (hull and measurement.flow_mask is not None):
         raise InputError(
-            "ambient_faces: expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
-            "fix the index only up to a constant"
+            "expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
+            "fix the index only up to a constant",
+            field="ambient_faces",
         )
 
 
@@ -48,10 +49,12 @@ def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
         If the measurement has no flow mask, or no voxel is left.
     """
     if measurement.flow_mask is None:
-        raise InputError("flow_mask: expected masks in the measurement to carve the visual hull, got none")
+        raise InputError("expected masks in the measurement to carve the visual hull, got none", field="flow_mask")
     inside = _in_hull(measurement, measurement.flow_mask, grid)
     if not bool(inside.any()):
-        raise InputError("flow_mask: the masks leave no voxel of the box; are they inverted, or of other views?")
+        raise InputError(
+            "the masks leave no voxel of the box; are they inverted, or of other views?", field="flow_mask"
+        )
     return inside
 
 

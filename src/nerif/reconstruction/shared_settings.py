@@ -23,13 +23,13 @@ class SharedSettings(Reconstructor):
     are means over their window where that is; or all are thin rays (off)."""
     refine: tuple[str, ...] = ()
     """Refined together with the field, held by their standard deviations: cameras (where they stand and look), shift
-    (of whole pictures, as of a shaken camera), focal, background (its distance)."""
+    (of whole images, as of a shaken camera), focal, background (its distance)."""
     pose_sigma_mm: float | None = None
     """Standard deviation of where a camera stands, mm; else the pose_sigma of the measurement, or 0.2."""
     pose_sigma_deg: float | None = None
     """Standard deviation of how a camera is turned, degrees; else the pose_sigma of the measurement, or 0.02."""
     shift_sigma_px: float = 0.05
-    """Standard deviation of the shift of a picture; of turn and zoom of it, at its edge, a fifth."""
+    """Standard deviation of the shift of an image; of turn and zoom of it, at its edge, a fifth."""
     symmetry: str = NO_SYMMETRY
     """Of the flow: none, axis (alike all around it, so that one view is enough), axis+N (with N harmonics of the angle
     around it, for several views), or planar (alike along a line, as between windows)."""
@@ -57,13 +57,13 @@ class SharedSettings(Reconstructor):
 
     def __post_init__(self) -> None:
         if not self.time_limit >= 0:
-            raise InputError(f"time_limit: expected 0 or more, got {self.time_limit}")
+            raise InputError(f"expected 0 or more, got {self.time_limit}", field="time_limit")
         check_aperture(self.aperture)
         check_refined(self.refine, self.pose_sigma_mm, self.pose_sigma_deg, self.shift_sigma_px)
         parse_symmetry(self.symmetry)
         for name in ("axis_sigma_mm", "axis_sigma_deg"):
             if not (getattr(self, name) or 0) >= 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+                raise InputError(f"expected 0 or more, got {getattr(self, name)}", field=name)
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
         parse_faces(self.open_faces, "open_faces")

@@ -1,7 +1,7 @@
-"""What a reconstruction goes by, where a measurement holds displacements and the pictures they were found in.
+"""What a reconstruction goes by, where a measurement holds displacements and the images they were found in.
 
-Pictures are met only where the pattern is already at the right dot. So a network begins with the displacements, where
-there are some, else with pictures blurred by several pixels, and goes on with pictures that are SOFT. Between pixels a
+Images are met only where the pattern is already at the right dot. So a network begins with the displacements, where
+there are some, else with images blurred by several pixels, and goes on with images that are SOFT. Between pixels a
 sharp pattern is not known: that much blur takes more from what cubic splines get wrong than from the pattern
 (docs/decisions/028).
 """
@@ -22,7 +22,7 @@ from nerif.data.measurement import Measurement, Observation
 
 __all__ = ["SOURCES", "Stage", "check_source", "chosen_source", "of_source", "stages"]
 
-SOURCES = ("auto", "pictures", "displacements", "both")
+SOURCES = ("auto", "images", "displacements", "both")
 
 SOFT = 0.6  # px, standard deviation
 BLURS = (4.0, 2.0, 1.0)  # px
@@ -48,39 +48,40 @@ class Stage:
 
 
 def check_source(source: str, measurement: Measurement | None = None) -> None:
-    """Raise InputError unless it is one of SOURCES, and a measurement that is given holds the pictures asked for, or
-    displacements beside its pictures where those are.
+    """Raise InputError unless it is one of SOURCES, and a measurement that is given holds the images asked for, or
+    displacements beside its images where those are.
     """
     if source not in SOURCES:
-        raise InputError(f"from: expected one of {', '.join(SOURCES)}, got '{source}'")
+        raise InputError(f"expected one of {', '.join(SOURCES)}, got '{source}'", field="from")
     if measurement is None:
         return
-    pictures, found = _pair(measurement)
-    if pictures is None and source in ("pictures", "both"):
+    images, found = _pair(measurement)
+    if images is None and source in ("images", "both"):
         names = " and ".join(o.technique.measured for o in measurement.observations)
         raise InputError(
-            f"from: expected a measurement with pictures (variables reference and flow) for '{source}', got {names}; "
-            "nerif displacement writes them"
+            f"expected a measurement with images (variables reference and flow) for '{source}', got {names}; "
+            "nerif displacement writes them",
+            field="from",
         )
-    if pictures is not None and found is None and source in ("displacements", "both"):
-        raise InputError(f"from: expected displacements for '{source}', got pictures alone; give --from pictures")
+    if images is not None and found is None and source in ("displacements", "both"):
+        raise InputError(f"expected displacements for '{source}', got images alone; give --from images", field="from")
 
 
 def chosen_source(measurement: Measurement, source: str, preferred: str) -> str:
-    """Return what "auto" means where a measurement holds both displacements and pictures; any other source as it is."""
-    pictures, found = _pair(measurement)
-    return preferred if source == "auto" and pictures is not None and found is not None else source
+    """Return what "auto" means where a measurement holds both displacements and images; any other source as it is."""
+    images, found = _pair(measurement)
+    return preferred if source == "auto" and images is not None and found is not None else source
 
 
-def of_source(measurement: Measurement, source: str, blur: float = SOFT, preferred: str = "pictures") -> Measurement:
-    """Return the measurement with what a reconstruction is to go by: pictures, displacements, or both.
+def of_source(measurement: Measurement, source: str, blur: float = SOFT, preferred: str = "images") -> Measurement:
+    """Return the measurement with what a reconstruction is to go by: images, displacements, or both.
 
-    What is measured by other techniques is left as it is. Pictures keep what displacements tell, as a guess.
+    What is measured by other techniques is left as it is. Images keep what displacements tell, as a guess.
 
     Parameters
     ----------
     source : one of SOURCES
-    blur : of the pictures, standard deviation in px
+    blur : of the images, standard deviation in px
     preferred : what "auto" takes where there are both
 
     Raises
@@ -89,50 +90,50 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT, preferr
         If the measurement does not hold what is asked for.
     """
     check_source(source, measurement)
-    pictures, found = _pair(measurement)
-    if pictures is None:
+    images, found = _pair(measurement)
+    if images is None:
         return measurement
     source = chosen_source(measurement, source, preferred)
     if found is not None and source == "displacements":
-        return pictures.without(measurement)
+        return images.without(measurement)
     whole = measurement if source == "both" or found is None else found.without(measurement)
     sizes = [camera.image_size for camera in whole.cameras]
-    maps = pictures.technique.softened(whole.maps, sizes, blur)
-    measured = pictures.technique.measured
-    maps[measured] = maps[measured].where(whole.usable_for(_pair(whole)[0] or pictures), math.nan)
+    maps = images.technique.softened(whole.maps, sizes, blur)
+    measured = images.technique.measured
+    maps[measured] = maps[measured].where(whole.usable_for(_pair(whole)[0] or images), math.nan)
     if found is not None:
         known = [measurement.names.index(name) for name in whole.names]
-        maps[pictures.technique.guess] = _filled(measurement, found)[known]
+        maps[images.technique.guess] = _filled(measurement, found)[known]
     return replace(whole, maps=maps)
 
 
 def stages(measurement: Measurement, source: str) -> list[Stage]:
     """Return the parts of a network's run on a measurement (see the head of this file)."""
-    pictures, found = _pair(measurement)
+    images, found = _pair(measurement)
     final = of_source(measurement, source)
 
     def last() -> Measurement:
         return final
 
-    if pictures is None or source == "displacements":
+    if images is None or source == "displacements":
         names = " and ".join(o.technique.measured for o in final.observations)
         return [Stage(0.0, last, names)]
-    ends = [Stage(begin, last, "pictures") for begin in (SHARP_FROM, *SETTLED)]
+    ends = [Stage(begin, last, "images") for begin in (SHARP_FROM, *SETTLED)]
     if found is not None:
         return [Stage(0.0, partial(of_source, measurement, "displacements"), "displacements"), *ends]
     begins = [SHARP_FROM * i / len(BLURS) for i in range(len(BLURS))]
     blurred = [
-        Stage(begin, partial(of_source, measurement, source, px), f"pictures blurred by {px:g} px")
+        Stage(begin, partial(of_source, measurement, source, px), f"images blurred by {px:g} px")
         for begin, px in zip(begins, BLURS, strict=True)
     ]
     return [*blurred, *ends]
 
 
 def _pair(measurement: Measurement) -> tuple[Observation | None, Observation | None]:
-    """The pictures, and the displacements that were found in them, as far as there are any."""
+    """The images, and the displacements that were found in them, as far as there are any."""
     by_name = {o.technique.name: o for o in measurement.observations}
-    pictures = next((o for o in by_name.values() if o.technique.derived), None)
-    return pictures, None if pictures is None else by_name.get(pictures.technique.derived)
+    images = next((o for o in by_name.values() if o.technique.derived), None)
+    return images, None if images is None else by_name.get(images.technique.derived)
 
 
 def _filled(measurement: Measurement, found: Observation) -> Float[Tensor, "view row column 2"]:

@@ -187,8 +187,9 @@ def check_views(settings: SharedSettings, measurement: Measurement) -> None:
     if parsed is not None and parsed[1] >= views:
         most = "axis" if views == 1 else f"axis+{views - 1}"
         raise InputError(
-            f"symmetry: expected {parsed[1] + 1} views or more for {settings.symmetry}, better {2 * parsed[1] + 1}, "
-            f"got {views}; give --symmetry {most}"
+            f"expected {parsed[1] + 1} views or more for {settings.symmetry}, better {2 * parsed[1] + 1}, "
+            f"got {views}; give --symmetry {most}",
+            field="symmetry",
         )
 
 

@@ -102,7 +102,9 @@ def check_target(measurement: Measurement, model: str = AUTO, linear: bool = Fal
     observations = measurement.observations
     if len(observations) > 1 and any(o.sigma is None for o in observations):
         names, wanted = (" and ".join(getattr(o.technique, a) for o in observations) for a in ("name", "sigma"))
-        raise InputError(f"technique: {names} together are weighed by their noise: expected {wanted}, got not both")
+        raise InputError(
+            f"{names} together are weighed by their noise: expected {wanted}, got not both", field="technique"
+        )
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ def _rays(
     rays, values, sigma = found
     keep = ~rays.exit_faces(measurement.box, open_faces)
     if not bool(keep.any()):
-        raise InputError("open_faces: every ray crosses one of them, so none is left; name fewer faces")
+        raise InputError("every ray crosses one of them, so none is left; name fewer faces", field="open_faces")
     if bool(keep.all()):
         return rays, values, sigma
     return rays[keep], values[keep], None if sigma is None else sigma[keep]

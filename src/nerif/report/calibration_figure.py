@@ -1,4 +1,4 @@
-"""How well a calibration fits: reprojection error of every picture, and where in the pictures it lies."""
+"""How well a calibration fits: reprojection error of every image, and where in the images it lies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["draw_errors", "draw_residuals", "save_errors"]
 
 
 def draw_errors(axes: Axes, calibration: Calibration) -> Axes:
-    """Draw the rms reprojection error (px) of every picture, camera by camera; those left out are hatched."""
+    """Draw the rms reprojection error (px) of every image, camera by camera; those left out are hatched."""
     position, ticks = 0, []
     for k, name in enumerate(calibration.names):
         own = [e for e in calibration.errors if e.camera == name]
@@ -40,7 +40,7 @@ def draw_errors(axes: Axes, calibration: Calibration) -> Axes:
 
 
 def draw_residuals(axes: Axes, residuals: np.ndarray, size: tuple[int, int], scale: float) -> Axes:
-    """Draw residuals (n, 4: u, v, and found less expected in u, v, px) over a picture, `scale` times their length."""
+    """Draw residuals (n, 4: u, v, and found less expected in u, v, px) over an image, `scale` times their length."""
     u, v, du, dv = residuals.T
     axes.quiver(u, v, du * scale, dv * scale, angles="xy", scale_units="xy", scale=1, width=0.003, color="#0072B2")
     axes.set_xlim(-0.5, size[1] - 0.5)
@@ -51,7 +51,7 @@ def draw_residuals(axes: Axes, residuals: np.ndarray, size: tuple[int, int], sca
 
 
 def save_errors(path: Path, calibration: Calibration) -> None:
-    """Write a picture of the errors of every picture and of the residuals over each camera's picture."""
+    """Write an image of the errors of every image and of the residuals over each camera's image."""
     from matplotlib.figure import Figure
 
     count = len(calibration.names)

@@ -16,7 +16,7 @@ MOST = 512  # px along the longer edge of a view
 
 
 def save_displacements(path: Path, measurement: Measurement) -> None:
-    """Write a picture with u and v (px) of every view on one scale; what is not valid is left grey."""
+    """Write an image with u and v (px) of every view on one scale; what is not valid is left grey."""
     from matplotlib.figure import Figure
 
     step = _step(measurement)
@@ -50,7 +50,7 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
 
 
 def save_masks(path: Path, measurement: Measurement) -> None:
-    """Write a picture of how large the values of the first technique are in every view, and of its flow mask."""
+    """Write an image of how large the values of the first technique are in every view, and of its flow mask."""
     from matplotlib.figure import Figure
 
     assert measurement.flow_mask is not None

@@ -33,7 +33,7 @@ def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Ax
     known = {name for record in history for name in record}
     across = "seconds" if "seconds" in known else "step"
     aside = {"step", "epoch", "seconds", "rays_per_second", "learning_rate", "samples", "weight", "voxels", "iteration"}
-    aside |= {"taken_back", "fit_step", "bin_edge", "held_back"}
+    aside |= {"taken_back", "fit_step", "bin_edge", "withheld_residual"}
     names = [n for n in dict.fromkeys(n for record in history for n in record) if n not in aside]
     colours = [*COLOURS.values()]
     drawn = 0
@@ -81,13 +81,13 @@ def draw_view_scores(axes: Axes, views: list[dict[str, Any]]) -> Axes:
         value = view.get(key)
         if value is None:
             continue
-        held = view["held_out"]
+        held = view["withheld"]
         colour = COLOURS["orange"] if held else COLOURS["blue"]
         axes.bar(place, value, width=0.7, color=colour, hatch="///" if held else None, edgecolor="white", linewidth=0)
     if in_sigma:
         axes.axhline(1, color=COLOURS["grey"], linewidth=0.8, linestyle="--")
     names = [f"{v['name']}{', ' + v['measured'] if several else ''}" for v in views]
-    names = [f"{name}\nheld out" if v["held_out"] else name for name, v in zip(names, views, strict=True)]
+    names = [f"{name}\nheld out" if v["withheld"] else name for name, v in zip(names, views, strict=True)]
     axes.set_xticks(list(places), names, rotation=90, parse_math=False)
     axes.set_ylabel("rms error / noise [1]" if in_sigma else f"rms error [{views[0]['unit']}]")
     return axes

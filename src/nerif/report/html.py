@@ -16,7 +16,7 @@ from nerif.data.meridian import Meridian
 from nerif.data.volume import name_of
 from nerif.forward.registry import technique_of
 from nerif.plotting.drawing import drawn_of, map_colours
-from nerif.plotting.notebook import number, picture
+from nerif.plotting.notebook import image, number
 from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.moves_figure import draw_moved_rig, draw_moves
@@ -54,7 +54,7 @@ def render(result: Result) -> str:
     metrics = metrics if isinstance(metrics, list) else []
     views, scales = ([], []) if result.reprojection is None else view_images(result.reprojection, metrics)
     meridian = result.meridian
-    first = next((v.name for v in views if v.held_out), views[0].name if views else "")
+    first = next((v.name for v in views if v.withheld), views[0].name if views else "")
     return render_page(
         kind=_kind(result),
         title=result.directory.resolve().name,
@@ -117,7 +117,7 @@ def _template() -> jinja2.Template:
 
 
 def _plane(meridian: Meridian | None) -> list[tuple[str, str]]:
-    """Titles and pictures of what a symmetric flow is over (r, h)."""
+    """Titles and images of what a symmetric flow is over (r, h)."""
     if meridian is None:
         return []
     plane = "in a plane through the axis" if meridian.axial else "in the plane across"
@@ -130,7 +130,7 @@ def _plane(meridian: Meridian | None) -> list[tuple[str, str]]:
 
 
 def _curves(result: Result) -> list[tuple[str, str]]:
-    """Titles and pictures (SVG as data addresses) of how the run went and of how it compares with the truth."""
+    """Titles and images (SVG as data addresses) of how the run went and of how it compares with the truth."""
     found = []
     if result.history:
         method = str(result.settings.get("method", "nerif"))
@@ -160,7 +160,7 @@ def _curves(result: Result) -> list[tuple[str, str]]:
 
 def svg(draw: Callable[[Axes], object]) -> str:
     """Return a plot as SVG in a data address."""
-    return picture(lambda figure: draw(figure.subplots()), 5.6, 3.6, 10, "svg")
+    return image(lambda figure: draw(figure.subplots()), 5.6, 3.6, 10, "svg")
 
 
 def _kind(result: Result) -> str:

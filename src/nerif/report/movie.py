@@ -49,11 +49,11 @@ class Movie:
 
     def __post_init__(self) -> None:
         if self.style not in STYLES:
-            raise InputError(f"style: expected one of {', '.join(STYLES)}, got '{self.style}'")
+            raise InputError(f"expected one of {', '.join(STYLES)}, got '{self.style}'", field="style")
         if min(self.size) < 16 or any(s % 2 for s in self.size):
-            raise InputError(f"size: expected an even width and height of 16 px or more, got {self.size}")
+            raise InputError(f"expected an even width and height of 16 px or more, got {self.size}", field="size")
         if not self.frames_per_second > 0:
-            raise InputError(f"frames_per_second: expected a positive number, got {self.frames_per_second}")
+            raise InputError(f"expected a positive number, got {self.frames_per_second}", field="frames_per_second")
 
     def quantity_of(self, store: VolumeSequence) -> str:
         """Return what is shown of a store.
@@ -66,19 +66,21 @@ class Movie:
         default = "density" if "density" in store.quantities else field_of(store.quantities)
         chosen = self.quantity or default
         if chosen is None or chosen not in store.quantities:
-            raise InputError(f"quantity: expected one of {', '.join(store.quantities)}, got '{chosen or 'none'}'")
+            raise InputError(
+                f"expected one of {', '.join(store.quantities)}, got '{chosen or 'none'}'", field="quantity"
+            )
         return chosen
 
-    def pictures(self, store: VolumeSequence, frames: Sequence[int]) -> Iterator[np.ndarray]:
+    def images(self, store: VolumeSequence, frames: Sequence[int]) -> Iterator[np.ndarray]:
         """Draw the frames one after the other: (row, column, 3) of 8 bit. The colours are those of the whole movie."""
         quantity = self.quantity_of(store)
         limits, found = ranges_over_time(store, quantity, frames)
         level = found if self.level is None else self.level
         for i, instant in zip(frames, instants([store.times[i] for i in frames]), strict=True):
             volume = store.volume(i, quantity)
-            yield self._picture(volume, f"t = {instant}", limits, level)
+            yield self._image(volume, f"t = {instant}", limits, level)
 
-    def _picture(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
+    def _image(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
         import pyvista as pv
         from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -155,13 +157,13 @@ class Movie:
             If the ending is another, no frame is there, or a library is missing.
         """
         if path.suffix not in FORMATS:
-            raise InputError(f"out: expected a name ending in {' or '.join(FORMATS)}, got '{path.name}'")
+            raise InputError(f"expected a name ending in {' or '.join(FORMATS)}, got '{path.name}'", field="out")
         if not len(frames):
-            raise InputError(f"{store.path}: no frame of it is there yet")
+            raise InputError("no frame of it is there yet", field=store.path)
         self.quantity_of(store)
         with atomic(path) as part, _writer(part, self.frames_per_second) as writer:
-            for done, picture in enumerate(self.pictures(store, frames), start=1):
-                writer.append_data(picture)
+            for done, image in enumerate(self.images(store, frames), start=1):
+                writer.append_data(image)
                 on_frame(done)
 
 
@@ -223,7 +225,7 @@ def _writer(path: Path, frames_per_second: float) -> Any:
             return imageio.get_writer(path, mode="I", duration=1000 / frames_per_second, loop=0)
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
-        raise InputError(f"movie: {error.name} is not installed; {install('movie')}") from None
+        raise InputError(f"{error.name} is not installed; {install('movie')}", field="movie") from None
     # yuv420p is what browsers and slides play
     return imageio.get_writer(
         path, fps=frames_per_second, codec="libx264", quality=8, pixelformat="yuv420p", macro_block_size=2

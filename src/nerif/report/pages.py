@@ -49,7 +49,7 @@ JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature":
 NOT_IN_FILES = r"[^\w.+-]"
 
 DOUBTFUL = 0.1  # standard deviation over the range of the colours, above which slices are hatched
-FEW = 3  # rows or columns of pictures that are drawn as lines
+FEW = 3  # rows or columns of images that are drawn as lines
 
 Seen = tuple[Observation, np.ndarray, np.ndarray, np.ndarray | None]
 """What a view saw by one technique: measured, NaN where not; predicted; sigma, if known: (row, column, c)."""
@@ -173,7 +173,7 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
             predicted = reprojection.maps[o.technique.name][inside].numpy()
             seen.append((o, np.where(mask, o.values[inside].numpy(), np.nan), predicted, sigma))
     figure = (_lines if min(height_px, width_px) <= FEW else _maps)(seen, width)
-    held = ", held out" if measurement.names[i] in reprojection.held_out else ""
+    held = ", held out" if measurement.names[i] in reprojection.withheld else ""
     figure.suptitle(f"view {measurement.names[i]}{held}", parse_math=False)
     return figure
 

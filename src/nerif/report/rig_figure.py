@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["PictureCorners", "draw_rig", "draw_two_sides", "picture_corners", "save_rig"]
+__all__ = ["ImageCorners", "draw_rig", "draw_two_sides", "image_corners", "save_rig"]
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")  # Okabe & Ito
 
@@ -27,12 +27,12 @@ COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")  # 
 def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) -> Axes3D:
     """Draw cameras as the pyramids or, telecentric, the beams they see along; backgrounds, box and world axes; mm.
 
-    A thick edge marks the top of the picture.
+    A thick edge marks the top of the image.
     """
     from matplotlib.ticker import MaxNLocator
 
     middle = np.zeros(3) if box is None else np.array(box.centre)
-    seen = [picture_corners(c, middle) for c in cameras]
+    seen = [image_corners(c, middle) for c in cameras]
     centres = np.stack([s.start.mean(axis=0) for s in seen])
     reach = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or float(np.linalg.norm(centres[0]))
     everything = [centres]
@@ -90,13 +90,13 @@ def draw_two_sides(figure: Figure, cameras: Sequence[Camera], box: Box | None = 
     figure.text(
         0.5, 0.02,
         "solid pyramids, or beams of telecentric lenses: cameras; dashed: what they see of their backgrounds; "
-        "thick edges: top of the picture; black: box",
+        "thick edges: top of the image; black: box",
         ha="center",
     )  # fmt: skip
 
 
 def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> None:
-    """Write a picture of the rig from two sides."""
+    """Write an image of the rig from two sides."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -108,8 +108,8 @@ def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> N
 
 
 @dataclass(frozen=True)
-class PictureCorners:
-    """The lines along which a camera sees the four corners of its picture, the top edge first; mm.
+class ImageCorners:
+    """The lines along which a camera sees the four corners of its image, the top edge first; mm.
 
     Parameters
     ----------
@@ -123,10 +123,10 @@ class PictureCorners:
     end: Float[np.ndarray, "4 3"]
 
 
-def picture_corners(camera: Camera, middle: Float[np.ndarray, 3]) -> PictureCorners:
-    """Return the lines to the corners of the picture of a camera that looks at `middle` (mm).
+def image_corners(camera: Camera, middle: Float[np.ndarray, 3]) -> ImageCorners:
+    """Return the lines to the corners of the image of a camera that looks at `middle` (mm).
 
-    Lines without a beginning are drawn from where the camera's frame is, or from twice the diagonal of the picture
+    Lines without a beginning are drawn from where the camera's frame is, or from twice the diagonal of the image
     before the middle if that is further off. Where the distortion of a corner cannot be inverted, it is left out.
     """
     height, width = camera.image_size
@@ -141,7 +141,7 @@ def picture_corners(camera: Camera, middle: Float[np.ndarray, 3]) -> PictureCorn
     before = np.minimum(0.0, abreast - 2 * np.linalg.norm(origin[2] - origin[0]))
     first = np.maximum(before, rays.begin.numpy()[:, None])
     last = abreast if rays.background is None else rays.background.distance.numpy()[:, None]
-    return PictureCorners(origin + first * direction, direction, origin + last * direction)
+    return ImageCorners(origin + first * direction, direction, origin + last * direction)
 
 
 def _close(axes: Axes3D, corners: np.ndarray, **style: object) -> None:

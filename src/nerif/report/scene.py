@@ -1,4 +1,4 @@
-"""What the pages draw their own pictures from: grids, quantities and colours as JSON, and packed arrays beside it."""
+"""What the pages draw their own images from: grids, quantities and colours as JSON, and packed arrays beside it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nerif.plotting.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, c
 from nerif.report import packing
 from nerif.report.isosurface import default_level
 from nerif.report.pages import error_of
-from nerif.report.rig_figure import picture_corners
+from nerif.report.rig_figure import image_corners
 from nerif.report.view_images import colour_table
 from nerif.results.directory import Result
 
@@ -134,18 +134,18 @@ def _variants(sources: dict[str, Volume]) -> dict[str, str]:
 
 
 def _cameras(result: Result) -> list[dict[str, Any]]:
-    """The lines to the corners of the picture, from where to draw them to the background, of every camera; mm."""
+    """The lines to the corners of the image, from where to draw them to the background, of every camera; mm."""
     if result.measurement is None:
         return []
-    held_out = () if result.reprojection is None else result.reprojection.held_out
+    withheld = () if result.reprojection is None else result.reprojection.withheld
     found = []
     middle = np.array(result.measurement.box.centre)
     for camera in result.measurement.cameras:
-        corners = picture_corners(camera, middle)
+        corners = image_corners(camera, middle)
         found.append(
             {
                 "name": camera.name,
-                "held_out": camera.name in held_out,
+                "withheld": camera.name in withheld,
                 "background": camera.background is not None,
                 "starts": np.round(corners.start, 3).tolist(),
                 "directions": np.round(corners.direction, 6).tolist(),

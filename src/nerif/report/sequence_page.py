@@ -37,10 +37,12 @@ def render_sequence(store: VolumeSequence) -> str:
     """
     there = frames_there(store)
     if not there:
-        raise InputError(f"{store.path}: no frame of it is done yet; run nerif sequence again")
+        raise InputError("no frame of it is done yet; run nerif sequence again", field=store.path)
     found = field_of(store.quantities)
     if found is None:
-        raise InputError(f"{store.path}: expected index_excess among its quantities, got {', '.join(store.quantities)}")
+        raise InputError(
+            f"expected index_excess among its quantities, got {', '.join(store.quantities)}", field=store.path
+        )
     chosen = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST)).round().astype(int))]
     scene, arrays = scene_over_time(store, chosen)
     statements = _statements(store)
@@ -78,7 +80,7 @@ def _statements(store: VolumeSequence) -> list[Statement]:
         reasons = [str(r) for r in store.array("reason")[:]]
         first = f"frame {failed[0]}: {reasons[failed[0]]}"
         found.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
-    held = set(store.attributes.get("hold_out", ()))
+    held = set(store.attributes.get("withhold", ()))
     if not held:
         found.append(Statement("note", "No view was held out, so nothing here is a test on unseen data."))
     return found
@@ -107,7 +109,7 @@ def _fit(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
     scores = store.view_scores
     if not scores:
         return [("Truth", "volumes as they are")]
-    held = np.array([v in store.attributes.get("hold_out", ()) for v in store.attributes["views"]])
+    held = np.array([v in store.attributes.get("withhold", ()) for v in store.attributes["views"]])
     rows = []
     for (name, which), of in itertools.product((("Training views", ~held), ("Held-out views", held)), scores):
         cc, rms = (np.asarray(array[:])[there][:, which] for array in (of.cc, of.rms))
@@ -126,7 +128,7 @@ def _curves(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
     if not scores:
         return []
     times = np.array(store.times)[there] * 1e3
-    names, held = store.attributes["views"], store.attributes.get("hold_out", ())
+    names, held = store.attributes["views"], store.attributes.get("withhold", ())
     seconds = np.asarray(store.array("seconds")[:])[there]
 
     def draw_rms(of: ViewScores, axes: Axes) -> None:

@@ -28,7 +28,7 @@ VITAL = (FIELD, METRICS, VOLUME)
 
 LEVELS = ("good", "note", "warning", "bad")
 OF_WORD = {"use": "good", "use with care": "warning", "do not use": "bad", "cannot tell": "note"}
-HELD_OUT_CC = 0.95  # a view that was not seen is predicted this well in all our simulated cases with nine views
+WITHHELD_CC = 0.95  # a view that was not seen is predicted this well in all our simulated cases with nine views
 TRUTH_CC = 0.98, 0.9  # good and fair, of all our simulated cases
 NAMED = 4  # views
 ALIKE = 0.01  # of what is predicted: smaller leftovers, even if they are alike, move a field by less than noise does
@@ -54,8 +54,8 @@ def measured(result: Result) -> list[tuple[str, str]]:
     m = result.measurement
     if m is None:
         return [("Measurement", str(result.settings.get("measurement", "unknown")))]
-    held_out = result.settings.get("hold_out", ()) if result.reprojection is None else result.reprojection.held_out
-    return m.summary(len(set(held_out) & set(m.names)))
+    withheld = result.settings.get("withhold", ()) if result.reprojection is None else result.reprojection.withheld
+    return m.summary(len(set(withheld) & set(m.names)))
 
 
 def came_out(result: Result) -> list[tuple[str, str]]:
@@ -151,7 +151,7 @@ def _scores(view: dict[str, Any]) -> str:
 def trust(result: Result) -> list[Statement]:
     """Return what to know before trusting it, the gravest first."""
     found = [Statement("bad" if gap.what in VITAL else "note", gap.sentence) for gap in result.missing]
-    found += _of_outcome(result) + _of_held_out(result) + _of_residual(result) + _of_leftovers(result)
+    found += _of_outcome(result) + _of_withheld(result) + _of_residual(result) + _of_leftovers(result)
     found += _of_truth(result)
     found += _of_gas(result) + _of_masks(result) + _of_repetitions(result) + _of_rig(result)
     return sorted(found, key=lambda s: -LEVELS.index(s.level))
@@ -172,14 +172,14 @@ def _place(view: dict[str, Any], views: list[dict[str, Any]]) -> str:
     return f"{view['name']}, {view['measured']}" if several else str(view["name"])
 
 
-def _views(result: Result, held_out: bool) -> list[dict[str, Any]]:
+def _views(result: Result, withheld: bool) -> list[dict[str, Any]]:
     views = result.metrics.get("views")
-    return [v for v in views if v.get("held_out") is held_out] if isinstance(views, list) else []
+    return [v for v in views if v.get("withheld") is withheld] if isinstance(views, list) else []
 
 
 def looked(result: Result) -> list[dict[str, Any]]:
     """Scores of the view that was kept out of a short run first."""
-    return list((result.metrics.get("first_look") or {}).get("views") or [])
+    return list((result.metrics.get("cross_validation") or {}).get("views") or [])
 
 
 def _values(views: list[dict[str, Any]], key: str) -> list[float]:
@@ -208,7 +208,7 @@ def _of_outcome(result: Result) -> list[Statement]:
     return [Statement(level, text.strip())] if text else []
 
 
-def _of_held_out(result: Result) -> list[Statement]:
+def _of_withheld(result: Result) -> list[Statement]:
     seen, held = _views(result, False), _views(result, True)
     what = "The field predicts"
     if not held and looked(result):
@@ -218,7 +218,7 @@ def _of_held_out(result: Result) -> list[Statement]:
             text = "The field was not compared with any view: nerif evaluate --measurement FILE does it."
             return [Statement("warning", text)]
         text = "No view was held out, so the field was not checked against data the reconstruction has not seen."
-        return [Statement("warning", f"{text} Repeat with --hold-out auto, or a view.")]
+        return [Statement("warning", f"{text} Repeat with --withhold auto, or a view.")]
     known = [v for v in held if v.get("cc") is not None]
     if not known:
         return [Statement("warning", "The held-out views have no pixels to compare.")]
@@ -227,8 +227,8 @@ def _of_held_out(result: Result) -> list[Statement]:
     among = f"; the worst of {len(known)}" if len(known) > 1 else ""
     if held == looked(result):  # of a short run, which is no measure of the long one: the verdict allows for that
         text = f"{what} what has not been seen (view {name}{among}) with CC {cc:.4f}; the whole run has used it."
-        return [Statement("good" if cc >= HELD_OUT_CC else "note", text)]
-    if cc >= HELD_OUT_CC:
+        return [Statement("good" if cc >= WITHHELD_CC else "note", text)]
+    if cc >= WITHHELD_CC:
         beyond = "" if noise is None or noise <= 2 else f", though the error is {noise:.1f} times the noise"
         text = f"{what} what has not been seen (view {name}{among}): CC {cc:.4f}{beyond}."
         return [Statement("warning" if beyond else "good", text)]
@@ -247,7 +247,7 @@ def _of_residual(result: Result) -> list[Statement]:
     known = [v for v in seen if v.get("rms_over_sigma") is not None]
     if not known:
         text = "The noise of the measurement is not known, so there is no telling whether the residual is noise."
-        remedy = "nerif displacement writes sigma." if _of_pictures(seen[0]["measured"]) else "Give its sigma."
+        remedy = "nerif displacement writes sigma." if _of_images(seen[0]["measured"]) else "Give its sigma."
         return [Statement("note", f"{text} {remedy}")]
     lowest, highest = (f(known, key=lambda v: v["rms_over_sigma"]) for f in (min, max))
     low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
@@ -293,8 +293,8 @@ def _left_alike(view: dict[str, Any]) -> float:
     return float(view["leftover"]["alike"] * view["rms"] / signal)
 
 
-def _of_pictures(measured: str) -> bool:
-    """Whether nerif displacement measures it, from pictures of a background."""
+def _of_images(measured: str) -> bool:
+    """Whether nerif displacement measures it, from images of a background."""
     return any(kind.background for kind in TECHNIQUES.values() if kind.measured == measured)
 
 
@@ -338,7 +338,7 @@ def _of_rig(result: Result) -> list[Statement]:
     if not table:
         return []
     first, *lines = moved_lines(table)
-    found = [Statement("note", f"Cameras or pictures were {first}.")]
+    found = [Statement("note", f"Cameras or images were {first}.")]
     return found + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
 
 

@@ -1,4 +1,4 @@
-"""Measured, re-projected and difference of every view as small pictures for the page."""
+"""Measured, re-projected and difference of every view as small images for the page."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
 from nerif.plotting.drawing import map_colours, map_range
 
-__all__ = ["Scale", "ViewImages", "colour_table", "lattice_step", "picture_address", "view_images"]
+__all__ = ["Scale", "ViewImages", "colour_table", "image_address", "lattice_step", "view_images"]
 
-LARGEST = 320  # px along an edge of a picture in the page
-ALL_PICTURES = 4_000_000  # px of all pictures of a page: 5 MB of it
+LARGEST = 320  # px along an edge of an image in the page
+ALL_IMAGES = 4_000_000  # px of all images of a page: 5 MB of it
 FOR_LIMITS = 1 << 20  # px from which the ends of the colours are found
 
 
@@ -43,20 +43,20 @@ class Scale:
 
 @dataclass(frozen=True)
 class ViewImages:
-    """The pictures of a view, as data addresses.
+    """The images of a view, as data addresses.
 
     Parameters
     ----------
     name : of the view
-    held_out : the reconstruction has not seen it
+    withheld : the reconstruction has not seen it
     scores : cc, ssim, rms, rms_over_sigma as far as known, of each technique
     rows : by component, such as u and v: addresses of measured, re-projected, difference
     size : height and width of the view, px
-    shrunk : how many rows and columns one pixel of the pictures stands for
+    shrunk : how many rows and columns one pixel of the images stands for
     """
 
     name: str
-    held_out: bool
+    withheld: bool
     scores: list[dict[str, Any]]
     rows: dict[str, tuple[str, str, str]]
     size: tuple[int, int]
@@ -77,7 +77,7 @@ def lattice_step(measurement: Measurement, most: int) -> int:
 
 
 def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tuple[list[ViewImages], list[Scale]]:
-    """Return the pictures of all views, and the colours of each technique.
+    """Return the images of all views, and the colours of each technique.
 
     Colours are those of all views: up to the 99.8th percentile of what was measured, the 99.5th of the difference; of
     more than a million pixels, on a regular lattice.
@@ -85,7 +85,7 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
     m = reprojection.measurement
     rows: list[dict[str, tuple[str, str, str]]] = [{} for _ in m.cameras]
     count = 3 * len(m.cameras) * sum(len(o.components) for o in m.observations)
-    largest = min(LARGEST, math.isqrt(ALL_PICTURES // count))
+    largest = min(LARGEST, math.isqrt(ALL_IMAGES // count))
     shrinks = [(-(-c.image_size[0] // largest), -(-c.image_size[1] // largest)) for c in m.cameras]
     scales = []
     for o in m.observations:
@@ -102,12 +102,12 @@ def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tu
                 images = (measured[..., c], seen[..., c], seen[..., c] - measured[..., c])
                 ends = (scale.limits, scale.limits, scale.apart)
                 small = [_shrink(image, shrinks[i]) for image in images]
-                first, second, third = (picture_address(x, e) for x, e in zip(small, ends, strict=True))
+                first, second, third = (image_address(x, e) for x, e in zip(small, ends, strict=True))
                 rows[i][component] = first, second, third
     found = [
         ViewImages(
             camera.name,
-            camera.name in reprojection.held_out,
+            camera.name in reprojection.withheld,
             [v for v in metrics if v.get("name") == camera.name],
             rows[i],
             camera.image_size,
@@ -141,7 +141,7 @@ def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Fl
     return image[:height, :width].reshape(height // down, down, width // across, across).mean(axis=(1, 3))
 
 
-def picture_address(
+def image_address(
     image: Float[np.ndarray, "row column"], limits: tuple[float, float], colours: str = ""
 ) -> str:  # fmt: skip
     """Return a PNG of 255 colours between the limits, grey where there is nothing, as a data address.
@@ -157,8 +157,8 @@ def picture_address(
     codes = np.where(np.isfinite(image), np.round(scaled), 255).astype(np.uint8)
     table = colour_table(colours or map_colours(limits))
     palette = [c for i in range(255) for c in table[round(i * 255 / 254)]] + [190, 190, 190]
-    picture = Image.fromarray(codes)
-    picture.putpalette(palette)
+    png = Image.fromarray(codes)
+    png.putpalette(palette)
     buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", optimize=True)
+    png.save(buffer, format="PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

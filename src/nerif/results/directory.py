@@ -47,7 +47,7 @@ __all__ = [
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
 MERIDIAN, LIVE, LIVE_LOOK = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
-TRIALS, FIRST_LOOK, FIGURES, CALIBRATION = "trials", "first_look", "figures", "calibration.toml"
+TRIALS, CROSS_VALIDATION, FIGURES, CALIBRATION = "trials", "cross_validation", "figures", "calibration.toml"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
@@ -148,11 +148,12 @@ class ResultDirectory:
             If it does, or is a file.
         """
         if self.path.is_file():
-            raise InputError(f"{self.path}: expected a directory for --out, got a file")
+            raise InputError("expected a directory for --out, got a file", field=self.path)
         if self.path.is_dir() and any(self.path.iterdir()) and not force:
             raise InputError(
-                f"{self.path}: exists already and was left as it is; give another --out, --force to overwrite, "
-                "or --resume to go on with it"
+                "exists already and was left as it is; give another --out, --force to overwrite, "
+                "or --resume to go on with it",
+                field=self.path,
             )
 
     # -- writing -------------------------------------------------------------------------------------------------
@@ -175,7 +176,7 @@ class ResultDirectory:
         if self.has(CALIBRATION):
             self.files.say(f"{self.path / CALIBRATION}: left as it is; this run did not write it")
         trials = self.path / TRIALS
-        for folder in (*sorted(trials.glob("[0-9]*")), self.path / FIRST_LOOK, self.path / FIGURES):
+        for folder in (*sorted(trials.glob("[0-9]*")), self.path / CROSS_VALIDATION, self.path / FIGURES):
             OwnFiles(folder, self.files.say).remove()
         remove_empty(trials)
 
@@ -216,7 +217,7 @@ class ResultDirectory:
         try:
             known = json.loads(path.read_text()) if path.is_file() else {}
         except ValueError:
-            raise InputError(f"{path}: not a JSON file, or truncated; remove it and evaluate again") from None
+            raise InputError("not a JSON file, or truncated; remove it and evaluate again", field=path) from None
         self.write_metrics({**known, **entries})
 
     def write_volumes(self, volumes: list[Volume]) -> None:
@@ -260,9 +261,11 @@ class ResultDirectory:
         try:
             return _checked(json.loads(path.read_text()))
         except FileNotFoundError:
-            raise InputError(f"{path}: no such file; nerif evaluate {self.path} --measurement FILE adds it") from None
+            raise InputError(
+                f"no such file; nerif evaluate {self.path} --measurement FILE adds it", field=path
+            ) from None
         except ValueError as error:
-            raise InputError(f"{path}: not a JSON file of nerif, or truncated ({error})") from None
+            raise InputError(f"not a JSON file of nerif, or truncated ({error})", field=path) from None
 
     def history(self) -> list[dict[str, float]]:
         """Return the records of history.csv, blanks as NaN."""
@@ -270,7 +273,7 @@ class ResultDirectory:
         with path.open(newline="") as file:
             rows = [{k: _number(v) for k, v in row.items() if k is not None} for row in csv.DictReader(file)]
         if rows and not {"seconds", "step"} & set(rows[0]):
-            raise InputError(f"{path}: expected columns 'seconds' or 'step', got {', '.join(list(rows[0])[:5])}")
+            raise InputError(f"expected columns 'seconds' or 'step', got {', '.join(list(rows[0])[:5])}", field=path)
         return rows
 
     def volumes(self) -> dict[str, Volume]:
@@ -286,9 +289,9 @@ class ResultDirectory:
         return ResultDirectory(self.path / TRIALS / f"{number:02d}", self.files.say)
 
     @property
-    def first_look(self) -> ResultDirectory:
+    def cross_validation(self) -> ResultDirectory:
         """The directory of what was found while a view was kept out."""
-        return ResultDirectory(self.path / FIRST_LOOK, self.files.say)
+        return ResultDirectory(self.path / CROSS_VALIDATION, self.files.say)
 
     def read(self) -> Result:
         """Read what there is, whole, half-finished or broken: what is missing is told in the Result, never fatal.
@@ -299,10 +302,10 @@ class ResultDirectory:
             If there is no such directory, or nothing of a reconstruction in it.
         """
         if not self.path.is_dir():
-            raise InputError(f"{self.path}: no such directory; expected one written by nerif reconstruct")
+            raise InputError("no such directory; expected one written by nerif reconstruct", field=self.path)
         if not any((self.path / name).exists() for name in FILES if name != REPORT):
             known = ", ".join((RUN, METRICS, HISTORY, VOLUME, REPROJECTION))
-            raise InputError(f"{self.path}: expected a result of nerif reconstruct, got none of {known} in it")
+            raise InputError(f"expected a result of nerif reconstruct, got none of {known} in it", field=self.path)
         finished = self.has(FIELD)
         missing: list[Missing] = []
         not_yet: list[str] = []
@@ -409,12 +412,12 @@ def _checked(found: Any) -> dict[str, Any]:
         if not isinstance(rows, list) or not all(isinstance(row, dict) and known in row for row in rows):
             raise ValueError(f"'{name}' is not a list of tables with '{known}'")
     for name, known in (
-        ("uncertainty", "members"), ("coverage", "share"), ("first_look", "views"),
+        ("uncertainty", "members"), ("coverage", "share"), ("cross_validation", "views"),
     ):  # fmt: skip
         table = found.get(name, {known: 0})
         if not isinstance(table, dict) or known not in table:
             raise ValueError(f"'{name}' is not a table with '{known}'")
-    first = found.get("first_look", {}).get("views") or []
+    first = found.get("cross_validation", {}).get("views") or []
     # older files knew displacements only
     for row in (*found.get("views", []), *first):
         for key, value in (("measured", "displacement"), ("unit", "px"), ("rms", row.get("rms_px"))):

@@ -57,7 +57,7 @@ class Look:
     values : [z, y, x] of it
     lower, upper : corners of its box, mm
     view : name of the view; empty where there is none
-    held_out : whether the work does without the view
+    withheld : whether the work does without the view
     measured, predicted : (row, column, component) of the view, on every so many pixels; NaN where not measured
     components : their names
     unit : of measured and predicted
@@ -70,7 +70,7 @@ class Look:
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
     view: str
-    held_out: bool
+    withheld: bool
     measured: np.ndarray
     predicted: np.ndarray
     components: tuple[str, ...]
@@ -105,12 +105,12 @@ class Live:
         self._curve: list[dict[str, float]] = []
         self._every = 1
 
-    def watching(self, monitor: Monitor, held_out: bool, looks: bool = True) -> Monitor:
+    def watching(self, monitor: Monitor, withheld: bool, looks: bool = True) -> Monitor:
         """Return a monitor that also tells the directory.
 
         Parameters
         ----------
-        held_out : whether the work is done without the view
+        withheld : whether the work is done without the view
         looks : whether to look at the field; of repetitions of a run there is nothing new to see
         """
 
@@ -118,13 +118,13 @@ class Live:
         def training(title: str) -> Iterator[OnStep]:
             with monitor.training(title) as told:
                 last: list[Step] = []
-                yield compose(self._teller(title, held_out, looks, last), told)
+                yield compose(self._teller(title, withheld, looks, last), told)
             if last:  # where it ended
                 self._write(title, last[0])
 
         return replace(monitor, training=training)
 
-    def _teller(self, title: str, held_out: bool, looks: bool, newest: list[Step]) -> OnStep:
+    def _teller(self, title: str, withheld: bool, looks: bool, newest: list[Step]) -> OnStep:
         begun = time.monotonic()
         written, spent, last = -EVERY, 0.0, 0.0
         self._curve, self._every = [], 1
@@ -140,7 +140,7 @@ class Live:
                 self._write(title, step)
                 written = now
             if looks and now - begun >= FIRST and spent + last <= SHARE * (now - begun):
-                self._look(title, step, held_out)
+                self._look(title, step, withheld)
                 last = time.monotonic() - now
                 spent += last
 
@@ -163,12 +163,12 @@ class Live:
             write_json(path, {**entries, "curve": curve})
 
     @torch.no_grad()
-    def _look(self, title: str, step: Step, held_out: bool) -> None:
+    def _look(self, title: str, step: Step, withheld: bool) -> None:
         m, field = self.measurement, step.field()
         grid = Grid.of_resolution(m.box, VOXELS)
         arrays: dict[str, np.ndarray] = {"values": field.sample(grid, _device(field)).numpy()}
         about: dict[str, Any] = {"title": title, "seconds": step.seconds, "quantity": m.quantity}
-        about |= {"lower": m.box.lower, "upper": m.box.upper, "held_out": held_out}
+        about |= {"lower": m.box.lower, "upper": m.box.upper, "withheld": withheld}
         about |= {"view": "", "components": (), "unit": ""}
         shown = self._shown()
         if shown is not None:

@@ -56,9 +56,11 @@ class DesignSettings:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
             if value is not None and not value > 0:
-                raise InputError(f"{name}: expected a positive number, got {value}")
+                raise InputError(f"expected a positive number, got {value}", field=name)
         if self.temperature == self.ambient_temperature:
-            raise InputError(f"temperature: expected another one than ambient_temperature, {self.temperature:g} K")
+            raise InputError(
+                f"expected another one than ambient_temperature, {self.temperature:g} K", field="temperature"
+            )
 
     @property
     def contrast(self) -> float:
@@ -81,9 +83,9 @@ class Expectation:
     pixel_at_background: float
     """Edge of a pixel on the background, mm."""
     field_of_view: tuple[float, float]
-    """Width and height of the picture at the flow, mm."""
+    """Width and height of the image at the flow, mm."""
     background_size: tuple[float, float]
-    """Width and height of the pattern to print, a tenth more than the picture shows, mm."""
+    """Width and height of the pattern to print, a tenth more than the image shows, mm."""
     dot: float
     """Size of a dot of 3 px on the background, mm."""
     sensitivity: float
@@ -120,7 +122,7 @@ def expect(ring: Ring, flow: DesignSettings) -> Expectation:
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
     ray = camera.rays(middle)
     lever = float(ray.ends.distance[0]) - ring.distance
-    # a deflection in the plane of the picture's columns
+    # a deflection in the plane of the image's columns
     per_mrad = lever * float((ray.ends.sensitivity[0, 0] @ camera.rotation[0]).abs()) / 1000
     at_flow, at_background = (float(camera.pixel_size(p)) for p in (torch.zeros_like(ray.origin), ray.end_points))
     deflection = 1000 * flow.contrast * math.sqrt(2 * math.pi / math.e)
@@ -169,7 +171,7 @@ def _notes(e: Expectation, ring: Ring, flow: DesignSettings) -> list[str]:
         )
     if min(e.field_of_view) < flow.flow_size:
         notes.append(
-            f"the flow of {flow.flow_size:g} mm is larger than the picture of {e.field_of_view[0]:.0f} x "
+            f"the flow of {flow.flow_size:g} mm is larger than the image of {e.field_of_view[0]:.0f} x "
             f"{e.field_of_view[1]:.0f} mm"
         )
     if e.dot < 0.2:

@@ -1,4 +1,4 @@
-"""A whole rendered experiment: pictures of targets, background and flow of every view, as a laboratory would take them.
+"""A whole rendered experiment: images of targets, background and flow of every view, as a laboratory would take them.
 
 The folder is one that nerif calibrate and nerif displacement read (imaging/views.py).
 """
@@ -45,14 +45,14 @@ ORIGIN = torch.zeros(3, dtype=torch.float64)
 
 @dataclass(frozen=True)
 class Experiment:
-    """How the pictures are taken."""
+    """How the images are taken."""
 
     kind: str = "dots"
     """Background: dots, wavelet or multiscale."""
     dot: float = 3.0
-    """Size of a dot in the picture, px."""
+    """Size of a dot in the image, px."""
     references: int = 5
-    """Pictures without flow."""
+    """Images without flow."""
     sensor: Sensor = field(default_factory=Sensor)
     samples: int = 3
     """Points along each edge of a pixel."""
@@ -63,45 +63,45 @@ class Experiment:
     rows: int = 7
     """Squares along a column."""
     pitch: float = 0.0
-    """Edge of a square, mm; 0 fills about 60 % of the picture at the origin."""
+    """Edge of a square, mm; 0 fills about 60 % of the image at the origin."""
     poses: int = 30
-    """Poses of the target free in space; 0 for no calibration pictures."""
+    """Poses of the target free in space; 0 for no calibration images."""
     backgrounds: int = 5
-    """Pictures of the target on each background."""
+    """Images of the target on each background."""
     seed: int = 0
     """Of patterns, poses and noise."""
 
     def write(
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,
-        truth_voxels: int = 100, on_picture: Callable[[], None] = lambda: None,
+        truth_voxels: int = 100, on_image: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
-        """Render all pictures into VIEW/{target,background,reference,flow}/, with settings to calibrate, and the truth.
+        """Render all images into VIEW/{target,background,reference,flow}/, with settings to calibrate, and the truth.
 
         Parameters
         ----------
-        folder : to write; calibrate.toml, truth/calibration.toml and truth/volume.nc come with the pictures
+        folder : to write; calibrate.toml, truth/calibration.toml and truth/volume.nc come with the images
         cameras : of the rig, with their lenses
         phantom, box : field of index excess, and the box that holds it
         n_ambient : refractive index around it
         truth_voxels : of the truth, along the longest edge of the box
-        on_picture : called after each picture (`pictures` of them in all)
+        on_image : called after each image (`images` of them in all)
 
         Raises
         ------
         InputError
-            If truth_voxels, or a setting of target or background, can't be; or if a view has pictures already that this
-            program did not write: renamed ones would be taken for pictures of the experiment.
+            If truth_voxels, or a setting of target or background, can't be; or if a view has images already that this
+            program did not write: renamed ones would be taken for images of the experiment.
         """
         if truth_voxels < 1:
-            raise InputError(f"truth_voxels: expected at least 1, got {truth_voxels}")
-        _check_pictures(folder, cameras)
+            raise InputError(f"expected at least 1, got {truth_voxels}", field="truth_voxels")
+        _check_images(folder, cameras)
         self._write_truth(folder / "truth", cameras, phantom, box, n_ambient, truth_voxels)
         with OwnFiles(folder).writing("calibrate.toml") as path:
             self._write_settings(path, cameras)
         for i, camera in enumerate(cameras):
-            self._background_pictures(folder / camera.name, camera, i, phantom, box, n_ambient, on_picture)
+            self._background_images(folder / camera.name, camera, i, phantom, box, n_ambient, on_image)
         if self.poses:
-            self.write_targets(folder, cameras, on_picture)
+            self.write_targets(folder, cameras, on_image)
 
     def _write_truth(
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float, voxels: int
@@ -131,36 +131,36 @@ class Experiment:
         write_toml(path, settings)
 
     def write_targets(
-        self, folder: Path, cameras: Sequence[Camera], on_picture: Callable[[], None] = lambda: None
+        self, folder: Path, cameras: Sequence[Camera], on_image: Callable[[], None] = lambda: None
     ) -> None:
-        """Render the pictures of the target into VIEW/{target,background}/."""
+        """Render the images of the target into VIEW/{target,background}/."""
         target = self.target_for(cameras)
         laid = target.scaled(background_scale(cameras))
         for j, pose in enumerate(target_poses(cameras, target, self.poses, self.seed)):
             for camera in cameras:
                 if _faces(pose, camera):
-                    self._target_picture(folder / camera.name / "target" / f"pose_{j:03d}.tif", camera, target, pose)
-                on_picture()
+                    self._target_image(folder / camera.name / "target" / f"pose_{j:03d}.tif", camera, target, pose)
+                on_image()
         for camera in cameras:
             for j, pose in enumerate(background_poses(camera, laid, self.backgrounds)):
-                self._target_picture(folder / camera.name / "background" / f"laid_{j:03d}.tif", camera, laid, pose)
-                on_picture()
+                self._target_image(folder / camera.name / "background" / f"laid_{j:03d}.tif", camera, laid, pose)
+                on_image()
 
     def target_for(self, cameras: Sequence[Camera]) -> CalibrationTarget:
-        """Return the target, of a size that fits the pictures if none is given."""
+        """Return the target, of a size that fits the images if none is given."""
         pitch = self.pitch
         if pitch == 0:
             seen = (float(c.pixel_size(ORIGIN)) * torch.tensor(c.image_size) for c in cameras)
             pitch = 0.75 * min(min(float(s[1]) / (self.columns + 1), float(s[0]) / (self.rows + 1)) for s in seen)
         return CalibrationTarget(self.target, self.columns, self.rows, pitch)
 
-    def pictures(self, views: int) -> int:
-        """Number of pictures of `views` views (those of targets that face away counted)."""
+    def images(self, views: int) -> int:
+        """Number of images of `views` views (those of targets that face away counted)."""
         return views * (self.references + 1 + (self.poses + self.backgrounds if self.poses else 0))
 
-    def _background_pictures(
+    def _background_images(
         self, folder: Path, camera: Camera, i: int, phantom: Field, box: Box, n_ambient: float,
-        on_picture: Callable[[], None],
+        on_image: Callable[[], None],
     ) -> None:  # fmt: skip
         width, height = pattern_size(camera)
         pixel = width / 1.1 / camera.image_size[1]
@@ -170,12 +170,12 @@ class Experiment:
         still = render(camera, texture, samples=self.samples)
         for k in range(self.references):
             self._save(folder / "reference" / f"reference_{k:03d}.tif", still)
-            on_picture()
+            on_image()
         flow = render(camera, texture, phantom, box, n_ambient, self.samples)
         self._save(folder / "flow" / "flow_000.tif", flow)
-        on_picture()
+        on_image()
 
-    def _target_picture(self, path: Path, camera: Camera, target: CalibrationTarget, pose: Pose) -> None:
+    def _target_image(self, path: Path, camera: Camera, target: CalibrationTarget, pose: Pose) -> None:
         sharp = replace(camera, lens=None)
         self._save(path, render(sharp, place(target, pose, camera), samples=self.samples))
 
@@ -185,7 +185,7 @@ class Experiment:
         import tifffile
 
         path.parent.mkdir(parents=True, exist_ok=True)
-        seed = zlib.crc32("/".join(path.parts[-3:]).encode()) + self.seed  # the same pictures in any folder and order
+        seed = zlib.crc32("/".join(path.parts[-3:]).encode()) + self.seed  # the same images in any folder and order
         counts = self.sensor.expose(light, seed)
         # a 16-bit file tells that only so many bits of it are used
         tags = [(281, "H", 1, 2**self.sensor.bits - 1, False)]
@@ -193,14 +193,14 @@ class Experiment:
             tifffile.imwrite(path, counts, extratags=tags)
 
 
-def _check_pictures(folder: Path, cameras: Sequence[Camera]) -> None:
+def _check_images(folder: Path, cameras: Sequence[Camera]) -> None:
     for place in (folder / camera.name / kind for camera in cameras for kind in KINDS):
         files = OwnFiles(place)
         strange = [p.name for p in sorted(place.glob("*")) if p.name != WRITTEN and p.name not in files]
         if strange:
             raise InputError(
-                f"{place}: holds {strange[0]}, which nerif render did not write, and was left as it is; "
-                "give another --out"
+                f"holds {strange[0]}, which nerif render did not write, and was left as it is; give another --out",
+                field=place,
             )
 
 
@@ -253,7 +253,7 @@ def target_poses(cameras: Sequence[Camera], target: CalibrationTarget, count: in
     from scipy.spatial.transform import Rotation
 
     if count < 4:
-        raise InputError(f"poses: expected 4 target poses or more, got {count}")
+        raise InputError(f"expected 4 target poses or more, got {count}", field="poses")
     rng = np.random.default_rng(seed)
     towards_camera = np.stack([-c.sight(ORIGIN).numpy() for c in cameras])
     side = _side(cameras)
@@ -276,7 +276,7 @@ def background_poses(camera: Camera, target: CalibrationTarget, count: int) -> l
     middle = background_texture(camera, torch.zeros(2, 2, dtype=torch.float64), 1.0)
     frame = torch.stack([middle.right, middle.down, torch.linalg.cross(middle.right, middle.down)], dim=1).numpy()
     centre = (middle.corner + middle.right + middle.down).numpy()
-    width, height = (s / 2.2 for s in pattern_size(camera))  # half of what the picture shows
+    width, height = (s / 2.2 for s in pattern_size(camera))  # half of what the image shows
     room = np.maximum(0.9 * np.array([width, height]) - np.array(target.size) / 2, 0)
     corners = [(0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, 0), (1, 0)]
     poses = []

@@ -1,6 +1,6 @@
-"""Pictures that a camera would take: a textured plane seen through a field by curved rays, lens disc, pixels and noise.
+"""Images that a camera would take: a textured plane seen through a field by curved rays, lens disc, pixels and noise.
 
-A pixel averages over its area and over the lens. Each ray is bent by the field and meets the plane at X; the picture
+A pixel averages over its area and over the lens. Each ray is bent by the field and meets the plane at X; the image
 is the mean of the texture at X. Without a field the same rays run straight: the reference.
 """
 
@@ -79,9 +79,9 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if not 8 <= self.bits <= 16:
-            raise InputError(f"bits: expected 8 to 16, got {self.bits}")
+            raise InputError(f"expected 8 to 16, got {self.bits}", field="bits")
         if not self.exposure > 0 or not self.full_well >= 0 or not self.read_noise >= 0:
-            raise InputError("sensor: expected exposure > 0, full_well >= 0 and read_noise >= 0")
+            raise InputError("expected exposure > 0, full_well >= 0 and read_noise >= 0", field="sensor")
 
     def expose(self, light: Float[Tensor, "row column"], seed: int) -> np.ndarray:
         """Return counts of light from 0 (black) to 1 (white paper): shot noise, read noise, rounding, saturation."""
@@ -96,7 +96,7 @@ class Sensor:
 
 
 def background_texture(camera: Camera, values: Float[Tensor, "row column"], texel: float) -> Texture:
-    """Lay a pattern onto the background of a camera, upright and in the middle of its picture."""
+    """Lay a pattern onto the background of a camera, upright and in the middle of its image."""
     height, width = camera.image_size
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
     ray = camera.rays(middle)
@@ -112,7 +112,7 @@ def background_texture(camera: Camera, values: Float[Tensor, "row column"], texe
 
 
 def pattern_size(camera: Camera) -> tuple[float, float]:
-    """Return width and height (mm) of a pattern that fills the picture of a camera, with a margin of a tenth."""
+    """Return width and height (mm) of a pattern that fills the image of a camera, with a margin of a tenth."""
     height, width = camera.image_size
     edge = torch.tensor([-0.5, 0.5], dtype=torch.float64)
     corners = torch.cartesian_prod(edge * width + (width - 1) / 2, edge * height + (height - 1) / 2)
@@ -148,7 +148,7 @@ def render(
     steps : Runge-Kutta steps through the box
     """
     if samples < 1:
-        raise InputError(f"samples: expected at least one point along the edge of a pixel, got {samples}")
+        raise InputError(f"expected at least one point along the edge of a pixel, got {samples}", field="samples")
     height, width = camera.image_size
     shift = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
     camera = replace(camera, background=texture.plane, lens=(camera.without_window.lens or Lens()))

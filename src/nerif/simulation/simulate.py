@@ -82,7 +82,7 @@ def add_noise(measurement: Measurement, level: float, seed: int = 0) -> Measurem
     seed : of the noise
     """
     if not level >= 0:
-        raise InputError(f"noise: expected a level of 0 or more (0.1 is 10 % of the rms), got {level}")
+        raise InputError(f"expected a level of 0 or more (0.1 is 10 % of the rms), got {level}", field="noise")
     if level == 0:
         return measurement
     generator, noisy, sigmas = torch.Generator().manual_seed(seed), {}, {}
@@ -140,7 +140,7 @@ def simulate(
     techniques : what each pixel measures
     """
     if len(techniques) > 1 and not noise:
-        raise InputError("noise: expected a level above 0, by which several techniques are weighed")
+        raise InputError("expected a level above 0, by which several techniques are weighed", field="noise")
     height, width = (max(c.image_size[i] for c in cameras) for i in (0, 1))
     if not any(kind.background for kind in techniques):
         cameras = [kind.seen_by(c) for kind in techniques[:1] for c in cameras]
@@ -193,19 +193,21 @@ class Simulation:
 
     def __post_init__(self) -> None:
         if not self.technique:
-            raise InputError(f"technique: expected one or more of {', '.join(TECHNIQUES)}, got none")
+            raise InputError(f"expected one or more of {', '.join(TECHNIQUES)}, got none", field="technique")
         kinds = [technique(name) for name in self.technique]
         check_simulated(kinds)
         for name in ("peak", "counts"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+                raise InputError(f"expected 0 or more, got {getattr(self, name)}", field=name)
         if self.peak and (self._is_file or kinds[0].quantity == INDEX):
             what = "a volume file, taken as it is" if self._is_file else f"{kinds[0].name}, of an index"
-            raise InputError(f"peak: expected for the extinction or emission of a phantom, got {what}; leave it out")
+            raise InputError(
+                f"expected for the extinction or emission of a phantom, got {what}; leave it out", field="peak"
+            )
         if self.counts and self.noise:
-            raise InputError("counts: expected without --noise, which it replaces")
+            raise InputError("expected without --noise, which it replaces", field="counts")
         if self.truth_voxels < 1:
-            raise InputError(f"truth_voxels: expected at least 1, got {self.truth_voxels}")
+            raise InputError(f"expected at least 1, got {self.truth_voxels}", field="truth_voxels")
 
     def __call__(
         self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None, frame: int = 0
@@ -245,7 +247,7 @@ class Simulation:
             If the phantom does not move.
         """
         if self.phantom not in MOVING:
-            raise InputError(f"times: expected a phantom that moves (flame, 2-7), got '{self.phantom}'")
+            raise InputError(f"expected a phantom that moves (flame, 2-7), got '{self.phantom}'", field="times")
         for i, time in enumerate(times):
             measurement, volume = replace(self, time=time)(cameras, frame=i)
             if i == 0:
@@ -276,7 +278,7 @@ class Simulation:
             n_ambient = next(n for n in (self.n_ambient, volume.n_ambient, AMBIENT_INDEX) if n is not None)
             excess = volume.relative_to(n_ambient)
         except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+            raise error.inside(path) from None
         return VoxelField.through(excess.values, excess.grid), excess.grid.box, n_ambient
 
     def _scaled(self, phantom: Field, box: Box) -> Field:

@@ -37,20 +37,20 @@ LIMITS = ("epochs", "max_steps", "time_limit", "longest", "iterations")
 SCORES = "views.json"
 
 
-def kept_out(hold_out: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+def kept_out(withhold: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the views that are kept out of the whole run, out of all names."""
-    words = tuple(hold_out)
+    words = tuple(withhold)
     return () if words in (AUTO, NONE) and words[0] not in names else words
 
 
 def kept_apart(
-    hold_out: Sequence[str], measurement: Measurement, reconstructor: Reconstructor
+    withhold: Sequence[str], measurement: Measurement, reconstructor: Reconstructor
 ) -> tuple[Measurement, Reconstructor, tuple[str, ...]]:
     """Return the measurement, in halves if one of them is to be kept out, what reconstructs it, and what is kept out.
 
     Parameters
     ----------
-    hold_out : names of views, one of HALVES, AUTO or NONE
+    withhold : names of views, one of HALVES, AUTO or NONE
     measurement : with all views
     reconstructor : settings
 
@@ -62,9 +62,9 @@ def kept_apart(
     axis = None
     if isinstance(reconstructor, SharedSettings):
         check_views(reconstructor, measurement)
-        if tuple(hold_out) in [(half,) for half in HALVES]:
+        if tuple(withhold) in [(half,) for half in HALVES]:
             axis = axis_of(reconstructor, measurement)  # by both halves: one does not tell
-    parts, names = kept_half(measurement, hold_out, None if axis is None else axis.symmetry)
+    parts, names = kept_half(measurement, withhold, None if axis is None else axis.symmetry)
     if axis is not None and parts is not measurement:
         assert isinstance(reconstructor, SharedSettings)
         reconstructor = with_axis(reconstructor, axis.symmetry)
@@ -124,7 +124,7 @@ class FirstLook:
         with self.monitor.counting(f"predicting {name}"):
             pair = reproject(result.field, self.data.select([name, other]), [name], result.device, model=result.model)
             scores = evaluate_views(pair)
-        views, used = ([v for v in scores if v["held_out"] is held] for held in (True, False))
+        views, used = ([v for v in scores if v["withheld"] is held] for held in (True, False))
         taken = time.monotonic() - started
         with self._directory.writing(SCORES) as path:
             write_json(path, {"views": views, "fitted_views": used, "seconds": taken})
@@ -139,7 +139,7 @@ class FirstLook:
 
     @property
     def _directory(self) -> ResultDirectory:
-        return self.out.first_look
+        return self.out.cross_validation
 
     @property
     def _run(self) -> KeptRun:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from nerif.analysis.asymmetry import departure_sentence, departures, halved
+from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence, halved
 from nerif.analysis.evaluation import evaluate_views, score_lines
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import check_sees, reproject
@@ -61,12 +61,13 @@ METHODS: dict[str, type[Reconstructor]] = {
     "mart": MART,
 }
 
+
 @dataclass(frozen=True)
 class Run:
     """What is asked of a reconstruction into a directory, beside the settings of the method."""
 
-    hold_out: tuple[str, ...] = AUTO
-    """Views kept out of the reconstruction and re-projected from it, or left or right, a half of each picture of an
+    withhold: tuple[str, ...] = AUTO
+    """Views kept out of the reconstruction and re-projected from it, or left or right, a half of each image of an
     axisymmetric flow; auto: one is kept out of a short run first, from which the run with all goes on; none."""
     start_from: Path | None = None
     """Result directory of another reconstruction in the same box, of any method, to start from."""
@@ -133,7 +134,7 @@ def _left_behind(out: ResultDirectory, begun: bool) -> str:
     resume = f"nerif reconstruct --resume --out {out.path}"
     if begun and out.has(FIELD):
         return f"{out.path} holds the field, not yet all that is written of it; {resume} completes it"
-    if begun and (out.has(CHECKPOINT) or out.first_look.has(CHECKPOINT) or out.first_look.has(FIELD)):
+    if begun and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):
         return f"{out.path} holds the last checkpoint; {resume} goes on from there"
     return "nothing was saved yet; the same command starts again"
 
@@ -153,9 +154,9 @@ def _reconstruct_into(
     if voxels is None:
         voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
     if voxels < 1:
-        raise InputError(f"voxels: expected at least 1, got {voxels}")
+        raise InputError(f"expected at least 1, got {voxels}", field="voxels")
     whole = measurement
-    measurement, reconstructor, unseen = kept_apart(run.hold_out, whole, reconstructor)
+    measurement, reconstructor, unseen = kept_apart(run.withhold, whole, reconstructor)
     training = measurement.without(unseen)
     gains = fit_gains(training) if run.fit_gains else {}
     if gains:
@@ -172,10 +173,10 @@ def _reconstruct_into(
         if camera.unseen:
             monitor.say(
                 f"view '{camera.name}': {camera.unseen:.1%} of its pixels left out, for which its distortion cannot be "
-                "inverted; calibrate it with pictures of a target that reaches into its corners"
+                "inverted; calibrate it with images of a target that reaches into its corners"
             )
     slow = SlowRun(reconstructor, monitor.say)
-    look = _first_look(out, run, reconstructor, training, not resume, monitor.telling(slow))
+    look = _cross_validation(out, run, reconstructor, training, not resume, monitor.telling(slow))
     state = out.state() if resume and (look is None or out.has(CHECKPOINT) or not look.begun) else None
     start = _start(run, measurement) if trials is not None or not resume else None
     if not resume:
@@ -190,24 +191,26 @@ def _reconstruct_into(
     settings = _settings(run, path, reconstructor, voxels, keep or {})
     if "density" not in quantities_of(measurement.quantity):
         del settings["gas"]
-    run, begin = replace(run, hold_out=unseen), _begin(out, settings, resume, begun)
+    run, begin = replace(run, withhold=unseen), _begin(out, settings, resume, begun)
     data = measurement if look is None else look.data
     looked = Live(out.path, data, reconstructor, next(iter(unseen), ""), lambda: slow.line) if live else None
     if looked is not None and look is not None:
-        look = replace(look, monitor=looked.watching(monitor, held_out=True))
-    watched = monitor if looked is None else looked.watching(monitor, held_out=bool(unseen))
+        look = replace(look, monitor=looked.watching(monitor, withheld=True))
+    watched = monitor if looked is None else looked.watching(monitor, withheld=bool(unseen))
     first, method, origin = look(begin) if look is not None and state is None else None, reconstructor, start
     if first is not None:
         origin, method = first.field, reconstructor.in_two()[1]
     if look is not None and first is not None and first.outcome.reason == "interrupted":
-        result, run, measurement = replace(first, state=None), replace(run, hold_out=(look.view,)), look.data
+        result, run, measurement = replace(first, state=None), replace(run, withhold=(look.view,)), look.data
     else:
         with watched.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
             callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
             result = method(training, compose(*callbacks), state, origin if state is None else None)
     begin(None)
     scores = {} if look is None else look.scores()
-    _write(out, measurement, result, run, settings, gains, voxels, monitor, {"first_look": scores} if scores else {})
+    _write(
+        out, measurement, result, run, settings, gains, voxels, monitor, {"cross_validation": scores} if scores else {}
+    )
     _tell_axis(out, result, whole, monitor)
     try:
         if trials is not None and result.outcome.failed:
@@ -215,7 +218,7 @@ def _reconstruct_into(
         elif trials is not None and result.outcome.reason != "interrupted":
             made_of = {"start_from": str(run.start_from)}
             known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
-            watched = monitor if looked is None else looked.watching(monitor, held_out=False, looks=False)
+            watched = monitor if looked is None else looked.watching(monitor, withheld=False, looks=False)
             members = Members(out, trials, reconstructor, known, start, made_of, run.checkpoint_every, watched)
             members.add_to(result, run.gas, voxels)
     finally:  # the verdict and the page of the main result, whatever becomes of the members
@@ -230,9 +233,7 @@ def _reconstruct_into(
     return result
 
 
-def write_report(
-    directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET
-) -> Path:
+def write_report(directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
     """Write the page of a result directory, say what could not be shown, and return where it is."""
     out = ResultDirectory(directory, monitor.say)
     path = path or out / REPORT
@@ -250,9 +251,7 @@ def write_report(
     return path
 
 
-def write_sequence_report(
-    store: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET
-) -> Path:
+def write_sequence_report(store: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
     """Write the page of a store of nerif sequence, finished or not, and return where it is."""
     path = path or Path(store).with_suffix(".html")
     html.write(render_sequence(VolumeSequence(store)), path)
@@ -302,7 +301,7 @@ def _write(
     calibrated, held = measurement, []
     if result.rig:
         with monitor.counting("how well the rig is known") as bar:
-            training = measurement.without(run.hold_out)
+            training = measurement.without(run.withhold)
             rig = with_posterior(result.rig, training, result.field, result.settings, bar)
         measurement = with_corrections(measurement, rig)
         metrics["rig"] = rig
@@ -310,14 +309,14 @@ def _write(
             write_cameras(written, [CalibratedCamera.from_camera(c) for c in measurement.cameras])
         for line in moved_lines(rig):
             monitor.say(line)
-        if run.hold_out:
-            unseen = calibrated.select(run.hold_out)
+        if run.withhold:
+            unseen = calibrated.select(run.withhold)
             with monitor.counting("refining the views held out"):
                 held = refit(result.field, unseen, result.settings, result.device)
-                mended = reproject(result.field, with_corrections(unseen, held), run.hold_out, result.device)
-            metrics |= {"rig_held_out": held, "views_refitted": evaluate_views(mended) if held else []}
+                mended = reproject(result.field, with_corrections(unseen, held), run.withhold, result.device)
+            metrics |= {"rig_withheld": held, "views_refitted": evaluate_views(mended) if held else []}
     with monitor.counting("re-projecting") as bar:
-        reprojection = reproject(result.field, measurement, run.hold_out, result.device, bar, result.model)
+        reprojection = reproject(result.field, measurement, run.withhold, result.device, bar, result.model)
     with monitor.counting("scoring the views"):
         views = evaluate_views(reprojection)
         out.write_metrics({"views": views, "reprojection": [a.entries for a in reprojection.accuracies], **metrics})
@@ -337,9 +336,9 @@ def _tell_axis(out: ResultDirectory, result: Reconstruction, whole: Measurement,
     """Keep and say where the axis of a symmetric flow was found, and how far the measurement departs from it."""
     if result.axis is None:
         return
-    apart = departures(whole, result.axis.symmetry) if result.axis.symmetry.axial else []
-    out.add_metrics({"axis": result.axis.record, "departures": apart})
-    for line in (*result.axis.sentences, *(departure_sentence(d) for d in apart)):
+    apart = asymmetry(whole, result.axis.symmetry) if result.axis.symmetry.axial else []
+    out.add_metrics({"axis": result.axis.record, "asymmetry": apart})
+    for line in (*result.axis.sentences, *(asymmetry_sentence(d) for d in apart)):
         monitor.say(line)
 
 
@@ -349,12 +348,12 @@ def _trials(run: Run) -> Trials | None:
     return trials if trials.members else None
 
 
-def _first_look(
+def _cross_validation(
     out: ResultDirectory, run: Run, reconstructor: Reconstructor, training: Measurement, afresh: bool,
     monitor: Monitor,
 ) -> FirstLook | None:  # fmt: skip
     """The short run without a view, unless the field to start from has seen all views."""
-    if run.hold_out != AUTO or AUTO[0] in training.names or run.start_from is not None:
+    if run.withhold != AUTO or AUTO[0] in training.names or run.start_from is not None:
         return None
     if Ranks.from_environment().size > 1:
         return None
@@ -371,9 +370,9 @@ def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:
     """Refuse what does not split its rays over the processes of torchrun."""
     if not isinstance(reconstructor, NeRIF):
         method = _method(reconstructor)
-        raise InputError(f"method: expected nerif under torchrun, got '{method}', which runs in one process")
+        raise InputError(f"expected nerif under torchrun, got '{method}', which runs in one process", field="method")
     if run.uncertainty != "off":
-        raise InputError("uncertainty: expected off under torchrun; run it in one process")
+        raise InputError("expected off under torchrun; run it in one process", field="uncertainty")
 
 
 def _start(run: Run, measurement: Measurement) -> Field | None:
@@ -385,8 +384,9 @@ def _start(run: Run, measurement: Measurement) -> Field | None:
     check_sees(measurement.techniques, directory.quantity(), f"start_from {run.start_from}")
     if box != measurement.box:
         raise InputError(
-            f"{run.start_from}: expected a reconstruction in the box of the measurement, "
-            f"{measurement.box.lower} to {measurement.box.upper} mm, got {box.lower} to {box.upper}"
+            f"expected a reconstruction in the box of the measurement, "
+            f"{measurement.box.lower} to {measurement.box.upper} mm, got {box.lower} to {box.upper}",
+            field=run.start_from,
         )
     return start
 

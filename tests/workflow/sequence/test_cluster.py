@@ -36,6 +36,7 @@ from nerif.workflow.sequence.cluster import _gpus, check_workers, open_cluster, 
 from nerif.workflow.sequence.plan import SequenceSettings
 from nerif.workflow.sequence.reconstruct import reconstruct_sequence
 from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
+from refusals import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed <(socket|ssl):ResourceWarning")
 
@@ -147,13 +148,13 @@ def test_no_other_user_can_write_where_dask_looks_for_modules(local):
 
 def test_a_dashboard_that_cannot_be_is_refused(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "bokeh" else name)
-    with pytest.raises(InputError, match="dashboard: Bokeh is not installed"), open_cluster("local", 1, None, True):
+    with refused("dashboard"), open_cluster("local", 1, None, True):
         pass
 
 
 def test_without_cryptography_no_cluster_is_opened(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "cryptography" else name)
-    with pytest.raises(InputError, match="cluster: cryptography is not installed"), open_cluster("local", 1):
+    with refused("cluster"), open_cluster("local", 1):
         pass
 
 
@@ -333,9 +334,9 @@ class Workers:
 
 def test_workers_that_could_not_read_the_job_are_refused():
     check_workers(Workers(__version__))
-    with pytest.raises(InputError, match=f"worker tcp://node7: expected nerif {__version__} as here, got 9.9"):
+    with refused("cluster"):
         check_workers(Workers("9.9"))
-    with pytest.raises(InputError, match="a worker cannot import nerif"):
+    with refused("cluster"):
         check_workers(Workers(ModuleNotFoundError("No module named 'nerif'")))
 
 
@@ -421,8 +422,8 @@ def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
         (["--warm-rate", "0"], "warm_rate: expected a share above 0"),
         (["--quantities", "pressure"], "quantities: expected some of"),
         (["--time-limit", "5"], "time_limit: expected none in a sequence"),
-        (["--hold-out", "nobody"], "hold_out: expected views out of"),
-        (["--hold-out", "0deg", "85deg", "170deg"], "every view is held out"),
+        (["--withhold", "nobody"], "withhold: expected views out of"),
+        (["--withhold", "0deg", "85deg", "170deg"], "every view is held out"),
     ],
 )
 def test_wrong_settings_are_refused_before_anything_is_made(arguments, words, five, tmp_path, capsys):

@@ -169,12 +169,12 @@ def test_a_frame_that_fails_warm_is_tried_from_nothing_then_with_half_the_rate(s
 
 def test_a_view_that_is_missing_in_one_frame_has_no_score_there(short, tmp_path):
     blank(short, 1, view=2)
-    plan = begun(short, tmp_path / "r.zarr", hold_out=("85deg",))
+    plan = begun(short, tmp_path / "r.zarr", withhold=("85deg",))
     reconstruct_frames(plan, 0, 2)
     store = SequenceStore(plan.out)
     cc = store.array("cc")[:2]
     assert np.isnan(cc).tolist() == [[False] * 3, [False, False, True]]
-    assert store.attributes["hold_out"] == ["85deg"]
+    assert store.attributes["withhold"] == ["85deg"]
 
 
 def test_chunks_do_not_depend_on_what_is_missing():

@@ -30,6 +30,7 @@ from nerif.workflow.sequence.frames import finished_frame
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.run import outcome_table
 from nerif.workflow.sequence.store import SequenceStore
+from refusals import refused
 from sequence_films import COLD, RIG, blank
 
 
@@ -107,7 +108,7 @@ def test_a_view_that_saw_nothing_is_left_out_and_an_empty_frame_refused(short):
     sequence = MeasurementSequence.read(short)
     names = sequence.frame(0).names
     assert sequence.frame(1).names == names[1:]
-    with pytest.raises(InputError, match=r"frame 2: .*no valid pixel"):
+    with refused("displacement of view '0deg'"):
         sequence.frame(2)
     blank(short, 0)
     assert sequence.fullest().names == names  # of a later one
@@ -139,7 +140,7 @@ def test_what_is_no_sequence_is_refused(short, tmp_path):
     truth = short.with_name("short.truth.zarr")
     with pytest.raises(InputError, match="Conventions"):
         MeasurementSequence.read(truth)
-    with pytest.raises(InputError, match="increasing"):
+    with refused("times"):
         MeasurementSequence.create(tmp_path / "x.zarr", [0.0, 0.0], MeasurementSequence.read(short).frame(0))
     with pytest.raises(InputError, match="exists already"):
         MeasurementSequence.create(short, [0.0], MeasurementSequence.read(short).frame(0))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from nerif.app.pages import calibration, check, design, displacement, pictures, reconstruct, results
+from nerif.app.pages import calibration, check, design, displacement, images, reconstruct, results
 from nerif.app.pages.page import Page
 
 __all__ = ["PAGES", "Page"]
 
 PAGES: tuple[Page, ...] = (
-    design.PAGE, pictures.PAGE, calibration.PAGE, displacement.PAGE, check.PAGE, reconstruct.PAGE, results.PAGE,
+    design.PAGE, images.PAGE, calibration.PAGE, displacement.PAGE, check.PAGE, reconstruct.PAGE, results.PAGE,
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Calibration: cameras from pictures of a target, or one from a ruler; what was found, how well it fits, the rig."""
+"""Calibration: cameras from images of a target, or one from a ruler; what was found, how well it fits, the rig."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.project import Contents
 from nerif.app.rig_scene import read_rig, show_rig
-from nerif.app.target_pictures import TargetPictures
+from nerif.app.target_images import TargetImages
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.calibrate import Calibrate
 from nerif.cli.commands.settings import merge
@@ -36,7 +36,7 @@ SIMPLE = ("distance", "mm_per_px", "background_distance", "axis_from", "axis_to"
           "pixel_pitch_um", "principal_point", "lower", "upper", "views")  # fmt: skip
 SIMPLE_MAIN = SIMPLE[:3]
 SETTINGS = "calibrate.toml"
-WAYS = {False: "Pictures of a target", True: "A ruler: one camera, no target"}
+WAYS = {False: "Images of a target", True: "A ruler: one camera, no target"}
 EVERY = 0.7  # seconds
 
 
@@ -68,7 +68,7 @@ class CalibrationPage:
         with ui.element("div").classes("columns"):
             with card("Calibrate"), ui.element("div").classes("form"):
                 if not experiments:
-                    text_html("There are no pictures in this folder yet; the page Pictures says where they go.")
+                    text_html("There are no images in this folder yet; the page Images says where they go.")
                 first = known if known in experiments else next(iter(experiments), None)
                 self.experiment = self._select("Experiment", experiments, first)
                 self.way = self._select("From", WAYS, bool(kept.get("simple", False)))
@@ -86,10 +86,10 @@ class CalibrationPage:
                 with card("The rig"):
                     self.calibration = self._select("Calibration", list(found.calibrations), None)
                     self.rig = ui.element("div").classes("rig")
-                with card("Pictures of the target", "Circles: points found, the first one filled. What is left out is "
+                with card("Images of the target", "Circles: points found, the first one filled. What is left out is "
                           "part of the command line; calibrate again after it."):  # fmt: skip
                     self.view = self._select("View", [], None)
-                    self.pictures = TargetPictures(work, self._toggled)
+                    self.images = TargetImages(work, self._toggled)
 
     def _select(self, label: str, options: Any, value: Any) -> ui.select:
         select = ui.select(options, label=label, value=value).props("outlined dense options-dense").classes("short")
@@ -105,7 +105,7 @@ class CalibrationPage:
         self.experiment.on_value_change(self._turned)
         self.way.on_value_change(self._turned)
         self.calibration.on_value_change(self._draw)
-        self.view.on_value_change(self._pictures)
+        self.view.on_value_change(self._images)
         await self._draw()
         ui.timer(EVERY, self._look_again)
 
@@ -116,7 +116,7 @@ class CalibrationPage:
 
     @property
     def settings(self) -> str:
-        """The file of settings that lies beside the pictures, relative to the project; empty if there is none."""
+        """The file of settings that lies beside the images, relative to the project; empty if there is none."""
         name = f"{self.experiment.value}/{SETTINGS}"
         there = self.experiment.value and not self.simple and self.work.project.path(name).is_file()
         return name if there else ""
@@ -146,7 +146,7 @@ class CalibrationPage:
 
     @property
     def left(self) -> list[str]:
-        """Names of the pictures of this experiment that are left out."""
+        """Names of the images of this experiment that are left out."""
         return self.left_out.setdefault(self.experiment.value or "", [])
 
     def arguments(self) -> list[str]:
@@ -214,7 +214,7 @@ class CalibrationPage:
         self.calibration.set_options(names, value=next(iter([*best, *names]), None))
 
     async def _draw(self) -> None:
-        """Show the rig of the calibration that is chosen, and its errors beside the pictures."""
+        """Show the rig of the calibration that is chosen, and its errors beside the images."""
         self.turn += 1
         turn, name, rig = self.turn, self.calibration.value, None
         said = [] if name else ["There is no calibration in this folder yet."]
@@ -231,17 +231,17 @@ class CalibrationPage:
             if rig:
                 show_rig(rig)
         self._show()
-        await self._pictures()
+        await self._images()
 
-    async def _pictures(self) -> None:
-        """Show the pictures of the view that is chosen."""
+    async def _images(self) -> None:
+        """Show the images of the view that is chosen."""
         view = self.views.get(self.view.value or "")
         if view is None or not self.form.right:
             return
         self._show()
         with refusals():
             targets, self.seen = self._targets(), self._wanted()
-            await self.pictures.show(view, targets, self.errors, self.left)
+            await self.images.show(view, targets, self.errors, self.left)
 
     def _targets(self) -> dict[str, CalibrationTarget]:
         """What is looked for; a ruler needs none, then it is that of the form's defaults."""
@@ -254,15 +254,15 @@ class CalibrationPage:
     async def _look_again(self) -> None:
         """Look anew after another target has been typed, or another experiment chosen."""
         if self.form.right and self._wanted() != self.seen:
-            await self._pictures()
+            await self._images()
 
 
 async def build(work: Workspace) -> None:
     """Build the page."""
     page = CalibrationPage(work, await work.beside(work.project.contents))
     with ui.element("div"):
-        ui.timer(0.01, page.build, once=True)  # the page is there before its pictures are looked through
+        ui.timer(0.01, page.build, once=True)  # the page is there before its images are looked through
 
 
-ABOUT = "Where the cameras stand and what they see, from pictures of a target or from a ruler."
+ABOUT = "Where the cameras stand and what they see, from images of a target or from a ruler."
 PAGE = Page("calibration", "Calibration", "/calibration", ABOUT, build)

@@ -183,7 +183,7 @@ async def build(work: Workspace) -> None:
     """Build the page."""
     contents = await work.beside(work.project.contents)
     if not contents.measurements:
-        text_html("There is no measurement in the folder yet: Displacement makes one of pictures.", classes="told")
+        text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="told")
         return
     CheckPage(work, contents.measurements)
 

@@ -1,4 +1,4 @@
-"""Displacement: from the pictures of all views to a measurement, with a preview of one view first; masks drawn."""
+"""Displacement: from the images of all views to a measurement, with a preview of one view first; masks drawn."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from nerif.imaging.measuring import measure_instant
 __all__ = ["PAGE"]
 
 BY_PAGE = ("config", "folder", "calibration", "out", "frames", "frame_rate")
-MAIN = ("method", "smoothness", "lower", "upper", "max_sigma", "min_correlation", "shake_border", "pictures")
+MAIN = ("method", "smoothness", "lower", "upper", "max_sigma", "min_correlation", "shake_border", "images")
 
 
 class DisplacementPage:
@@ -41,7 +41,7 @@ class DisplacementPage:
         self.measured: MeasurementCard | None = None
         if contents.experiments and contents.calibrations:
             with ui.element("div").classes("columns"):
-                with card("Pictures to displacements"), ui.element("div").classes("form"):
+                with card("Images to displacements"), ui.element("div").classes("form"):
                     self.experiment = self._select("Experiment", contents.experiments, kept.get("experiment"))
                     self.calibration = self._select("Calibration", contents.calibrations, kept.get("calibration"))
                     self.out = ui.input("Measurement to write", value=work.project.free_name("measurement.nc"))
@@ -62,7 +62,7 @@ class DisplacementPage:
                     self.shown = ui.element("div").props('aria-live="polite"')
             self._views()
         else:
-            lacking = "are no pictures of an experiment" if not contents.experiments else "is no calibration"
+            lacking = "are no images of an experiment" if not contents.experiments else "is no calibration"
             text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="told")
         self.below = ui.element("div").classes("stack")
         self._show(contents.measurements)
@@ -114,7 +114,7 @@ class DisplacementPage:
             asked = replace(
                 self.job.view.made(), folder=self.work.project.path(str(self.experiment.value)),
                 calibration=self.work.project.path(str(self.calibration.value)), views=(str(self.view.value),),
-                pictures=False,
+                images=False,
             )  # fmt: skip
 
             def work() -> str:

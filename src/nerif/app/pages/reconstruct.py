@@ -27,11 +27,11 @@ from nerif.reconstruction.uncertainty.bootstrap import KINDS
 __all__ = ["PAGE"]
 
 WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live")
-MAIN = ("time_limit", "hold_out", "uncertainty", "voxels")
+MAIN = ("time_limit", "withhold", "uncertainty", "voxels")
 FILM = ".zarr"
 VALUES = {False: "values", True: "film_values"}  # of what is not a film, and of one
 FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine")
-FILM_MAIN = ("cluster", "workers", "chunk", "hold_out", "voxels")
+FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
 LABELS = {
     "nerif": "NeRIF: a neural field", "tikhonov": "Tikhonov, on voxels", "landweber": "Landweber, on voxels",
     "tv": "Total variation, on voxels", "mlem": "MLEM, never negative", "mart": "MART, never negative",

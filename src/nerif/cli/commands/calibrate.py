@@ -1,4 +1,4 @@
-"""nerif calibrate: from target pictures, another program's file, or what a ruler tells, to calibrated cameras."""
+"""nerif calibrate: from target images, another program's file, or what a ruler tells, to calibrated cameras."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from nerif.cli.commands.settings import Flat, Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
-from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views, target_pictures
+from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views, target_images
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.calibration.importers.importers import ImportSettings, import_box, import_cameras, is_calibration
 from nerif.imaging.calibration.result import MOUNT, Calibration
-from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_picture, simple_camera
+from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.readers.views import find_views
 
@@ -29,18 +29,18 @@ __all__ = ["Calibrate", "main", "run"]
 
 @dataclass(frozen=True)
 class Calibrate(Settings):
-    """Calibrate cameras from target pictures, take them over, or one from a ruler; all draw the rig in 3-D.
+    """Calibrate cameras from target images, take them over, or one from a ruler; all draw the rig in 3-D.
 
     SOURCE is a folder with a folder for each view (VIEW/target/*.tif: the target free in space, one pose under one
     number in all views; VIEW/background/*.tif: the target laid on the view's background), or with a views.toml; or the
     calibration of another program (.mat, .yml, .xml, transforms.json, .csv, .toml). With --check only the rig is drawn.
 
-    With --simple SOURCE is the folder of an experiment of one view (VIEW/reference) or a picture, and one camera that
+    With --simple SOURCE is the folder of an experiment of one view (VIEW/reference) or an image, and one camera that
     looks across the axis of a flow comes from --distance, --background-distance and --mm-per-px.
     """
 
     source: tyro.conf.Positional[Path]
-    """Folder of pictures, or a file with a calibration, or (with --check) a measurement, (with --simple) a picture."""
+    """Folder of images, or a file with a calibration, or (with --check) a measurement, (with --simple) an image."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("calibration.toml")
     """Calibration to write, NAME.toml; NAME.rig.png and NAME.errors.png come with it."""
     check: bool = False
@@ -49,9 +49,9 @@ class Calibrate(Settings):
     background_scale: float = 1.0
     """The target laid on the backgrounds is the same one printed this many times larger."""
     views: tuple[str, ...] = ()
-    """Only these views; with --simple and a picture, what its view is called (default: camera)."""
+    """Only these views; with --simple and an image, what its view is called (default: camera)."""
     leave_out: tuple[str, ...] = ()
-    """Target pictures that are not used: cam1/target/7 is pose 7 of view cam1, cam1/background/2 one that lies on its
+    """Target images that are not used: cam1/target/7 is pose 7 of view cam1, cam1/background/2 one that lies on its
     background. NAME.toml tells their errors under these names."""
     simple: bool = False
     """One camera from distances, no target: its frame has z along the axis of the flow, y away from the camera."""
@@ -67,14 +67,16 @@ class Calibrate(Settings):
 
 
 def run(settings: Calibrate) -> None:
-    """Write the calibration and its pictures."""
+    """Write the calibration and its images."""
     if settings.out.suffix != ".toml":
-        raise InputError(f"out: expected a name ending in .toml, got '{settings.out.name}'")
+        raise InputError(f"expected a name ending in .toml, got '{settings.out.name}'", field="out")
     box = Box.between(settings.lower, settings.upper)
     if settings.simple and not settings.method.kind.shows_depth:
-        raise InputError(f"projection: expected perspective with --simple, got {settings.method.projection}")
+        raise InputError(f"expected perspective with --simple, got {settings.method.projection}", field="projection")
     if not settings.simple and settings.rig.given:
-        raise InputError(f"{', '.join(settings.rig.given)}: expected together with --simple; add it, or leave them out")
+        raise InputError(
+            "expected together with --simple; add it, or leave them out", field=", ".join(settings.rig.given)
+        )
     rig, errors = settings.out.with_suffix(".rig.png"), settings.out.with_suffix(".errors.png")
     if settings.check:
         check_file(rig, settings.force)
@@ -108,7 +110,7 @@ def run(settings: Calibrate) -> None:
 
 
 def _simple(settings: Calibrate, box: Box | None) -> tuple[CalibratedCamera, Box]:
-    name, size = find_picture(settings.source, settings.views, settings.taken_over.image_size)
+    name, size = find_image(settings.source, settings.views, settings.taken_over.image_size)
     camera = simple_camera(settings.rig, size, settings.taken_over, name)
     return camera, box or box_about_axis(camera)
 
@@ -127,7 +129,7 @@ def _tell_simple(out: Path, camera: CalibratedCamera, box: Box) -> None:
 
 def _calibrate(settings: Calibrate) -> Calibration:
     views, count = find_views(settings.source, settings.views), itertools.count(1)
-    with counting_bar("looking for targets", target_pictures(views)) as bar:
+    with counting_bar("looking for targets", target_images(views)) as bar:
         return calibrate_views(
             views, settings.target, settings.method, settings.background_scale,
             settings.taken_over.background_distance, say, lambda: bar(next(count)), settings.leave_out,
@@ -137,7 +139,7 @@ def _calibrate(settings: Calibrate) -> Calibration:
 def _tell(calibration: Calibration) -> None:
     scale = f"f [{calibration.projection.unit}]"
     say(
-        f"{'camera':<12}{'pictures':>9}{'rms [px]':>10}{scale:>10}{'+-':>8}{'rotation +-':>13}{'position +-':>13}"
+        f"{'camera':<12}{'images':>9}{'rms [px]':>10}{scale:>10}{'+-':>8}{'rotation +-':>13}{'position +-':>13}"
         f"{'background rms':>16}"
     )
     for i, name in enumerate(calibration.names):
@@ -153,9 +155,7 @@ def _tell(calibration: Calibration) -> None:
         say(f"note: {note}")
 
 
-def _existing(
-    settings: Calibrate, box: Box | None
-) -> tuple[Sequence[CalibratedCamera] | Sequence[Camera], Box | None]:
+def _existing(settings: Calibrate, box: Box | None) -> tuple[Sequence[CalibratedCamera] | Sequence[Camera], Box | None]:
     if settings.simple:
         camera, box = _simple(settings, box)
         return (camera,), box

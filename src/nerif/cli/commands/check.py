@@ -22,9 +22,9 @@ __all__ = ["Check", "main", "run"]
 class Check(Settings):
     """Predict every view by a quick reconstruction from the others, and name the ones that do not fit, and why.
 
-    Found are: u and v swapped, a flipped sign, a mirrored, reversed or turned picture, of one view or all; two views
+    Found are: u and v swapped, a flipped sign, a mirrored, reversed or turned image, of one view or all; two views
     exchanged; values of a wrong size; flow that leaves the box through a face. What fits equally well either way is
-    not: a flipped sign of everything (so it says whether a flow comes out lighter or denser), a mirrored picture of a
+    not: a flipped sign of everything (so it says whether a flow comes out lighter or denser), a mirrored image of a
     symmetric flow. Each technique of a measurement is checked by itself.
     """
 
@@ -45,7 +45,7 @@ class Check(Settings):
     time_limit: float = 30.0
     """With --refine: seconds in which the field is found."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Measurement to write, NAME.nc, with the mistakes undone that were found; without its pictures of the pattern."""
+    """Measurement to write, NAME.nc, with the mistakes undone that were found; without its images of the pattern."""
     force: bool = False
     """Overwrite an existing file."""
     strict: bool = False
@@ -57,14 +57,14 @@ def run(settings: Check) -> Consistency | RigCheck:
     if settings.out is not None:
         if settings.refine or settings.out.suffix != ".nc":
             wrong = "--refine, which corrects nothing" if settings.refine else f"'{settings.out.name}'"
-            raise InputError(f"out: expected a name ending in .nc, of what is compared, got {wrong}")
+            raise InputError(f"expected a name ending in .nc, of what is compared, got {wrong}", field="out")
         check_file(settings.out, settings.force)
     return _rig(settings) if settings.refine else _views(settings)
 
 
 def _rig(settings: Check) -> RigCheck:
     if not settings.time_limit > 0:
-        raise InputError(f"time_limit: expected seconds above 0, got {settings.time_limit}")
+        raise InputError(f"expected seconds above 0, got {settings.time_limit}", field="time_limit")
     sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg)
     measurement = Measurement.read(settings.measurement)
     found = check_rig(measurement, settings.refine, settings.time_limit, *sigma, MONITOR, settings.aperture)
@@ -86,7 +86,7 @@ def _rig(settings: Check) -> RigCheck:
 
 def _views(settings: Check) -> Consistency:
     if settings.voxels < 8:
-        raise InputError(f"voxels: expected at least 8, got {settings.voxels}")
+        raise InputError(f"expected at least 8, got {settings.voxels}", field="voxels")
     measurement = Measurement.read(settings.measurement)
     with counting_bar("comparing views") as bar:
         result = check_consistency(measurement, settings.voxels, bar, settings.aperture)

@@ -44,9 +44,9 @@ class Demo(Settings):
 def run(settings: Demo) -> None:
     """Run the demo and say where to look."""
     if settings.pixels < 8:
-        raise InputError(f"pixels: expected at least 8, got {settings.pixels}")
+        raise InputError(f"expected at least 8, got {settings.pixels}", field="pixels")
     if not settings.time_limit > 0:
-        raise InputError(f"time_limit: expected seconds above 0, got {settings.time_limit}")
+        raise InputError(f"expected seconds above 0, got {settings.time_limit}", field="time_limit")
     out = ResultDirectory(settings.out, say)
     out.check_free(settings.force)
     settings.out.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ def run(settings: Demo) -> None:
                 ring=ring,
             )
         )
-    held_out = f"{between:g}deg"
+    withheld = f"{between:g}deg"
     reconstruct.run(
         ReconstructNeRIF(
             measurement=measured,
@@ -70,7 +70,7 @@ def run(settings: Demo) -> None:
             preset="fast",
             voxels=80,
             force=True,
-            run=Run(hold_out=(held_out,), uncertainty="fast", report=False),
+            run=Run(withhold=(withheld,), uncertainty="fast", report=False),
             reconstructor=NeRIF(time_limit=settings.time_limit, seed=settings.seed),
         )
     )

@@ -33,7 +33,7 @@ def run(settings: Design) -> Expectation:
     """Print what to expect, and draw it."""
     if settings.out is not None:
         if settings.out.suffix not in (".png", ".pdf"):
-            raise InputError(f"out: expected a name ending in .png or .pdf, got '{settings.out.name}'")
+            raise InputError(f"expected a name ending in .png or .pdf, got '{settings.out.name}'", field="out")
         check_file(settings.out, settings.force)
     result = expect(settings.ring, settings.flow)
     _tell(result, settings.flow)

@@ -1,4 +1,4 @@
-"""nerif displacement: from pictures of all views to a measurement."""
+"""nerif displacement: from images of all views to a measurement."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ __all__ = ["Displacement", "main", "run"]
 class Displacement(Settings):
     """Find the displacements of all views and write them, with the calibration, as a measurement.
 
-    FOLDER has a folder for each view with VIEW/reference (pictures without flow; with three or more, the noise is taken
-    from them) and VIEW/flow (pictures with flow), or a views.toml that says where they are. VIEW/mask.png, if there is
+    FOLDER has a folder for each view with VIEW/reference (images without flow; with three or more, the noise is taken
+    from them) and VIEW/flow (images with flow), or a views.toml that says where they are. VIEW/mask.png, if there is
     one, tells where the flow is, VIEW/region.png where the background is seen.
     """
 
@@ -48,56 +48,57 @@ class Displacement(Settings):
     views: tuple[str, ...] = ()
     """Only these views."""
     frame: int = 0
-    """Which flow picture to take."""
+    """Which flow image to take."""
     frames: str = ""
-    """Many flow pictures, all or FIRST:LAST (LAST not included): a sequence, --out NAME.zarr."""
+    """Many flow images, all or FIRST:LAST (LAST not included): a sequence, --out NAME.zarr."""
     frame_rate: float = 0.0
-    """Flow pictures a second, where the recording does not tell."""
+    """Flow images a second, where the recording does not tell."""
     average: int = 1
-    """Number of flow pictures, from `frame` on, whose displacements are averaged."""
+    """Number of flow images, from `frame` on, whose displacements are averaged."""
     references: int = 100
-    """Most reference pictures to read; 0 for all."""
+    """Most reference images to read; 0 for all."""
     mask: float = 0.0
     """Flow mask (for the visual hull) where |d| exceeds this many sigma; 0 for none. 4 is a good value."""
-    pictures: bool = True
-    """Keep the pictures beside the displacements, to reconstruct straight from them (not of averages or sequences)."""
+    images: bool = True
+    """Keep the images beside the displacements, to reconstruct straight from them (not of averages or sequences)."""
     force: bool = False
     """Overwrite existing files."""
     surroundings: Annotated[Surroundings, Flat] = field(default_factory=Surroundings)
     method: Annotated[DisplacementSettings, Flat] = field(default_factory=DisplacementSettings)
 
     def recording(self) -> Recording:
-        """Find the pictures, the cameras and the box."""
+        """Find the images, the cameras and the box."""
         from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 
         box = Box.between(self.lower, self.upper) or import_box(self.calibration)
         if box is None:
             raise InputError(
-                f"lower, upper: expected the corners of the box to reconstruct, since {self.calibration} holds none; "
-                "give --lower X Y Z and --upper X Y Z, mm"
+                f"expected the corners of the box to reconstruct, since {self.calibration} holds none; "
+                "give --lower X Y Z and --upper X Y Z, mm",
+                field="lower, upper",
             )
         scene = Scene(box, self.surroundings)
         masks = MaskSettings(self.mask) if self.mask else None
         views = find_views(self.folder, self.views)
         cameras = {c.name: c for c in import_cameras(self.calibration)}
-        return Recording(views, cameras, scene, self.method, masks, self.references, self.pictures)
+        return Recording(views, cameras, scene, self.method, masks, self.references, self.images)
 
 
 def run(settings: Displacement) -> Measurement:
     """Write the measurement, or the first frame's of a sequence."""
     ending = ".zarr" if settings.frames else ".nc"
     if settings.out.suffix != ending:
-        raise InputError(f"out: expected a name ending in {ending}, got '{settings.out.name}'")
+        raise InputError(f"expected a name ending in {ending}, got '{settings.out.name}'", field="out")
     for name, least in (("frame", 0), ("average", 1), ("references", 0), ("mask", 0)):
         if not getattr(settings, name) >= least:
-            raise InputError(f"{name}: expected {least} or more, got {getattr(settings, name)}")
+            raise InputError(f"expected {least} or more, got {getattr(settings, name)}", field=name)
     recording = settings.recording()
     box = recording.scene.box
     settings = replace(settings, lower=box.lower, upper=box.upper)
     if settings.frames:
         return run_over_time(settings, recording).fullest()
-    picture = settings.out.with_suffix(".png")
-    check_file(settings.out, settings.force, picture)
+    image = settings.out.with_suffix(".png")
+    check_file(settings.out, settings.force, image)
     with counting_bar("finding displacements", len(recording.views)) as bar:
         numbers = range(settings.frame, settings.frame + settings.average)
         measurement, noise = measure_instant(recording, numbers, say, bar)
@@ -105,15 +106,17 @@ def run(settings: Displacement) -> Measurement:
     _tell(measurement, noise)
     from nerif.report.displacement_figure import save_displacements
 
-    save_displacements(picture, measurement)
-    say(f"{settings.out}: measurement of {len(measurement.names)} views; {picture}: its displacements")
+    save_displacements(image, measurement)
+    say(f"{settings.out}: measurement of {len(measurement.names)} views; {image}: its displacements")
     return measurement
 
 
 def run_over_time(settings: Displacement, recording: Recording) -> MeasurementSequence:
-    """Write a measurement of every flow picture asked for."""
+    """Write a measurement of every flow image asked for."""
     if settings.average != 1 or settings.frame != 0:
-        raise InputError("frame, average: expected neither with --frames, which takes every flow picture by itself")
+        raise InputError(
+            "expected neither with --frames, which takes every flow image by itself", field="frame, average"
+        )
     numbers = frame_numbers(settings.frames, recording.views)
     times = instants_of(numbers, recording.views[0], settings.frame_rate)
     kept = {name: value for name, value in asdict(settings).items() if name not in ("out", "force", "config", "frames")}

@@ -30,7 +30,7 @@ class Evaluate(Settings):
     """Measurement to re-project into."""
     align: str = "none"
     """Give errors after the best rigid motion of the field as well (rigid): what no camera can tell."""
-    hold_out: tuple[str, ...] | None = None
+    withhold: tuple[str, ...] | None = None
     """Views of that measurement which the reconstruction has not seen; default: those that run.toml held out."""
 
 
@@ -40,7 +40,7 @@ def run(settings: Evaluate) -> dict[str, Any]:
         return run_over_time(settings)
     with counting_bar("re-projecting") as bar:
         metrics = evaluate(
-            settings.result, settings.truth, settings.measurement, settings.hold_out, bar, settings.align
+            settings.result, settings.truth, settings.measurement, settings.withhold, bar, settings.align
         )
     if settings.truth is not None:
         if "coverage" in metrics:
@@ -68,7 +68,7 @@ def run(settings: Evaluate) -> dict[str, Any]:
         several = len({v["measured"] for v in metrics["views"]}) > 1
         say(f"view          {' ' * 14 * several}      CC    SSIM  PSNR [dB]  rms")
         for v in metrics["views"]:
-            held = "  held out" if v["held_out"] else ""
+            held = "  held out" if v["withheld"] else ""
             name = f"{v['name']}, {v['measured']}" if several else v["name"]
             say(f"{name:<{14 + 14 * several}} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {rms_text(v)}{held}")
     return metrics
@@ -80,7 +80,7 @@ def run_over_time(settings: Evaluate) -> dict[str, Any]:
 
     if settings.truth is None or replace(settings, truth=None) != Evaluate(settings.result):
         raise InputError(
-            "evaluate: expected --truth NAME.truth.zarr alone for a sequence, whose views are compared already"
+            "expected --truth NAME.truth.zarr alone for a sequence, whose views are compared already", field="evaluate"
         )
     with counting_bar("comparing frames") as bar:
         metrics = evaluate_sequence(settings.result, settings.truth, bar)

@@ -48,14 +48,16 @@ class Export(Settings):
 def run(settings: Export) -> None:
     """Write the file."""
     if settings.out.suffix not in FORMATS:
-        raise InputError(f"out: expected a name ending in {', '.join(FORMATS)}, got '{settings.out.name}'")
+        raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{settings.out.name}'", field="out")
     check_file(settings.out, settings.force)
     result = ResultDirectory(settings.result)
     (field, whole, n_ambient), quantity = result.field(), result.quantity()
     box = Box(settings.lower or whole.lower, settings.upper or whole.upper)
     if not whole.holds(box):
         whole_box = f"{whole.lower} to {whole.upper} mm"
-        raise InputError(f"lower, upper: expected a part of the box {whole_box}, got {box.lower} to {box.upper}")
+        raise InputError(
+            f"expected a part of the box {whole_box}, got {box.lower} to {box.upper}", field="lower, upper"
+        )
     grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
     asked = settings.quantities or tuple(q for q in quantities_of(quantity) if q != "temperature")
     with counting_bar("sampling the field"):

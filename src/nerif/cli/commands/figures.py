@@ -34,20 +34,20 @@ class Figures(Settings):
 def run(settings: Figures) -> None:
     """Write them, and say what could not be drawn."""
     if settings.journal not in JOURNALS:
-        raise InputError(f"journal: expected one of {', '.join(JOURNALS)}, got '{settings.journal}'")
+        raise InputError(f"expected one of {', '.join(JOURNALS)}, got '{settings.journal}'", field="journal")
     if not 20 <= settings.dpi <= 2400:
-        raise InputError(f"dpi: expected 20 to 2400 dots per inch, got {settings.dpi}")
+        raise InputError(f"expected 20 to 2400 dots per inch, got {settings.dpi}", field="dpi")
     result = ResultDirectory(settings.result).read()
     out = settings.out or settings.result / FIGURES
     if out.is_file():
-        raise InputError(f"{out}: expected a folder for --out, got a file")
+        raise InputError("expected a folder for --out, got a file", field=out)
     out.mkdir(parents=True, exist_ok=True)
     with counting_bar("drawing figures"):
         paths = save_figures(result, out, settings.journal, settings.dpi)
     for gap in result.missing:
         say(f"left out: {gap.sentence}")
     if not paths:
-        raise InputError(f"{settings.result}: nothing to draw; {' '.join(gap.sentence for gap in result.missing)}")
+        raise InputError(f"nothing to draw; {' '.join(gap.sentence for gap in result.missing)}", field=settings.result)
     say(f"{out}: {len(paths) // 2} figures, each as .pdf and .png")
 
 

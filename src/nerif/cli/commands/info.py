@@ -103,10 +103,7 @@ def _measurement(path: Path, m: Measurement) -> None:
         sizes = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:24.4f}" for x in good)
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
-        say(
-            f"  {c.name:<14} {size:>10} {pixel:11.4g} {away:23.1f} {behind:>20} "
-            f"{share:8.1%}{sizes}"
-        )
+        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {away:23.1f} {behind:>20} {share:8.1%}{sizes}")
 
 
 def _volume(path: Path, v: Volume) -> None:
@@ -137,7 +134,7 @@ def _result(path: Path) -> None:
         if not isinstance(value, list | dict):
             say(f"  {name:<18} {value}")
     for v in metrics.get("views", []):
-        held = "held out" if v["held_out"] else "training"
+        held = "held out" if v["withheld"] else "training"
         say(f"  view {v['name']:<14} {held}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_text(v)}")
 
 

@@ -31,7 +31,7 @@ class Mask(Settings):
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Measurement to write, NAME.nc; NAME.masks.png shows the masks."""
     drawn: Path | None = None
-    """Folder with a picture VIEW.png of each view (white where the flow is); views without one keep the threshold."""
+    """Folder with an image VIEW.png of each view (white where the flow is); views without one keep the threshold."""
     sigma: float | None = None
     """Noise where the measurement has none, in the unit of what was measured (px of displacements)."""
     remove: bool = False
@@ -44,9 +44,9 @@ class Mask(Settings):
 def run(settings: Mask) -> Measurement:
     """Write the measurement with its masks."""
     if settings.out.suffix != ".nc":
-        raise InputError(f"out: expected a name ending in .nc, got '{settings.out.name}'")
-    picture = settings.out.with_suffix(".masks.png")
-    check_file(settings.out, settings.force, picture)
+        raise InputError(f"expected a name ending in .nc, got '{settings.out.name}'", field="out")
+    image = settings.out.with_suffix(".masks.png")
+    check_file(settings.out, settings.force, image)
     measurement = Measurement.read(settings.measurement)
     if settings.remove:
         measurement = replace(measurement, flow_mask=None)
@@ -62,13 +62,13 @@ def run(settings: Mask) -> Measurement:
     measurement.write(settings.out)
     for name, mask, camera in zip(measurement.names, measurement.flow_mask, measurement.cameras, strict=True):
         height, width = camera.image_size
-        say(f"{name:<12} flow in {float(mask[:height, :width].float().mean()):.1%} of the picture")
+        say(f"{name:<12} flow in {float(mask[:height, :width].float().mean()):.1%} of the image")
     say(f"{settings.out}: the visual hull holds {float(hull.float().mean()):.1%} of the box")
     from nerif.report.displacement_figure import save_masks
 
-    save_masks(picture, measurement)
+    save_masks(image, measurement)
     measured = measurement.observations[0].technique.measured
-    say(f"{picture}: the masks over |{measured}|; cut off flow costs more than a mask that is too large")
+    say(f"{image}: the masks over |{measured}|; cut off flow costs more than a mask that is too large")
     return measurement
 
 

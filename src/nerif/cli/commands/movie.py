@@ -35,7 +35,7 @@ class MovieCommand(Settings):
 def run(settings: MovieCommand) -> None:
     """Write the movie."""
     if settings.every < 1:
-        raise InputError(f"every: expected 1 or more, got {settings.every}")
+        raise InputError(f"expected 1 or more, got {settings.every}", field="every")
     check_file(settings.out, settings.force)
     store = VolumeSequence(settings.result)
     there = frames_there(store)

@@ -43,11 +43,11 @@ def check_file(path: Path, force: bool, *others: Path) -> None:
     """Refuse an output file that exists (unless forced) or whose folder does not."""
     for file in (path, *others):
         if not file.parent.is_dir():
-            raise InputError(f"{file}: the folder {file.parent} does not exist; make it first")
+            raise InputError(f"the folder {file.parent} does not exist; make it first", field=file)
         if file.is_dir():
-            raise InputError(f"{file}: expected the name of a file to write, got a folder")
+            raise InputError("expected the name of a file to write, got a folder", field=file)
         if file.exists() and not force:
-            raise InputError(f"{file}: exists already and was left as it is; give another --out, or --force")
+            raise InputError("exists already and was left as it is; give another --out, or --force", field=file)
 
 
 @contextmanager

@@ -68,4 +68,4 @@ def main(arguments: list[str]) -> None:
         run(read_settings(PrintBackground(tyro.MISSING, pattern=Background(kind)), arguments, "pattern"))
     else:
         kinds = ", ".join((*background.KINDS, *targets.KINDS))
-        raise InputError(f"kind: expected one of {kinds}, got '{kind}'")
+        raise InputError(f"expected one of {kinds}, got '{kind}'", field="kind")

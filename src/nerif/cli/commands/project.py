@@ -55,21 +55,25 @@ class Project(Settings):
 def run(settings: Project) -> Measurement:
     """Write the predicted measurement and return it."""
     if settings.out.suffix != ".nc":
-        raise InputError(f"out: expected a name ending in .nc, got '{settings.out.name}'")
+        raise InputError(f"expected a name ending in .nc, got '{settings.out.name}'", field="out")
     check_file(settings.out, settings.force)
     result = ResultDirectory(settings.result)
     index, box, n_ambient = result.field()
     wavelength = settings.wavelength_nm
     if settings.cameras is not None and settings.f_number:
-        raise InputError("f_number: expected for the ring, got cameras of a file, which know their own aperture")
+        raise InputError(
+            "expected for the ring, got cameras of a file, which know their own aperture", field="f_number"
+        )
     if settings.cameras is None and settings.aperture != "auto":
-        raise InputError("aperture: expected together with --cameras FILE, got no file; the ring takes --f-number")
+        raise InputError(
+            "expected together with --cameras FILE, got no file; the ring takes --f-number", field="aperture"
+        )
     if settings.cameras is not None:
         given = seen_through(Measurement.read(settings.cameras), settings.aperture)
         wavelength = wavelength or given.wavelength_nm
         cameras = (given.select(settings.names) if settings.names else given).cameras
     elif settings.names:
-        raise InputError("names: expected together with --cameras FILE, got no file")
+        raise InputError("expected together with --cameras FILE, got no file", field="names")
     else:
         cameras = settings.ring.cameras(settings.f_number)
     kind = technique(settings.technique) if settings.technique else technique_of(result.quantity())

@@ -43,7 +43,7 @@ def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise InputError(f"tensorboard: not installed; {install('tensorboard')}") from None
+        raise InputError(f"not installed; {install('tensorboard')}", field="tensorboard") from None
     with ExitStack() as stack:
         writer: list[SummaryWriter] = []
         written = [0.0]
@@ -65,10 +65,10 @@ def main(arguments: list[str]) -> None:
     if "--resume" in arguments and flag_value(arguments, "--config") is None and out is not None:
         file = Path(out) / RUN
         if not file.is_file():
-            raise InputError(f"{out}: expected an interrupted run to resume, got no {RUN} in it")
+            raise InputError(f"expected an interrupted run to resume, got no {RUN} in it", field=out)
     method = value_given("method", arguments, "nerif", file)
     if method not in RECORDS:
-        raise InputError(f"method: expected one of {', '.join(RECORDS)}, got '{method}'")
+        raise InputError(f"expected one of {', '.join(RECORDS)}, got '{method}'", field="method")
     chosen: dict[str, Any] = {"method": method}
     if method == "nerif":
         name = value_given("preset", arguments, "auto", file)

@@ -1,4 +1,4 @@
-"""nerif render: pictures of a whole experiment with a phantom, and its truth."""
+"""nerif render: images of a whole experiment with a phantom, and its truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Render", "main", "run"]
 
 @dataclass(frozen=True)
 class Render(Settings):
-    """Render the pictures that a rig would take: targets, background without and with flow; the truth comes with them.
+    """Render the images that a rig would take: targets, background without and with flow; the truth comes with them.
 
     In the folder OUT: VIEW/target, VIEW/background, VIEW/reference, VIEW/flow for nerif calibrate and nerif
     displacement; calibrate.toml, the settings for the former; truth/calibration.toml and truth/volume.nc to
@@ -47,25 +47,25 @@ class Render(Settings):
     """Voxels of the truth along the longest edge."""
     force: bool = False
     """Write into a folder that holds something."""
-    pictures: Annotated[Experiment, Flat] = field(default_factory=Experiment)
+    images: Annotated[Experiment, Flat] = field(default_factory=Experiment)
     ring: Annotated[Ring, Flat] = field(default_factory=Ring)
 
 
 def run(settings: Render) -> None:
-    """Write pictures and truth."""
+    """Write images and truth."""
     ResultDirectory(settings.out).check_free(settings.force)
-    cameras, pictures = settings.ring.cameras(settings.f_number), settings.pictures
+    cameras, images = settings.ring.cameras(settings.f_number), settings.images
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
-    begun = f"{settings.out} lacks pictures; the same command with --force starts again"
-    with if_interrupted(lambda: begun), counting_bar("rendering", pictures.pictures(len(cameras))) as bar:
-        pictures.write(
+    begun = f"{settings.out} lacks images; the same command with --force starts again"
+    with if_interrupted(lambda: begun), counting_bar("rendering", images.images(len(cameras))) as bar:
+        images.write(
             settings.out, cameras, phantom, box, settings.n_ambient, settings.truth_voxels,
             lambda: bar(next(count)),
         )  # fmt: skip
-    target = pictures.target_for(cameras)
-    say(f"{settings.out}: pictures of {len(cameras)} views, {pictures.sensor.bits} bit")
+    target = images.target_for(cameras)
+    say(f"{settings.out}: images of {len(cameras)} views, {images.sensor.bits} bit")
     say(f"target: {target.label}")
     say(f"next: nerif calibrate {settings.out} --config {settings.out / 'calibrate.toml'} -o calibration.toml")
 

@@ -34,11 +34,11 @@ def run(settings: Report) -> Path:
     is_store = settings.result.suffix == ".zarr"
     out = settings.out or (settings.result.with_suffix(".html") if is_store else settings.result / REPORT)
     if out.suffix not in (".html", ".htm"):
-        raise InputError(f"out: expected a name ending in .html, got '{out.name}'")
+        raise InputError(f"expected a name ending in .html, got '{out.name}'", field="out")
     if settings.out is not None:
         check_file(out, settings.force)
     elif not out.parent.is_dir():
-        raise InputError(f"{settings.result}: no such directory")
+        raise InputError("no such directory", field=settings.result)
     write = write_sequence_report if is_store else write_report
     return write(settings.result, out, MONITOR)
 

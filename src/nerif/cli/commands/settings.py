@@ -143,7 +143,7 @@ def _typed(cls: type, name: str, value: Any, source: str) -> Any:
         return TypeAdapter(_hint(cls, name)).validate_json(json.dumps(value, default=str), strict=True)
     except ValidationError as error:
         detail = error.errors()[0]
-        raise InputError(f"{source}: '{name}' = {value!r}: {detail['msg'].lower()}") from None
+        raise InputError(f"'{name}' = {value!r}: {detail['msg'].lower()}", field=source) from None
 
 
 def flag_value(arguments: list[str], *flags: str) -> str | None:

@@ -44,7 +44,7 @@ def run(settings: Simulate) -> None:
     """Write the measurement and its truth."""
     ending = ".zarr" if settings.times else ".nc"
     if settings.out.suffix != ending:
-        raise InputError(f"out: expected a name ending in {ending}, got '{settings.out.name}'")
+        raise InputError(f"expected a name ending in {ending}, got '{settings.out.name}'", field="out")
     if settings.times:
         run_over_time(settings)
         return
@@ -76,7 +76,7 @@ def instants(text: str) -> tuple[float, ...]:
         if not (count == 1 or (count > 1 and last > first)):
             raise ValueError
     except ValueError:
-        raise InputError(f"times: expected FIRST:LAST:COUNT in s, such as 0:2.3e-3:24, got '{text}'") from None
+        raise InputError(f"expected FIRST:LAST:COUNT in s, such as 0:2.3e-3:24, got '{text}'", field="times") from None
     return tuple(first + (last - first) * i / max(count - 1, 1) for i in range(count))
 
 
@@ -86,7 +86,7 @@ def run_over_time(settings: Simulate) -> None:
     cameras, truth = settings.ring.cameras(settings.f_number), truth_path(settings.out)
     for path in (settings.out, truth):
         if path.exists() and not settings.force:
-            raise InputError(f"{path}: exists already and was left as it is; give another --out, or --force")
+            raise InputError("exists already and was left as it is; give another --out, or --force", field=path)
     begun = f"{settings.out} and {truth} lack frames; the same command with --force starts again"
     with if_interrupted(lambda: begun), counting_bar("simulating frames") as bar:
         _, store = settings.simulation.over_time(times, cameras, settings.out, truth, settings.force, bar)

@@ -3,12 +3,12 @@
     minimise  sum rho(|pixel - project_i(R_i (R_j X + t_j) + t_i)|^2),      rho Huber's loss
 
 over cameras i and target poses j; one pose is the world and stays. Weak priors keep what a narrow lens cannot tell from
-a turn: the principal point near the middle of the picture, distortion near none.
+a turn: the principal point near the middle of the image, distortion near none.
 
 The normal equations are put together block by block and solved exactly in each step of Levenberg and Marquardt's
 method, which settles what a narrow lens can hardly tell apart too.
 
-What no picture shows, such as the depth of a telecentric camera, stays where it is, with a standard deviation of 0.
+What no image shows, such as the depth of a telecentric camera, stays where it is, with a standard deviation of 0.
 
 Source: Triggs et al., Bundle adjustment - a modern synthesis, 2000.
 """
@@ -29,10 +29,10 @@ __all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust", "crossing"
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 HUBER = 5  # times the noise of a point: where the loss turns linear
-PRINCIPAL = 0.03  # of the picture's width: how far the principal point may well be from its middle
+PRINCIPAL = 0.03  # of the image's width: how far the principal point may well be from its middle
 DISTORTION = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS: how large they may well be, by (x, y) in units of
-UNIT = 5  # times half the width of a telecentric picture, mm: of a perspective one, that is 23 degrees wide
-UNSEEN = 1e-13  # share of the largest eigenvalue of the curvature: directions below it change no picture
+UNIT = 5  # times half the width of a telecentric image, mm: of a perspective one, that is 23 degrees wide
+UNSEEN = 1e-13  # share of the largest eigenvalue of the curvature: directions below it change no image
 INTRINSIC, POSE = 9, 6  # parameters: fx, fy, cx, cy and five of distortion; rotation vector, translation
 
 
@@ -96,14 +96,14 @@ class Observation:
     ----------
     camera, pose : numbers of the camera and the pose in the bundle
     detection : what was found
-    picture : name of the picture in which it was found
+    image : name of the image in which it was found
     on_background : whether the target lay on the camera's background
     """
 
     camera: int
     pose: int
     detection: Detection
-    picture: str = ""
+    image: str = ""
     on_background: bool = False
 
 
@@ -118,7 +118,7 @@ class Bundle:
     poses : target to world
     fixed : the pose that is the world
     free : (9,) which intrinsics are adjusted
-    sizes : (height, width) of every camera's pictures, px
+    sizes : (height, width) of every camera's images, px
     projection : of all cameras
     """
 
@@ -299,7 +299,7 @@ class _Layout:
         return cost + float((prior**2).sum()), curvature, slope
 
     def _prior(self, bundle: Bundle) -> np.ndarray:
-        """Distance from the middle of the picture and from no distortion, in units that make `noise` one sigma."""
+        """Distance from the middle of the image and from no distortion, in units that make `noise` one sigma."""
         middle = np.array([((w - 1) / 2, (h - 1) / 2) for h, w in bundle.sizes])
         off = np.concatenate([bundle.intrinsics[:, 2:4] - middle, bundle.intrinsics[:, 4:]], axis=1)
         return off * self._prior_slopes()

@@ -1,7 +1,7 @@
-"""From target pictures of several cameras to intrinsics, poses in one world frame, and background planes.
+"""From target images of several cameras to intrinsics, poses in one world frame, and background planes.
 
 1. a first guess of all poses in the world, which is the frame of one target pose (first_guess.py);
-2. bundle adjustment of everything (bundle.py), after which pictures that do not fit are left out, once;
+2. bundle adjustment of everything (bundle.py), after which images that do not fit are left out, once;
 3. a plane through each camera's targets that lay on its background, and a look at what came out
    (result.py).
 """
@@ -20,10 +20,10 @@ from nerif.geometry import Projection, projection_named
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
 from nerif.imaging.calibration.first_guess import first_guess, mirrored
 from nerif.imaging.calibration.result import Calibration
-from nerif.imaging.calibration.targets import CalibrationTarget, ViewPictures
+from nerif.imaging.calibration.targets import CalibrationTarget, ViewImages
 from nerif.imaging.readers.views import View, find_targets, pose_names
 
-__all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_pictures"]
+__all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_images"]
 
 ON_A_SIDE = 0.1  # of a unit vector towards a camera: what it has to be more on one side than its mirror image
 FREE_OR_LAID = ("target", "background")
@@ -47,31 +47,35 @@ class CalibrationSettings:
     max_error: float = 1.0
     """Largest rms reprojection error to accept, px."""
     side: tuple[str, str] | None = None
-    """Of telecentric cameras: one view and the side of the world that it stands on, such as cam1 x+. The pictures of
+    """Of telecentric cameras: one view and the side of the world that it stands on, such as cam1 x+. The images of
     flat targets fit a rig and its mirror image alike."""
 
     def __post_init__(self) -> None:
         for name in self.distortion:
             if name not in COEFFICIENTS:
-                raise InputError(f"distortion: expected coefficients out of {' '.join(COEFFICIENTS)}, got '{name}'")
+                raise InputError(
+                    f"expected coefficients out of {' '.join(COEFFICIENTS)}, got '{name}'", field="distortion"
+                )
         if not self.max_error > 0:
-            raise InputError(f"max_error: expected a positive number of px, got {self.max_error}")
+            raise InputError(f"expected a positive number of px, got {self.max_error}", field="max_error")
         if not self.kind.shows_depth and (self.side is None or self.side[1] not in FACES):
             raise InputError(
-                f"side: expected a view and the side of the world that it stands on ({' '.join(FACES)}), such as "
-                "cam1 x+, since pictures of flat targets fit a telecentric rig and its mirror image alike; got "
-                f"{self.side}"
+                f"expected a view and the side of the world that it stands on ({' '.join(FACES)}), such as "
+                "cam1 x+, since images of flat targets fit a telecentric rig and its mirror image alike; got "
+                f"{self.side}",
+                field="side",
             )
         if not np.isclose(np.linalg.det(self.rotation), 1):
             raise InputError(
-                f"axes: expected three different axes of the target that make a right-handed world, such as x+ z+ y-, "
-                f"got {' '.join(self.axes)}"
+                f"expected three different axes of the target that make a right-handed world, such as x+ z+ y-, "
+                f"got {' '.join(self.axes)}",
+                field="axes",
             )
 
     def check_names(self, names: Sequence[str]) -> None:
         """Refuse a view that is not among those of these names."""
         if self.side is not None and self.side[0] not in names:
-            raise InputError(f"side: expected one of {', '.join(names)}, got '{self.side[0]}'")
+            raise InputError(f"expected one of {', '.join(names)}, got '{self.side[0]}'", field="side")
 
     @property
     def kind(self) -> Projection:
@@ -93,62 +97,62 @@ def calibrate_views(
     background_scale: float = 1.0,
     background_distance: float | None = None,
     say: Callable[[str], None] = lambda text: None,
-    on_picture: Callable[[], None] = lambda: None,
+    on_image: Callable[[], None] = lambda: None,
     leave_out: Sequence[str] = (),
 ) -> Calibration:
-    """Find a target in the pictures of all views, and calibrate their cameras by it.
+    """Find a target in the images of all views, and calibrate their cameras by it.
 
     Parameters
     ----------
     views : of find_views
-    target : free in space, in the pictures VIEW/target
+    target : free in space, in the images VIEW/target
     settings : of the calibration
     background_scale : the target laid on the backgrounds is the same one printed this many times larger
     background_distance : as `calibrate`
-    say : told of pictures that are of no use
-    on_picture : called after each picture (`target_pictures` of them in all)
-    leave_out : pictures that are not used, such as cam1/target/7 or cam1/background/2: view, source and pose
+    say : told of images that are of no use
+    on_image : called after each image (`target_images` of them in all)
+    leave_out : images that are not used, such as cam1/target/7 or cam1/background/2: view, source and pose
 
     Raises
     ------
     InputError
-        If pictures are missing, one to be left out is none of them, or as `calibrate`.
+        If images are missing, one to be left out is none of them, or as `calibrate`.
     """
     laid = target.scaled(background_scale)
     settings.check_names([view.name for view in views])
-    target_pictures(views)  # what is missing is said before the long work
+    target_images(views)  # what is missing is said before the long work
     there = [f"{v.name}/{s}/{p}" for v in views for s in FREE_OR_LAID if s in v.sources for p in pose_names(v.open(s))]
-    check_known(leave_out, there, "leave_out", "picture")
-    found = [find_targets(view, target, say, on_picture, laid).without(leave_out) for view in views]
+    check_known(leave_out, there, "leave_out", "image")
+    found = [find_targets(view, target, say, on_image, laid).without(leave_out) for view in views]
     return calibrate(found, settings, background_distance)
 
 
-def target_pictures(views: Sequence[View]) -> int:
-    """Return how many pictures of the target, in space and on the background, the views have."""
+def target_images(views: Sequence[View]) -> int:
+    """Return how many images of the target, in space and on the background, the views have."""
     return sum(len(view.open(s)) for view in views for s in FREE_OR_LAID if s in ("target", *view.sources))
 
 
 def calibrate(
-    views: Sequence[ViewPictures],
+    views: Sequence[ViewImages],
     settings: CalibrationSettings = CalibrationSettings(),
     background_distance: float | None = None,
 ) -> Calibration:
-    """Calibrate all cameras from what was found in their pictures.
+    """Calibrate all cameras from what was found in their images.
 
     Parameters
     ----------
-    views : what was found. Pictures of the target on the background say where it is unless the camera is telecentric
+    views : what was found. Images of the target on the background say where it is unless the camera is telecentric
     settings : of the calibration
-    background_distance : of backgrounds without such pictures: across the optical axis, so far behind the origin, mm
+    background_distance : of backgrounds without such images: across the optical axis, so far behind the origin, mm
 
     Raises
     ------
     InputError
         If a camera has too few poses or is not tied to the others by shared ones, if guesses contradict one another
-        (a mirrored picture, pictures of different poses under one name), or if the result can't be right.
+        (a mirrored image, images of different poses under one name), or if the result can't be right.
     """
     if not views:
-        raise InputError("calibrate: no view was found; expected one folder of target pictures a camera")
+        raise InputError("no view was found; expected one folder of target images a camera", field="calibrate")
     names = [v.name for v in views]
     settings.check_names(names)
     if not settings.kind.shows_depth:
@@ -167,21 +171,22 @@ def calibrate(
 
 
 def _fitting(bundle: Bundle, observations: Sequence[Observation]) -> list[bool]:
-    """Which pictures fit: their rms is within five times the median of all, or a tenth of a pixel."""
+    """Which images fit: their rms is within five times the median of all, or a tenth of a pixel."""
     rms = [bundle.rms(o) for o in observations]
     limit = max(5 * float(np.median(rms)), 0.1)
     return [r <= limit for r in rms]
 
 
-def _check_poses(views: Sequence[ViewPictures], kept: Sequence[Observation]) -> None:
-    """Every camera has to keep half its pictures, or the fault is not in single pictures."""
+def _check_poses(views: Sequence[ViewImages], kept: Sequence[Observation]) -> None:
+    """Every camera has to keep half its images, or the fault is not in single images."""
     for i, view in enumerate(views):
         left = sum(o.camera == i for o in kept)
         whole = len(view.poses) + len(view.background)
         if left < max(3, whole / 2):
             raise InputError(
-                f"view '{view.name}': {whole - left} of its {whole} target pictures do not fit together with the other "
-                "cameras; is it mirrored (flip), did it move, or do its pictures show other poses than their names say?"
+                f"{whole - left} of its {whole} target images do not fit together with the other "
+                "cameras; is it mirrored (flip), did it move, or do its images show other poses than their names say?",
+                field=f"view '{view.name}'",
             )
 
 
@@ -195,8 +200,9 @@ def _on_the_right_side(bundle: Bundle, settings: CalibrationSettings, names: Seq
     here, there = (-sign * float(axis @ b.cameras[names.index(name)].rotation[2]) for b in (bundle, other))
     if abs(here - there) < ON_A_SIDE:
         raise InputError(
-            f"side: view '{name}' stands as much on the side {face} in the mirror image of the rig, so this does not "
-            "tell the two apart; name another view or axis"
+            f"view '{name}' stands as much on the side {face} in the mirror image of the rig, so this does not "
+            "tell the two apart; name another view or axis",
+            field="side",
         )
     return bundle if here > there else other
 

@@ -45,7 +45,7 @@ KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotatio
         "aperture_diameter", "focus_distance", "pose_sigma")  # fmt: skip
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
 """Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
-LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)", re.IGNORECASE)  # no undistorted pictures, no distances
+LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)", re.IGNORECASE)  # no undistorted images, no distances
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def checked(camera: CalibratedCamera, source: str) -> CalibratedCamera:
         if camera.image_size is not None:
             whole.check_distortion()
     except InputError as error:
-        raise InputError(f"{source}: {error}") from None
+        raise error.inside(source) from None
     return camera
 
 
@@ -126,12 +126,12 @@ def numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
     try:
         array = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"{what}: expected {expected}, got {value!r}") from None
+        raise InputError(f"expected {expected}, got {value!r}", field=what) from None
     if tuple(array.shape) != shape:
         got = " x ".join(map(str, array.shape)) or "a single number"
-        raise InputError(f"{what}: expected {expected}, got {got}")
+        raise InputError(f"expected {expected}, got {got}", field=what)
     if not bool(torch.isfinite(array).all()):
-        raise InputError(f"{what}: expected finite numbers, got {value!r}")
+        raise InputError(f"expected finite numbers, got {value!r}", field=what)
     return array
 
 
@@ -146,9 +146,9 @@ def flat(value: Any, what: str, group: int = 1) -> np.ndarray:
     try:
         found = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        raise InputError(f"{what}: expected numbers, got {value!r}") from None
+        raise InputError(f"expected numbers, got {value!r}", field=what) from None
     if found.size % group:
-        raise InputError(f"{what}: expected {group} numbers each, got {found.size} in all")
+        raise InputError(f"expected {group} numbers each, got {found.size} in all", field=what)
     return found
 
 
@@ -156,7 +156,7 @@ def image_size(value: Any, what: str) -> tuple[int, int]:
     """Return (height, width), px; InputError if they are not two positive whole numbers."""
     size = numbers(value, (2,), what)
     if not bool((size > 0).all()) or bool((size % 1 != 0).any()):
-        raise InputError(f"{what}: expected height and width, whole numbers of px, got {value}")
+        raise InputError(f"expected height and width, whole numbers of px, got {value}", field=what)
     return int(size[0]), int(size[1])
 
 
@@ -171,7 +171,7 @@ def plane(normal: Any, offset: Any, where: str) -> Plane:
     direction = numbers(normal, (3,), f"{where}: normal")
     length = float(direction.norm())
     if not length > 0:
-        raise InputError(f"{where}: normal: expected a direction, got {normal}")
+        raise InputError(f"normal: expected a direction, got {normal}", field=where)
     return Plane(direction / length, float(numbers(offset, (), f"{where}: offset")) / length)
 
 
@@ -185,8 +185,9 @@ def check_model(model: Any, where: str) -> None:
     """
     if str(model).lower() not in BROWN:
         raise InputError(
-            f"{where}: expected a perspective camera with Brown's distortion ({', '.join(BROWN)}), got '{model}'; "
-            "calibrate again with one of those models, or undistort the pictures first"
+            f"expected a perspective camera with Brown's distortion ({', '.join(BROWN)}), got '{model}'; "
+            "calibrate again with one of those models, or undistort the images first",
+            field=where,
         )
 
 
@@ -207,8 +208,9 @@ def check_distortion(given: Iterable[str], used: Collection[str], names: Sequenc
     for key in given:
         if key not in used and (key.rstrip("0123456789") in names or LIKE_DISTORTION.search(key)):
             raise InputError(
-                f"{where}: expected distortion coefficients as one of {', '.join(names)}, got '{key}', which is not "
-                "read; rename it, or take it out of the file"
+                f"expected distortion coefficients as one of {', '.join(names)}, got '{key}', which is not "
+                "read; rename it, or take it out of the file",
+                field=where,
             )
 
 
@@ -218,7 +220,7 @@ def check_names(cameras: Sequence[CalibratedCamera], where: str) -> None:
     for name in names:
         if names.count(name) > 1:
             raise InputError(
-                f"{where}: expected cameras of different names, got {names.count(name)} named '{name}'; rename them"
+                f"expected cameras of different names, got {names.count(name)} named '{name}'; rename them", field=where
             )
 
 
@@ -226,11 +228,12 @@ def five(values: Any, where: str) -> Tensor:
     """Return OpenCV's five coefficients of 4 to 14; InputError if those beyond are not 0, or one is no number."""
     given = flat(values, where)
     if not np.isfinite(given).all():
-        raise InputError(f"{where}: expected finite numbers as distortion coefficients, got {values!r}")
+        raise InputError(f"expected finite numbers as distortion coefficients, got {values!r}", field=where)
     if np.any(given[5:] != 0):
         raise InputError(
-            f"{where}: expected at most 5 distortion coefficients (k1 k2 p1 p2 k3), got {len(given)}; calibrate again "
-            "without the rational, thin-prism and tilted models"
+            f"expected at most 5 distortion coefficients (k1 k2 p1 p2 k3), got {len(given)}; calibrate again "
+            "without the rational, thin-prism and tilted models",
+            field=where,
         )
     return torch.from_numpy(np.concatenate([given[:5], np.zeros(max(0, 5 - len(given)))]))
 
@@ -286,7 +289,7 @@ def read_box(path: str | os.PathLike[str]) -> Box | None:
     try:
         return Box(lower, upper)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise error.inside(path) from None
 
 
 def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
@@ -299,10 +302,10 @@ def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
     """
     table = read_toml(path, "file; expected a calibration")
     if table.get("format") != FORMAT:
-        raise InputError(f"{path}: expected format = '{FORMAT}', got {table.get('format')!r}")
+        raise InputError(f"expected format = '{FORMAT}', got {table.get('format')!r}", field=path)
     tables = table.get("camera", [])
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
-        raise InputError(f"{path}: expected at least one table [[camera]], got none")
+        raise InputError("expected at least one table [[camera]], got none", field=path)
     cameras = tuple(_camera(t, i, str(path)) for i, t in enumerate(tables))
     check_names(cameras, str(path))
     return cameras
@@ -314,10 +317,10 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
     check_known(table, KEYS, where)
     for key in ("name", "intrinsics", "rotation", "translation"):
         if key not in table:
-            raise InputError(f"{where}: '{key}' is missing")
+            raise InputError(f"'{key}' is missing", field=where)
     given = table.get("background")
     if given is not None and (not isinstance(given, dict) or set(given) != {"normal", "offset"}):
-        raise InputError(f"{where}: background: expected normal = [x, y, z] and offset = mm, got {given!r}")
+        raise InputError(f"background: expected normal = [x, y, z] and offset = mm, got {given!r}", field=where)
     camera = CalibratedCamera(
         name=name,
         intrinsics=numbers(table["intrinsics"], (3, 3), f"{where}: intrinsics"),
@@ -337,7 +340,7 @@ def _lens(table: dict[str, Any], where: str) -> Lens | None:
     """The lens of a camera; none where its aperture is not told."""
     if "aperture_diameter" not in table:
         if "focus_distance" in table:
-            raise InputError(f"{where}: focus_distance: expected together with aperture_diameter, got it alone")
+            raise InputError("focus_distance: expected together with aperture_diameter, got it alone", field=where)
         return None
     diameter, focus = (
         None if key not in table else float(numbers(table[key], (), f"{where}: {key}"))
@@ -346,4 +349,4 @@ def _lens(table: dict[str, Any], where: str) -> Lens | None:
     try:
         return Lens(diameter or 0.0, focus)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+        raise error.inside(where) from None

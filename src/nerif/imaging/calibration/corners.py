@@ -1,4 +1,4 @@
-"""Corners of a calibration target in a picture: their order, and where they are to a hundredth of a pixel."""
+"""Corners of a calibration target in an image: their order, and where they are to a hundredth of a pixel."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ __all__ = ["eight_bit", "first_at_a_black_square", "first_at_the_upper_left", "s
 
 
 def eight_bit(image: np.ndarray) -> np.ndarray:
-    """Stretch the picture to eight bits."""
+    """Stretch the image to eight bits."""
     low, high = np.percentile(image.astype(np.float64), (0.2, 99.8))
     scaled = (image.astype(np.float32) - low) * (255 / max(float(high - low), 1e-6))
     return np.clip(np.round(scaled), 0, 255).astype(np.uint8)
 
 
-def first_at_a_black_square(picture: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def first_at_a_black_square(image: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Order corners so that the first square, beyond the first corner, is the black one of our own print."""
     columns, rows = shape
     grid = pixels.reshape(rows, columns, 2)
@@ -24,7 +24,7 @@ def first_at_a_black_square(picture: np.ndarray, pixels: np.ndarray, shape: tupl
     means = []
     for i in (0, 1):  # the inner squares next to the first corner along the first row: black where i is even
         square = grid[0:2, i : i + 2].mean(axis=(0, 1))
-        means.append(float(_sample(picture, square)))
+        means.append(float(_sample(image, square)))
     return (grid if means[0] < means[1] else grid[::-1, ::-1]).reshape(-1, 2)
 
 
@@ -32,7 +32,7 @@ def saddle_points(image: np.ndarray, pixels: np.ndarray, room: float) -> tuple[n
     """Move corners to the saddle point of the grey values around them, and tell which stay near where they were.
 
     A quadratic surface is fitted by least squares under a Gaussian weight, again around each new point (Lucchese &
-    Mitra, Using saddle points for subpixel feature detection, 2002): 0.005 to 0.02 px on rendered pictures, where
+    Mitra, Using saddle points for subpixel feature detection, 2002): 0.005 to 0.02 px on rendered images, where
     OpenCV's own refinements leave 0.02 to 0.05 px. `room` is the reach (px) that the fit may have: up to the markers,
     whose own edges would pull at it.
     """
@@ -57,14 +57,14 @@ def saddle_points(image: np.ndarray, pixels: np.ndarray, room: float) -> tuple[n
     return found, np.linalg.norm(found - pixels, axis=1) < max(2.0, 0.3 * half)
 
 
-def _sample(picture: np.ndarray, where: np.ndarray) -> float:
+def _sample(image: np.ndarray, where: np.ndarray) -> float:
     """Mean of 3 x 3 pixels."""
     u, v = np.round(where).astype(int)
-    return float(picture[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].mean())
+    return float(image[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].mean())
 
 
 def first_at_the_upper_left(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Order circles so that rows go down and columns to the right in the picture."""
+    """Order circles so that rows go down and columns to the right in the image."""
     columns, rows = shape
     grid = pixels.reshape(rows, columns, 2)
     if grid[0, 0, 1] + grid[0, -1, 1] > grid[-1, 0, 1] + grid[-1, -1, 1]:
@@ -73,7 +73,7 @@ def first_at_the_upper_left(pixels: np.ndarray, shape: tuple[int, int]) -> np.nd
 
 
 def spacing(pixels: np.ndarray, ids: np.ndarray, shape: tuple[int, int]) -> float:
-    """Shortest distance between neighbouring points in the picture, px."""
+    """Shortest distance between neighbouring points in the image, px."""
     where = {int(i): p for i, p in zip(ids, pixels, strict=True)}
     columns, _ = shape
     near = [

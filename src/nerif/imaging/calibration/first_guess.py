@@ -21,7 +21,7 @@ from jaxtyping import Float
 from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose
-from nerif.imaging.calibration.targets import Detection, ViewPictures
+from nerif.imaging.calibration.targets import Detection, ViewImages
 
 __all__ = [
     "DISAGREE",
@@ -48,7 +48,7 @@ class Guess:
     intrinsics : (camera, 9) as those of a Bundle
     cameras : world to camera
     targets : target to world, of the poses that cameras share, by name
-    laid : target to world, of each camera's pictures of the target on its background, by name
+    laid : target to world, of each camera's images of the target on its background, by name
     """
 
     intrinsics: Float[np.ndarray, "camera 9"]
@@ -57,23 +57,24 @@ class Guess:
     laid: tuple[Mapping[str, Pose], ...]
 
 
-def enough(view: ViewPictures, pictures: int) -> None:
-    """Refuse fewer than three pictures of a target."""
-    if pictures < 3:
+def enough(view: ViewImages, images: int) -> None:
+    """Refuse fewer than three images of a target."""
+    if images < 3:
         raise InputError(
-            f"view '{view.name}': expected the target in 3 pictures at least (10 or more, tilted in different ways, "
-            f"are good), found it in {pictures}"
+            f"expected the target in 3 images at least (10 or more, tilted in different ways, "
+            f"are good), found it in {images}",
+            field=f"view '{view.name}'",
         )
 
 
 def next_camera(
-    views: Sequence[ViewPictures], tied: Collection[int], targets: Collection[str], least: int
+    views: Sequence[ViewImages], tied: Collection[int], targets: Collection[str], least: int
 ) -> tuple[int, list[str]]:
     """Return the camera, of those not tied to the others yet, that shares most target poses with them, and which.
 
     Parameters
     ----------
-    views : what was found in the pictures of each camera
+    views : what was found in the images of each camera
     tied : numbers of the cameras that are
     targets : names of the target poses that these have seen
     least : number of poses it has to share
@@ -89,8 +90,9 @@ def next_camera(
         number = "no target pose" if least == 1 else "fewer than two target poses"
         names = ", ".join(f"'{views[i].name}'" for i in shared)
         raise InputError(
-            f"view {names}: {number} shared with the other cameras, so there is no common frame; take "
-            "pictures of one pose with neighbouring cameras at the same time, under the same number"
+            f"{number} shared with the other cameras, so there is no common frame; take "
+            "images of one pose with neighbouring cameras at the same time, under the same number",
+            field=f"view {names}",
         )
     return chosen, shared[chosen]
 
@@ -104,8 +106,9 @@ def angles(a: Float[np.ndarray, "*#n 3 3"], b: Float[np.ndarray, "*#n 3 3"]) -> 
 def contradiction(view: str, pose: str, degrees: float) -> InputError:
     """What to say of a camera that sees target poses otherwise than the others."""
     return InputError(
-        f"view '{view}': its target poses contradict those of the other cameras (by {degrees:.0f} "
-        f"degrees in '{pose}'); are its pictures mirrored (flip), or of other poses than their names say?"
+        f"its target poses contradict those of the other cameras (by {degrees:.0f} "
+        f"degrees in '{pose}'); are its images mirrored (flip), or of other poses than their names say?",
+        field=f"view '{view}'",
     )
 
 
@@ -115,7 +118,7 @@ Alone = tuple[np.ndarray, dict[tuple[str, bool], Pose]]
 """Intrinsics of one camera, and target poses before it by name and whether the target lies on the background."""
 
 
-def guess_perspective(views: Sequence[ViewPictures], world: str) -> Guess:
+def guess_perspective(views: Sequence[ViewImages], world: str) -> Guess:
     """Return intrinsics and poses in the frame of the target pose `world`.
 
     Raises
@@ -136,15 +139,15 @@ def guess_perspective(views: Sequence[ViewPictures], world: str) -> Guess:
     )
 
 
-def _perspective_view(view: ViewPictures) -> Alone:
+def _perspective_view(view: ViewImages) -> Alone:
     """Focal length of one camera and the pose of each target before it, by name and whether it is on the background."""
     import cv2
 
-    pictures = {(n, False): d for n, d in view.poses.items()} | {(n, True): d for n, d in view.background.items()}
-    enough(view, len(pictures))
+    images = {(n, False): d for n, d in view.poses.items()} | {(n, True): d for n, d in view.background.items()}
+    enough(view, len(images))
     height, width = view.size
-    points = [d.points.astype(np.float32) for d in pictures.values()]
-    pixels = [d.pixels.astype(np.float32) for d in pictures.values()]
+    points = [d.points.astype(np.float32) for d in images.values()]
+    pixels = [d.pixels.astype(np.float32) for d in images.values()]
     # principal point and distortion wait for the bundle adjustment: one camera alone cannot tell them well
     flags = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
@@ -159,19 +162,20 @@ def _perspective_view(view: ViewPictures) -> Alone:
             best = (rms, k, rotations, translations)
     if best is None:
         raise InputError(
-            f"view '{view.name}': no camera explains its {len(pictures)} target pictures; check the number of squares "
-            "and that the target was tilted differently in them"
+            f"no camera explains its {len(images)} target images; check the number of squares "
+            "and that the target was tilted differently in them",
+            field=f"view '{view.name}'",
         )
     _, k, rotations, translations = best
     found = {
         key: Pose.of_vector(np.concatenate([r.ravel(), t.ravel()]))
-        for key, r, t in zip(pictures, rotations, translations, strict=True)
+        for key, r, t in zip(images, rotations, translations, strict=True)
     }
     return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0], dtype=np.float64), found
 
 
 def _perspective_rig(
-    views: Sequence[ViewPictures], alone: Sequence[Alone], world: str
+    views: Sequence[ViewImages], alone: Sequence[Alone], world: str
 ) -> tuple[dict[int, Pose], dict[str, Pose]]:
     """Poses of cameras (world to camera) and targets (to world), from camera to camera through shared poses."""
     targets = {world: Pose(np.eye(3), np.zeros(3))}
@@ -205,8 +209,8 @@ FARTHEST = 3 * DISAGREE  # degrees: rotations further apart than this do not fit
 FLIP = np.diag([1.0, 1.0, -1.0])
 
 
-def guess_telecentric(views: Sequence[ViewPictures], world: str) -> Guess:
-    """Return intrinsics and poses in the frame of the target pose `world`; pictures on the background are not used.
+def guess_telecentric(views: Sequence[ViewImages], world: str) -> Guess:
+    """Return intrinsics and poses in the frame of the target pose `world`; images on the background are not used.
 
     Raises
     ------
@@ -225,7 +229,7 @@ def guess_telecentric(views: Sequence[ViewPictures], world: str) -> Guess:
 
 
 def mirrored(bundle: Bundle) -> Bundle:
-    """Return the rig mirrored at the world's plane z = 0, cameras looking the other way: it takes the same pictures."""
+    """Return the rig mirrored at the world's plane z = 0, cameras looking the other way: it takes the same images."""
 
     def flipped(pose: Pose) -> Pose:
         return Pose(FLIP @ pose.rotation @ FLIP, FLIP @ pose.translation)
@@ -235,7 +239,7 @@ def mirrored(bundle: Bundle) -> Bundle:
 
 @dataclass(frozen=True)
 class _TelecentricView:
-    """One camera: px/mm, the middle of its picture (px), and of each pose both rotations and the place (x, y) in mm."""
+    """One camera: px/mm, the middle of its image (px), and of each pose both rotations and the place (x, y) in mm."""
 
     scale: float
     middle: tuple[float, float]
@@ -243,12 +247,14 @@ class _TelecentricView:
     places: Mapping[str, Float[np.ndarray, 2]]
 
 
-def _telecentric_view(view: ViewPictures) -> _TelecentricView:
+def _telecentric_view(view: ViewImages) -> _TelecentricView:
     enough(view, len(view.poses))
     affine = {name: _affine(found) for name, found in view.poses.items()}
     for name, (matrix, _) in affine.items():
         if not np.linalg.det(matrix) > 0:
-            raise InputError(f"view '{view.name}': sees the target of '{name}' from behind; is it mirrored (flip)?")
+            raise InputError(
+                f"sees the target of '{name}' from behind; is it mirrored (flip)?", field=f"view '{view.name}'"
+            )
     scale = float(np.median([np.linalg.norm(matrix, 2) for matrix, _ in affine.values()]))
     middle = ((view.size[1] - 1) / 2, (view.size[0] - 1) / 2)
     return _TelecentricView(
@@ -279,7 +285,7 @@ def _both_turns(block: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 3 3"]:
 
 
 def _telecentric_rig(
-    views: Sequence[ViewPictures], alone: Sequence[_TelecentricView], world: str
+    views: Sequence[ViewImages], alone: Sequence[_TelecentricView], world: str
 ) -> tuple[dict[int, np.ndarray], dict[str, np.ndarray]]:
     """Rotations of cameras (from the world) and targets (to it): always the camera that shares most poses is next."""
     first = max(range(len(views)), key=lambda i: len(views[i].poses))
@@ -298,7 +304,7 @@ def _telecentric_rig(
                 if left.min() < DISAGREE:
                     targets[name] = targets[name][[left.argmin()]]
     if len(views) > 1 and len(targets[world]) > 1:
-        raise InputError(f"world: expected a target pose that two cameras see, got '{world}'")
+        raise InputError(f"expected a target pose that two cameras see, got '{world}'", field="world")
     to_world = targets[world][0].T
     turned = {name: to_world @ turns[0] for name, turns in targets.items()}
     return {i: camera @ to_world.T for i, camera in cameras.items()}, turned
@@ -337,23 +343,23 @@ def _places(
     return {**places, world: np.zeros(3)}, offsets
 
 
-GUESSES: dict[Projection, Callable[[Sequence[ViewPictures], str], Guess]] = {
+GUESSES: dict[Projection, Callable[[Sequence[ViewImages], str], Guess]] = {
     PERSPECTIVE: guess_perspective,
     TELECENTRIC: guess_telecentric,
 }
 
 
 def first_guess(
-    views: Sequence[ViewPictures], distortion: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
+    views: Sequence[ViewImages], distortion: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
 ) -> tuple[Bundle, list[Observation]]:
     """Return a bundle to adjust, in the frame of one target pose, and all points found.
 
-    The principal point of a camera that shows no depth stays in the middle of the picture: moving it is moving the
+    The principal point of a camera that shows no depth stays in the middle of the image: moving it is moving the
     camera and, for the distortion, p1 and p2.
 
     Parameters
     ----------
-    views : what was found in the pictures of each camera
+    views : what was found in the images of each camera
     distortion : coefficients to be adjusted
     world : name of the target pose that is the world frame; the one that most cameras see if empty
     projection : of all cameras
@@ -385,17 +391,17 @@ def first_guess(
     return bundle, observations
 
 
-def _pose_names(views: Sequence[ViewPictures], world: str) -> tuple[list[str], str]:
+def _pose_names(views: Sequence[ViewImages], world: str) -> tuple[list[str], str]:
     """All shared poses, and the one that is the world."""
     seen: dict[str, int] = {}
     for view in views:
         for name in view.poses:
             seen[name] = seen.get(name, 0) + 1
     if not seen:
-        raise InputError("calibrate: no picture with the target free in space; expected some in every view")
+        raise InputError("no image with the target free in space; expected some in every view", field="calibrate")
     if world and world not in seen:
         raise InputError(
-            f"world: expected a target pose that was found, one of {', '.join(sorted(seen))}, got '{world}'"
+            f"expected a target pose that was found, one of {', '.join(sorted(seen))}, got '{world}'", field="world"
         )
     names = sorted(seen)
     return names, world or max(names, key=lambda n: seen[n])

@@ -21,17 +21,17 @@ __all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "
 
 MOUNT = 0.05, 0.005
 """How far a camera may have been moved (mm) and turned (degrees) since it was calibrated, where nobody says."""
-COVERED = 0.4  # of the picture: with less, distortion is not known at its edges
+COVERED = 0.4  # of the image: with less, distortion is not known at its edges
 FOCAL_KNOWN = 0.01  # of the focal length: a larger standard deviation is told
 PLANE_FLAT = 0.005  # of the distance: a background that is less flat is none
 
 
 @dataclass(frozen=True)
 class ImageError:
-    """Reprojection error of one picture: rms over `points` points, px."""
+    """Reprojection error of one image: rms over `points` points, px."""
 
     camera: str
-    picture: str
+    image: str
     rms: float
     points: int
     used: bool
@@ -39,36 +39,36 @@ class ImageError:
 
     @property
     def name(self) -> str:
-        """Name of the picture, such as cam1/target/7."""
-        return f"{self.camera}/{'background' if self.background else 'target'}/{self.picture}"
+        """Name of the image, such as cam1/target/7."""
+        return f"{self.camera}/{'background' if self.background else 'target'}/{self.image}"
 
 
 def rms_of(errors: Sequence[ImageError]) -> float:
-    """Return the rms reprojection error over the points of the pictures that were used, px."""
+    """Return the rms reprojection error over the points of the images that were used, px."""
     used = [e for e in errors if e.used]
     return float(np.sqrt(np.average([e.rms**2 for e in used], weights=[e.points for e in used])))
 
 
 def read_errors(path: str | os.PathLike[str]) -> tuple[ImageError, ...]:
-    """Read the errors of the pictures that a calibration file was made from; none where it does not tell them.
+    """Read the errors of the images that a calibration file was made from; none where it does not tell them.
 
     Raises
     ------
     InputError
-        If it is missing, no TOML, or its [[about.picture]] are not as nerif calibrate writes them.
+        If it is missing, no TOML, or its [[about.image]] are not as nerif calibrate writes them.
     """
     table = read_toml(path, "file; expected a calibration")
     about = table.get("about")
     errors = []
-    for entry in (about.get("picture") or []) if isinstance(about, dict) else []:
+    for entry in (about.get("image") or []) if isinstance(about, dict) else []:
         try:
-            camera, source, picture = str(entry["name"]).rsplit("/", 2)
+            camera, source, image = str(entry["name"]).rsplit("/", 2)
             rms, points, used = float(entry["rms_px"]), int(entry["points"]), bool(entry["used"])
         except (KeyError, TypeError, ValueError):
             raise InputError(
-                f"{path}: expected about.picture with name, rms_px, points and used, got {entry!r}; calibrate again"
+                f"expected about.image with name, rms_px, points and used, got {entry!r}; calibrate again", field=path
             ) from None
-        errors.append(ImageError(camera, picture, rms, points, used, source == "background"))
+        errors.append(ImageError(camera, image, rms, points, used, source == "background"))
     return tuple(errors)
 
 
@@ -102,11 +102,11 @@ class Calibration:
 
     Parameters
     ----------
-    names, sizes : of the cameras and their pictures (height, width)
+    names, sizes : of the cameras and their images (height, width)
     intrinsics : (camera, 9) as those of a Bundle
     poses : world to camera, mm
     backgrounds : plane of each camera, or None
-    errors : one a picture
+    errors : one an image
     sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm; the latter of
         telecentric cameras across the optical axis
     sigma_focal : (camera,) share of the focal length or scale
@@ -149,7 +149,7 @@ class Calibration:
         background_distance : where no target was laid, of a plane across the optical axis, behind the origin, mm
         """
         errors = [
-            ImageError(names[o.camera], o.picture, bundle.rms(o), len(o.detection.points), u, o.on_background)
+            ImageError(names[o.camera], o.image, bundle.rms(o), len(o.detection.points), u, o.on_background)
             for o, u in zip(observations, used, strict=True)
         ]
         residuals, backgrounds = [], []
@@ -175,7 +175,7 @@ class Calibration:
         )
 
     def rms(self, camera: str | None = None) -> float:
-        """Rms reprojection error over the pictures used, of one camera or all, px."""
+        """Rms reprojection error over the images used, of one camera or all, px."""
         return rms_of([e for e in self.errors if camera in (None, e.camera)])
 
     @property
@@ -201,9 +201,9 @@ class Calibration:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know: pictures left out, and what may be wrong with a camera, short of refusing it."""
+        """What a user should know: images left out, and what may be wrong with a camera, short of refusing it."""
         notes = [
-            f"{e.camera}/{e.picture}: left out, its reprojection error of {e.rms:.2f} px does not fit"
+            f"{e.camera}/{e.image}: left out, its reprojection error of {e.rms:.2f} px does not fit"
             for e in self.errors
             if not e.used
         ]
@@ -211,9 +211,7 @@ class Calibration:
             u, v = self.residuals[i][:, :2].T
             covered = np.ptp(u) * np.ptp(v) / (self.sizes[i][0] * self.sizes[i][1])
             if covered < COVERED:
-                notes.append(
-                    f"{name}: the targets cover {covered:.0%} of the picture; distortion is a guess beyond them"
-                )
+                notes.append(f"{name}: the targets cover {covered:.0%} of the image; distortion is a guess beyond them")
             if self.sigma_focal[i] > FOCAL_KNOWN:
                 notes.append(
                     f"{name}: the {self.projection.scale} is known to {self.sigma_focal[i]:.1%} only; tilt the target "
@@ -224,7 +222,7 @@ class Calibration:
                 notes.append(f"{name}: {why}, so its plane is not known; --background-distance gives it")
         if not self.projection.shows_depth:
             notes.append(
-                "where telecentric cameras are along their optical axes does not show in pictures, and does not "
+                "where telecentric cameras are along their optical axes does not show in images, and does not "
                 "matter: z_cam = 0 was laid through the origin"
             )
         return tuple(notes)
@@ -242,22 +240,25 @@ class Calibration:
             if not rms <= max_error:
                 worst = max((e for e in self.errors if e.camera == name and e.used), key=lambda e: e.rms)
                 raise InputError(
-                    f"view '{name}': reprojection error {rms:.2f} px, expected {max_error:g} px or less; the worst "
-                    f"picture is {worst.picture} ({worst.rms:.2f} px). Check pitch and number of squares, and that "
-                    "pictures under one name show one pose; or raise --max-error"
+                    f"reprojection error {rms:.2f} px, expected {max_error:g} px or less; the worst "
+                    f"image is {worst.image} ({worst.rms:.2f} px). Check pitch and number of squares, and that "
+                    "images under one name show one pose; or raise --max-error",
+                    field=f"view '{name}'",
                 )
             fx, fy, cx, cy = self.intrinsics[i, :4]
             if not (0.8 < fx / fy < 1.25 and -0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
                 raise InputError(
-                    f"view '{name}': got fx = {fx:.5g}, fy = {fy:.5g} {self.projection.unit}, cx = {cx:.5g}, "
-                    f"cy = {cy:.5g} px, which no camera has; take more target pictures, tilted in different ways and "
-                    "filling the picture"
+                    f"got fx = {fx:.5g}, fy = {fy:.5g} {self.projection.unit}, cx = {cx:.5g}, "
+                    f"cy = {cy:.5g} px, which no camera has; take more target images, tilted in different ways and "
+                    "filling the image",
+                    field=f"view '{name}'",
                 )
             plane = self.backgrounds[i]
             if plane is not None and plane.rms > PLANE_FLAT * np.linalg.norm(self.poses[i].translation):
                 raise InputError(
-                    f"view '{name}': the targets on its background lie {plane.rms:.2f} mm rms off one plane; did the "
-                    "background move, or does a picture show the target off it?"
+                    f"the targets on its background lie {plane.rms:.2f} mm rms off one plane; did the "
+                    "background move, or does an image show the target off it?",
+                    field=f"view '{name}'",
                 )
 
     def write(self, path: str | os.PathLike[str], box: Box | None = None) -> None:
@@ -269,7 +270,7 @@ class Calibration:
             "sigma_rotation_deg": dict(zip(self.names, self.sigma_rotation.tolist(), strict=True)),
             "sigma_translation_mm": dict(zip(self.names, self.sigma_translation.tolist(), strict=True)),
             "notes": list(self.notes),
-            "picture": [{"name": e.name, "rms_px": e.rms, "points": e.points, "used": e.used} for e in self.errors],
+            "image": [{"name": e.name, "rms_px": e.rms, "points": e.points, "used": e.used} for e in self.errors],
         }
         write_cameras(path, self.cameras, about, box)
 

@@ -1,9 +1,9 @@
-"""One camera from what a ruler tells: how far it is from the axis of a flow, and where that axis is in its picture.
+"""One camera from what a ruler tells: how far it is from the axis of a flow, and where that axis is in its image.
 
     x_cam = (X, Y, D)      points of the axis, which lies in a plane across the optical axis, D mm from the camera
     z = drawn axis, y = optical axis, x = y x z         world, about the point of the axis nearest the principal point
 
-With the axis upright in the picture, x is to its right, y away from the camera, z up.
+With the axis upright in the image, x is to its right, y away from the camera, z up.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from nerif.imaging.calibration.importers.importers import ImportSettings
 from nerif.imaging.readers.open import open_frames
 from nerif.imaging.readers.views import find_views
 
-__all__ = ["RULER", "SimpleRig", "box_about_axis", "find_picture", "simple_camera"]
+__all__ = ["RULER", "SimpleRig", "box_about_axis", "find_image", "simple_camera"]
 
 RULER = 1.0, 0.5
 """How far the camera may stand (mm) and be turned (degrees) from where a ruler has it, where nobody says."""
 STEPS = 1000  # of the half width at which a box is tried
 PARTS = 100  # a corner of the box is rounded to a power of ten below this part of its edges
 SLACK = 1e-6  # of a step of the rounding: what a number may lack of being one
-TOGETHER = 1e-9  # of the picture: what lies this close to its edge is on it
+TOGETHER = 1e-9  # of the image: what lies this close to its edge is on it
 
 Pixel = tuple[float, float]
 
@@ -50,7 +50,7 @@ class SimpleRig:
     distance: float | None = None
     """With --simple: camera (entrance pupil of its lens) to the axis of the flow, along the optical axis, mm."""
     mm_per_px: float | None = None
-    """With --simple: mm that a pixel shows at the axis: length of a ruler held there over its length in the picture."""
+    """With --simple: mm that a pixel shows at the axis: length of a ruler held there over its length in the image."""
     focal_length: float | None = None
     """With --simple, where mm_per_px is not known: focal length of the lens, mm; some per cent off for close-ups."""
     pixel_pitch_um: float | None = None
@@ -58,36 +58,37 @@ class SimpleRig:
     f_number: float | None = None
     """With --focal-length: f-number of the lens, focused on the background, through all of which a pixel then sees."""
     axis_from: Pixel | None = None
-    """With --simple: column and row of a point of the axis; default: the middle of the picture's lower edge."""
+    """With --simple: column and row of a point of the axis; default: the middle of the image's lower edge."""
     axis_to: Pixel | None = None
     """With --simple: column and row of another one, along z+ (downstream); default: the middle of the upper edge."""
     principal_point: Pixel | None = None
-    """With --simple: column and row of the optical axis, where that is not in the middle of the picture (of a crop)."""
+    """With --simple: column and row of the optical axis, where that is not in the middle of the image (of a crop)."""
 
     def __post_init__(self) -> None:
         for name in ("distance", "mm_per_px", "focal_length", "pixel_pitch_um", "f_number"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name}: expected a positive number, got {value}")
+                raise InputError(f"expected a positive number, got {value}", field=name)
         for name in ("axis_from", "axis_to", "principal_point"):
             value = getattr(self, name)
             if value is not None and not math.isfinite(math.fsum(value)):
-                raise InputError(f"{name}: expected column and row of a pixel, got {value}")
+                raise InputError(f"expected column and row of a pixel, got {value}", field=name)
         if (self.axis_from is None) != (self.axis_to is None):
-            raise InputError("axis_from, axis_to: expected two points of the axis or neither")
+            raise InputError("expected two points of the axis or neither", field="axis_from, axis_to")
         if self.axis_from and self.axis_to and not math.dist(self.axis_from, self.axis_to) >= 1:
             raise InputError(
-                f"axis_from, axis_to: expected two pixels of the axis, far from one another, got {self.axis_from} and "
-                f"{self.axis_to}"
+                f"expected two pixels of the axis, far from one another, got {self.axis_from} and {self.axis_to}",
+                field="axis_from, axis_to",
             )
         if self.mm_per_px is not None and self.pixel_pitch_um is not None:
             raise InputError(
-                "mm_per_px, pixel_pitch_um: expected one of the two, since either tells the scale; leave out the pitch"
+                "expected one of the two, since either tells the scale; leave out the pitch",
+                field="mm_per_px, pixel_pitch_um",
             )
         if self.f_number is not None and self.focal_length is None:
             raise InputError(
-                "f_number: expected together with focal_length, got it alone; or give --aperture-diameter, their "
-                "quotient in mm"
+                "expected together with focal_length, got it alone; or give --aperture-diameter, their quotient in mm",
+                field="f_number",
             )
 
     @property
@@ -109,8 +110,9 @@ class SimpleRig:
             return self.mm_per_px
         if self.focal_length is None or self.pixel_pitch_um is None:
             raise InputError(
-                "mm_per_px: expected the scale at the axis, or focal_length and pixel_pitch_um; hold a ruler at the "
-                "axis, and divide its length by that in the picture"
+                "expected the scale at the axis, or focal_length and pixel_pitch_um; hold a ruler at the "
+                "axis, and divide its length by that in the image",
+                field="mm_per_px",
             )
         return self.depth * self.pixel_pitch_um / 1000 / self.focal_length
 
@@ -118,34 +120,36 @@ class SimpleRig:
     def depth(self) -> float:
         """The distance, mm; InputError if it is not known."""
         if self.distance is None:
-            raise InputError("distance: expected mm from the camera to the axis of the flow, got none; measure it")
+            raise InputError(
+                "expected mm from the camera to the axis of the flow, got none; measure it", field="distance"
+            )
         return self.distance
 
 
-def find_picture(
+def find_image(
     source: Path, only: Sequence[str] = (), image_size: tuple[int, int] | None = None
 ) -> tuple[str, tuple[int, int]]:
-    """Return the name of the one view of an experiment, and the height and width of its pictures, px.
+    """Return the name of the one view of an experiment, and the height and width of its images, px.
 
     Parameters
     ----------
-    source : folder of the experiment, or a picture; its view is called "camera", unless `only` has a name
+    source : folder of the experiment, or an image; its view is called "camera", unless `only` has a name
     only : name of the view, needed where there are several
-    image_size : height and width, px, where no picture is to be looked at
+    image_size : height and width, px, where no image is to be looked at
 
     Raises
     ------
     InputError
-        If there is none or more than one, or a picture cannot be read.
+        If there is none or more than one, or an image cannot be read.
     """
     if len(only) > 1:
-        raise InputError(f"views: expected one view for a simple rig, got {', '.join(only)}")
+        raise InputError(f"expected one view for a simple rig, got {', '.join(only)}", field="views")
     if not source.is_dir():
         return only[0] if only else "camera", image_size or open_frames(source).shape
     views = find_views(source, only)
     if len(views) > 1:
         names = ", ".join(view.name for view in views)
-        raise InputError(f"views: expected one view for a simple rig, found {names}; choose with --views NAME")
+        raise InputError(f"expected one view for a simple rig, found {names}; choose with --views NAME", field="views")
     (view,) = views
     if image_size is None:
         shape = view.open("reference").shape
@@ -173,13 +177,13 @@ def simple_camera(
     depth, scale, behind = rig.depth, rig.scale, given.background_distance
     if behind is None or not 0 < behind < math.inf:
         raise InputError(
-            f"background_distance: expected a positive number of mm from the axis of the flow to the background, got "
-            f"{behind}; measure it"
+            f"expected a positive number of mm from the axis of the flow to the background, got {behind}; measure it",
+            field="background_distance",
         )
     lens = given.lens
     if rig.f_number is not None and rig.focal_length is not None:
         if lens is not None:
-            raise InputError("f_number, aperture_diameter: expected one of the two, got both")
+            raise InputError("expected one of the two, got both", field="f_number, aperture_diameter")
         lens = Lens(rig.focal_length / rig.f_number)
     height, width = image_size
     middle = np.array(rig.principal_point or ((width - 1) / 2, (height - 1) / 2))
@@ -206,9 +210,9 @@ def simple_camera(
 
 
 def box_about_axis(camera: CalibratedCamera) -> Box:
-    """Return the largest box about the axis, square across it, that the picture shows whole in the axis's plane.
+    """Return the largest box about the axis, square across it, that the image shows whole in the axis's plane.
 
-    Along x it reaches as far as the nearer side of the picture allows, along y as far as that, but ends before the
+    Along x it reaches as far as the nearer side of the image allows, along y as far as that, but ends before the
     background; the corners are rounded inwards.
 
     Parameters
@@ -218,14 +222,14 @@ def box_about_axis(camera: CalibratedCamera) -> Box:
     Raises
     ------
     InputError
-        If the axis is not in the picture, or at its edge.
+        If the axis is not in the image, or at its edge.
     """
     whole = camera.camera()
     steps = whole.project(torch.tensor([[0, 0, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)).numpy()
     origin, across, along = steps[0], steps[1] - steps[0], steps[2] - steps[0]  # px, px/mm: all at one depth
     height, width = whole.image_size
     far = np.array([width - 0.5, height - 0.5])
-    # the corners (+-half, z) are in the picture: upward z <= room - sideways half, for each of its four edges
+    # the corners (+-half, z) are in the image: upward z <= room - sideways half, for each of its four edges
     upward = np.concatenate([along, -along])
     sideways = np.abs(np.concatenate([across, across]))
     room = np.concatenate([far - origin, origin + 0.5])
@@ -234,8 +238,9 @@ def box_about_axis(camera: CalibratedCamera) -> Box:
     half = min(half, behind)
     if not min(half, top - bottom) * np.linalg.norm(across) > 1:
         raise InputError(
-            f"axis_from, axis_to: expected an axis inside the picture of {width} x {height} px (width x height), got "
-            "one beside it or at its edge; check the order, COLUMN ROW, or give the box by --lower and --upper"
+            f"expected an axis inside the image of {width} x {height} px (width x height), got "
+            "one beside it or at its edge; check the order, COLUMN ROW, or give the box by --lower and --upper",
+            field="axis_from, axis_to",
         )
     unit = 10.0 ** -math.floor(math.log10(min(half, top - bottom) / PARTS))
     before = math.ceil(behind * unit - SLACK) - 1  # a box that touches the background is none before it

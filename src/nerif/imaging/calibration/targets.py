@@ -18,7 +18,7 @@ from nerif.imaging.calibration.corners import (
     spacing,
 )
 
-__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewPictures"]
+__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages"]
 
 KINDS = ("chessboard", "charuco", "circles")
 DICTIONARY = "DICT_4X4_250"
@@ -27,7 +27,7 @@ MARKER = 0.6  # of a square
 
 @dataclass(frozen=True)
 class Detection:
-    """What was found of a target in a picture.
+    """What was found of a target in an image.
 
     Parameters
     ----------
@@ -42,15 +42,15 @@ class Detection:
 
 
 @dataclass(frozen=True)
-class ViewPictures:
-    """What was found in the pictures of one camera.
+class ViewImages:
+    """What was found in the images of one camera.
 
     Parameters
     ----------
     name : of the camera
-    size : (height, width) of its pictures, px
+    size : (height, width) of its images, px
     poses : the target free in space, by the name of the pose, which cameras share
-    background : the target laid on the background, by the name of the picture
+    background : the target laid on the background, by the name of the image
     """
 
     name: str
@@ -58,8 +58,8 @@ class ViewPictures:
     poses: Mapping[str, Detection]
     background: Mapping[str, Detection]
 
-    def without(self, names: Collection[str]) -> ViewPictures:
-        """Return what was found but for the pictures of these names."""
+    def without(self, names: Collection[str]) -> ViewImages:
+        """Return what was found but for the images of these names."""
         poses, background = (
             {pose: d for pose, d in found.items() if f"{self.name}/{source}/{pose}" not in names}
             for source, found in (("target", self.poses), ("background", self.background))
@@ -101,24 +101,30 @@ class CalibrationTarget:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError(f"target kind: expected one of {', '.join(KINDS)}, got '{self.kind}'")
+            raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="target kind")
         least = 2 if self.kind == "circles" else 4
         if self.columns < least or self.rows < least:
-            raise InputError(f"target: expected at least {least} columns and rows, got {self.columns} x {self.rows}")
+            raise InputError(
+                f"expected at least {least} columns and rows, got {self.columns} x {self.rows}", field="target"
+            )
         if not self.pitch > 0 or not 0 <= self.marker < self.pitch:
             raise InputError(
-                f"target: expected pitch > 0 mm and a marker smaller than it, got {self.pitch} and {self.marker}"
+                f"expected pitch > 0 mm and a marker smaller than it, got {self.pitch} and {self.marker}",
+                field="target",
             )
         if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
             raise InputError(
-                f"target: a chessboard of {self.columns} x {self.rows} squares looks the same turned by 180 degrees; "
-                "take one odd and one even number of squares (13 x 10, say), or ChArUco"
+                f"a chessboard of {self.columns} x {self.rows} squares looks the same turned by 180 degrees; "
+                "take one odd and one even number of squares (13 x 10, say), or ChArUco",
+                field="target",
             )
         if self.kind == "charuco":
             import cv2
 
             if not hasattr(cv2.aruco, self.dictionary):
-                raise InputError(f"dictionary: expected an OpenCV name such as {DICTIONARY}, got '{self.dictionary}'")
+                raise InputError(
+                    f"expected an OpenCV name such as {DICTIONARY}, got '{self.dictionary}'", field="dictionary"
+                )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -146,7 +152,7 @@ class CalibrationTarget:
     def scaled(self, factor: float) -> CalibrationTarget:
         """Return the same target printed `factor` times as large."""
         if not factor > 0:
-            raise InputError(f"background_scale: expected a positive number, got {factor}")
+            raise InputError(f"expected a positive number, got {factor}", field="background_scale")
         return replace(self, pitch=factor * self.pitch, marker=factor * self.marker)
 
     def raster(self, pixel: float) -> Float[np.ndarray, "row column"]:
@@ -169,24 +175,24 @@ class CalibrationTarget:
         return self.pitch / max(8, round(self.pitch / pixel))
 
     def detect(self, image: np.ndarray) -> Detection | None:
-        """Find the target in a picture (8 to 16 bit or float); None where it is not found."""
+        """Find the target in an image (8 to 16 bit or float); None where it is not found."""
         import cv2
 
-        picture = eight_bit(image)
+        image = eight_bit(image)
         if self.kind == "chessboard":
             flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-            found, corners = cv2.findChessboardCornersSB(picture, self.shape, flags=flags)
+            found, corners = cv2.findChessboardCornersSB(image, self.shape, flags=flags)
             if not found:
                 return None
-            pixels = first_at_a_black_square(picture, corners.reshape(-1, 2).astype(np.float64), self.shape)
+            pixels = first_at_a_black_square(image, corners.reshape(-1, 2).astype(np.float64), self.shape)
             return self._refined(image, np.arange(len(pixels)), pixels, 0.5)
         if self.kind == "circles":
-            found, corners = cv2.findCirclesGrid(picture, self.shape, flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+            found, corners = cv2.findCirclesGrid(image, self.shape, flags=cv2.CALIB_CB_SYMMETRIC_GRID)
             if not found:
                 return None
             pixels = first_at_the_upper_left(corners.reshape(-1, 2).astype(np.float64), self.shape)
             return Detection(np.arange(len(pixels)), pixels, self.points)
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(self._board()).detectBoard(picture)
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(self._board()).detectBoard(image)
         if ids is None or len(ids) < 6:
             return None
         gap = (1 - (self.marker or MARKER * self.pitch) / self.pitch) / 2
@@ -204,8 +210,9 @@ class CalibrationTarget:
         needed = self.columns * self.rows // 2
         if needed > len(dictionary.bytesList):
             raise InputError(
-                f"dictionary: expected at least {needed} markers for {self.columns} x {self.rows} squares, "
-                f"{self.dictionary} has {len(dictionary.bytesList)}"
+                f"expected at least {needed} markers for {self.columns} x {self.rows} squares, "
+                f"{self.dictionary} has {len(dictionary.bytesList)}",
+                field="dictionary",
             )
         board = cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.pitch, self.marker or MARKER * self.pitch, dictionary

@@ -1,4 +1,4 @@
-"""Window cross-correlation, as in particle image velocimetry, of pictures or volumes: several passes, deformed between.
+"""Window cross-correlation, as in particle image velocimetry, of images or volumes: several passes, deformed between.
 
 Each window of the first array is correlated with the same window of the second, moved by what is known so far; the peak
 is fitted by a Gaussian through three points a direction; vectors that do not fit their neighbours are replaced. Arrays
@@ -41,21 +41,23 @@ class Vectors:
 
 
 def window_correlation(flow: np.ndarray, reference: np.ndarray, window: int = 16, passes: int = 4) -> np.ndarray:
-    """Return the movement w (row, column, 2) in px of every pixel from the flow picture to the reference.
+    """Return the movement w (row, column, 2) in px of every pixel from the flow image to the reference.
 
     Parameters
     ----------
-    flow, reference : (row, column) grey pictures of one scale
+    flow, reference : (row, column) grey images of one scale
     window : edge of the interrogation windows of the last passes, px; the first uses twice that
     passes : number of passes; windows overlap by three quarters
 
     Raises
     ------
     InputError
-        If a picture is smaller than two windows.
+        If an image is smaller than two windows.
     """
     if min(flow.shape) < 2 * window:
-        raise InputError(f"window: expected at most half the picture ({min(flow.shape) // 2} px), got {window} px")
+        raise InputError(
+            f"expected at most half the image ({min(flow.shape) // 2} px), got {window} px", field="window"
+        )
     return _everywhere(correlate(flow, reference, window, passes), flow.shape)
 
 
@@ -66,7 +68,7 @@ def correlate(
 
     Parameters
     ----------
-    first, second : pictures or volumes of one shape and scale
+    first, second : images or volumes of one shape and scale
     window : edge of the windows of the last passes, px; the first uses twice that where four of them fit
     passes : number of passes; windows overlap by three quarters
     central : whether both arrays are moved, by half each, so that the movement is that of what passes a node halfway;
@@ -78,11 +80,11 @@ def correlate(
         If shapes differ, or an array is smaller than a window.
     """
     if first.shape != second.shape:
-        raise InputError(f"second: expected the shape of the first, {first.shape}, got {second.shape}")
+        raise InputError(f"expected the shape of the first, {first.shape}, got {second.shape}", field="second")
     if not 4 <= window <= min(first.shape):
-        raise InputError(f"window: expected between 4 and the shortest edge, {min(first.shape)}, got {window}")
+        raise InputError(f"expected between 4 and the shortest edge, {min(first.shape)}, got {window}", field="window")
     if passes < 1:
-        raise InputError(f"passes: expected at least 1, got {passes}")
+        raise InputError(f"expected at least 1, got {passes}", field="passes")
     movement = np.zeros((*first.shape, first.ndim), dtype=np.float32)
     for i in range(passes):
         size = 2 * window if i == 0 and min(first.shape) >= 4 * window else window

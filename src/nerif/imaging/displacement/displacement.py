@@ -1,9 +1,9 @@
-"""From pictures to the displacement d(p) = p - p0(p) on the flow picture, with its noise and where it holds.
+"""From images to the displacement d(p) = p - p0(p) on the flow image, with its noise and where it holds.
 
-    flow(p) = reference(p - d(p)),     d = -(optical flow from the flow picture to the reference)
+    flow(p) = reference(p - d(p)),     d = -(optical flow from the flow image to the reference)
 
 How well a pattern fixes a shift: cov = <r^2> (sum grad(I) grad(I)^T)^-1, with r the difference left between the flow
-picture and the moved reference, and the sum over a Gaussian window of the method's own reach. The noise of d is that,
+image and the moved reference, and the sum over a Gaussian window of the method's own reach. The noise of d is that,
 or, where there are three or more reference frames, what flow-off repeats show, plus what cov has more with flow than
 without: repeats know the noise of the camera, but not where the flow is too sharp for the method. To both is added what
 a window of that reach would smooth away of d once more.
@@ -21,7 +21,7 @@ from nerif.common.conventions import InputError
 from nerif.imaging.displacement.exposure import saturated
 from nerif.imaging.displacement.noise import FLOOR, local_correlation, smoothed_away, structure_variance
 from nerif.imaging.displacement.optical_flow import FLOWS
-from nerif.imaging.displacement.photometry import CameraNoise, PicturePair
+from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.frames import as_float
@@ -41,7 +41,7 @@ REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.
 """Standard deviation (px) of the window over which each method averages, smoothness 1 (benchmarks/displacement.py)."""
 
 MOST_REPEATS = 12  # of the reference that are compared with the mean of the others,
-MEGAPIXEL = 2**20  # in pictures up to this many pixels
+MEGAPIXEL = 2**20  # in images up to this many pixels
 
 
 @dataclass(frozen=True)
@@ -54,25 +54,25 @@ class DisplacementSettings:
     smoothness: float = 1.0
     """Above 1 for smoother displacements; scales window or regularisation (deepflow has a fixed one)."""
     local_contrast: int = 0
-    """Window (px) over which brightness and contrast are evened out; 0 matches them over the whole picture only."""
+    """Window (px) over which brightness and contrast are evened out; 0 matches them over the whole image only."""
     shake_border: int = 0
     """Width (px) of the flow-free border to which a shift, turn and zoom are fitted and removed; 0 for none."""
     max_sigma: float = 0.5
     """Pixels with a noise above this are not valid, px."""
     min_correlation: float = 0.5
-    """Pixels around which the two pictures correlate less than this once moved are not valid."""
+    """Pixels around which the two images correlate less than this once moved are not valid."""
 
     def __post_init__(self) -> None:
         if self.method not in FLOWS:
-            raise InputError(f"method: expected one of {', '.join(FLOWS)}, got '{self.method}'")
+            raise InputError(f"expected one of {', '.join(FLOWS)}, got '{self.method}'", field="method")
         for name in ("smoothness", "max_sigma"):
             if not getattr(self, name) > 0:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+                raise InputError(f"expected a positive number, got {getattr(self, name)}", field=name)
         for name in ("local_contrast", "shake_border"):
             if not getattr(self, name) >= 0:
-                raise InputError(f"{name}: expected 0 or more px, got {getattr(self, name)}")
+                raise InputError(f"expected 0 or more px, got {getattr(self, name)}", field=name)
         if not -1 <= self.min_correlation < 1:
-            raise InputError(f"min_correlation: expected a number from -1 to 1, got {self.min_correlation}")
+            raise InputError(f"expected a number from -1 to 1, got {self.min_correlation}", field="min_correlation")
 
     @property
     def reach(self) -> float:
@@ -90,29 +90,30 @@ class DisplacementMap:
     sigma : (row, column, 2) standard deviation of its noise, px
     valid : (row, column) where it holds
     noise_from : "repeats" (of the reference, and residual) or "structure tensor"
-    pair : the pictures that it was found in; None where it is the mean of several
+    pair : the images that it was found in; None where it is the mean of several
     """
 
     displacement: Float[np.ndarray, "row column 2"]
     sigma: Float[np.ndarray, "row column 2"]
     valid: Bool[np.ndarray, "row column"]
     noise_from: str
-    pair: PicturePair | None = None
+    pair: ImagePair | None = None
 
 
 def displacement(
     reference: Grey, flow: Grey, settings: DisplacementSettings
 ) -> Float[np.ndarray, "row column 2"]:  # fmt: skip
-    """Return d (px) of one flow picture against one reference, both of any scale and type.
+    """Return d (px) of one flow image against one reference, both of any scale and type.
 
     Raises
     ------
     InputError
-        If the pictures differ in size, are smaller than 16 px, or the reference is of one grey.
+        If the images differ in size, are smaller than 16 px, or the reference is of one grey.
     """
     if reference.shape != flow.shape or min(flow.shape) < 16:
         raise InputError(
-            f"pictures: expected reference and flow of one size, at least 16 px, got {reference.shape} and {flow.shape}"
+            f"expected reference and flow of one size, at least 16 px, got {reference.shape} and {flow.shape}",
+            field="images",
         )
     first, second = _even_out(as_float(flow), as_float(reference), settings.local_contrast)
     return -FLOWS[settings.method](first, second, settings.smoothness).astype(np.float32)
@@ -153,11 +154,11 @@ class AtRest:
     ) -> AtRest:
         """Average the frames and take the noise from their differences; frames are read when they are needed."""
         if not len(reference):
-            raise InputError("pictures: expected at least one reference picture, got none")
+            raise InputError("expected at least one reference image, got none", field="images")
         total, full = np.zeros(reference[0].shape), np.zeros(reference[0].shape, dtype=bool)
-        for picture in reference:
-            total += picture
-            full |= saturated(picture, full_scale)
+        for image in reference:
+            total += image
+            full |= saturated(image, full_scale)
         noise = _repeat_sigma(reference, total, averaged, settings) if len(reference) >= 3 else None
         mean, count = total / len(reference), len(reference)
         camera = CameraNoise.of_repeats(reference[:MOST_REPEATS], mean, count) if count >= 2 else None
@@ -182,7 +183,9 @@ def measure(
     region : where the background is seen at all, or None
     """
     if not len(reference) or not len(flow):
-        raise InputError(f"pictures: expected at least one of each, got {len(reference)} reference, {len(flow)} flow")
+        raise InputError(
+            f"expected at least one of each, got {len(reference)} reference, {len(flow)} flow", field="images"
+        )
     return measure_against(AtRest.of(reference, settings, full_scale, len(flow)), flow, region)
 
 
@@ -190,23 +193,23 @@ def measure_against(
     rest: AtRest,
     flow: Sequence[np.ndarray],
     region: Bool[np.ndarray, "row column"] | None = None,
-    pictures: bool = True,
+    images: bool = True,
 ) -> DisplacementMap:
     """Return displacement, noise and validity of a view whose reference is known already; see measure.
 
     Parameters
     ----------
-    pictures : whether to keep them, where there is one flow picture
+    images : whether to keep them, where there is one flow image
     """
     settings, reach = rest.settings, rest.settings.reach
     full = rest.full.copy()
     shaken = np.zeros(1)
 
-    def one(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def one(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         nonlocal full, shaken
-        grey = np.asarray(picture, dtype=np.float32)
+        grey = np.asarray(image, dtype=np.float32)
         seen = displacement(rest.mean, grey, settings)
-        full |= saturated(picture, rest.full_scale)
+        full |= saturated(image, rest.full_scale)
         pair = _even_out(grey, warp(rest.mean, -seen), 0)
         still = _still(seen, settings)
         shaken = seen - still
@@ -226,11 +229,11 @@ def measure_against(
     if region is not None:
         valid &= region
     pair = None
-    if pictures and len(flow) == 1 and bool(valid.any()):
+    if images and len(flow) == 1 and bool(valid.any()):
         usable = ~_grown(full, 2) if region is None else region & ~_grown(full, 2)
         reference = warp(rest.mean, -shaken) if settings.shake_border else rest.mean
         grey = np.asarray(flow[0], dtype=np.float32)
-        pair = PicturePair.of(reference, grey, d, rest.camera, rest.frames, usable, valid)
+        pair = ImagePair.of(reference, grey, d, rest.camera, rest.frames, usable, valid)
     return DisplacementMap(d, sigma, valid, source, pair)
 
 
@@ -248,24 +251,24 @@ def _still(d: Float[np.ndarray, "row column 2"], settings: DisplacementSettings)
 
 
 def _even_out(flow: Image, reference: Image, window: int) -> tuple[Image, Image]:
-    """Both pictures on one scale of 0 to 255, brightness and contrast matched, over windows if asked for."""
+    """Both images on one scale of 0 to 255, brightness and contrast matched, over windows if asked for."""
     from scipy.ndimage import gaussian_filter
 
     low, high = np.percentile(reference, (0.5, 99.5))
     if not high > low:
-        raise InputError("reference: expected a picture of a pattern, got one of a single grey")
-    pictures = []
-    for picture in (flow, reference):
+        raise InputError("expected an image of a pattern, got one of a single grey", field="reference")
+    images = []
+    for image in (flow, reference):
         if window:
-            mean = gaussian_filter(picture, window / 2)
-            spread = np.sqrt(gaussian_filter((picture - mean) ** 2, window / 2))
-            even = (picture - mean) / (spread + 0.05 * (high - low))
-            pictures.append((127.5 + 50 * even).astype(np.float32))
+            mean = gaussian_filter(image, window / 2)
+            spread = np.sqrt(gaussian_filter((image - mean) ** 2, window / 2))
+            even = (image - mean) / (spread + 0.05 * (high - low))
+            images.append((127.5 + 50 * even).astype(np.float32))
         else:
-            gain, offset = reference.std() / max(float(picture.std()), 1e-6), reference.mean() - picture.mean()
-            even = (picture - picture.mean()) * gain + picture.mean() + offset
-            pictures.append((255 * (even - low) / (high - low)).astype(np.float32))
-    return pictures[0], pictures[1]
+            gain, offset = reference.std() / max(float(image.std()), 1e-6), reference.mean() - image.mean()
+            even = (image - image.mean()) * gain + image.mean() + offset
+            images.append((255 * (even - low) / (high - low)).astype(np.float32))
+    return images[0], images[1]
 
 
 def _repeat_sigma(
@@ -274,7 +277,7 @@ def _repeat_sigma(
     """Standard deviation of d between reference frames and the mean of the others: as seen, and by the gradients.
 
     A repeat has the variance s^2 (1 + 1/(count - 1)) if one frame has s^2, the measurement s^2 (1/averaged + 1/count).
-    Of large pictures fewer repeats do, their squares averaged over wider windows.
+    Of large images fewer repeats do, their squares averaged over wider windows.
     """
     from scipy.ndimage import gaussian_filter
 

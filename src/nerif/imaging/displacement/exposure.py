@@ -1,4 +1,4 @@
-"""The grey value at which a sensor is full, which pixels reach it, and whether a picture is well exposed."""
+"""The grey value at which a sensor is full, which pixels reach it, and whether an image is well exposed."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ CANDIDATE_BITS = (8, 10, 12, 14, 16)
 FEWEST_BITS = 8  # of a sensor
 PLATEAU = 32, 8.0  # pixels that have the highest value, and times the most that have any value just below
 JUST_BELOW = 0.03  # of the highest value
-NOISE_FREE = 0.5  # share of neighbouring pixels that are equal: in a picture without noise a plateau tells nothing
+NOISE_FREE = 0.5  # share of neighbouring pixels that are equal: in an image without noise a plateau tells nothing
 
 
 def effective_bits(*sources: Frames) -> int:
     """Return the bits that the values of one camera fill: from the metadata, else the fewest that hold those seen.
 
     Files of 16 bit often hold 10, 12 or 14 without saying so. The guess is the smallest of 10, 12, 14 and 16 whose
-    range holds the largest value of the frames looked at (up to five a source); dark pictures make it too small.
+    range holds the largest value of the frames looked at (up to five a source); dark images make it too small.
     Frames of 8 bit have 8, floats between 0 and 1 have 1.
     """
     stated = [s.bits for s in sources if s.known_bits is not None or s.bits in (1, 8)]
@@ -46,8 +46,8 @@ def full_scale(*sources: Frames) -> float:
 def saturated(image: np.ndarray, full: float) -> Bool[np.ndarray, "row column"]:
     """Return the pixels at which the sensor was full.
 
-    These are the pixels at full scale, or at the highest value of the picture where that is a plateau: reached by many
-    more pixels than any value just below. A picture with values above `full` shows that this was guessed too low.
+    These are the pixels at full scale, or at the highest value of the image where that is a plateau: reached by many
+    more pixels than any value just below. An image with values above `full` shows that this was guessed too low.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def _is_plateau(image: np.ndarray) -> bool:
 
 
 def check_exposure(image: np.ndarray, full: float, name: str, limit: float = 0.01) -> str | None:
-    """Return a line naming the picture if more than `limit` of it is over-exposed, or it is nearly black, else None."""
+    """Return a line naming the image if more than `limit` of it is over-exposed, or it is nearly black, else None."""
     share = float(np.mean(saturated(image, full) | (as_float(image) >= full)))
     if share > limit:
         return f"{name}: {share:.1%} of the pixels are over-exposed (full scale {full:g}); lower the exposure"

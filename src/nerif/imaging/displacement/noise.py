@@ -14,7 +14,7 @@ FLOOR = 1e-3  # px: no optical flow is better than that
 
 
 def structure_variance(flow: Grey, moved: Grey, reach: float) -> Float[np.ndarray, "row column 2"]:
-    """Return the variance (px^2) of a shift by the gradients of the moved picture and what is left of the difference.
+    """Return the variance (px^2) of a shift by the gradients of the moved image and what is left of the difference.
 
     cov = <r^2> (sum grad(I) grad(I)^T)^-1 with r the difference, over Gaussian windows of standard deviation `reach`.
     """
@@ -38,7 +38,7 @@ def smoothed_away(d: Shaped[np.ndarray, "row column 2"], reach: float) -> Float[
 
 
 def local_correlation(a: Grey, b: Grey, reach: float) -> Float[np.ndarray, "row column"]:
-    """Correlation coefficient of two pictures over a Gaussian window."""
+    """Correlation coefficient of two images over a Gaussian window."""
     from scipy.ndimage import gaussian_filter
 
     a, b = a.astype(np.float64), b.astype(np.float64)

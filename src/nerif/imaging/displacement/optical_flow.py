@@ -1,7 +1,7 @@
 """Optical flow by well-kept libraries: one function a method, all with the same habit.
 
-Each takes the flow picture and the reference, both float32 on a scale of 0 to 255, and returns the movement w (px) of
-what is seen at p in the flow picture to where it is in the reference: flow(p) = reference(p + w(p)), so d = -w.
+Each takes the flow image and the reference, both float32 on a scale of 0 to 255, and returns the movement w (px) of
+what is seen at p in the flow image to where it is in the reference: flow(p) = reference(p + w(p)), so d = -w.
 
 Sources: DeepFlow: Weinzaepfel et al., ICCV 2013 (the paper's choice); DIS: Kroeger et al., ECCV 2016; TV-L1: Zach et
 al., DAGM 2007; ILK: Le Besnerais & Champagnat, ICIP 2005.

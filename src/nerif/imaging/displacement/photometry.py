@@ -1,12 +1,12 @@
-"""Flow pictures with their reference and the noise of the camera: what a reconstruction straight from pictures takes.
+"""Flow images with their reference and the noise of the camera: what a reconstruction straight from images takes.
 
     var(grey) = read^2 + grey / e,      e electrons a grey value
 
-Two or more reference pictures tell both; of a single one what is left of the flow picture tells it, once the reference
+Two or more reference images tell both; of a single one what is left of the flow image tells it, once the reference
 is moved and made as bright, the error of the displacement included.
 
 Between pixels a reference is known by interpolation, which sharp dots of few pixels defeat: the more, the steeper the
-pattern and the farther from a whole pixel the shift f is. What is left of the flow picture tells by how much:
+pattern and the farther from a whole pixel the shift f is. What is left of the flow image tells by how much:
 
     sigma^2 = <var(flow) + var(reference) + a^2 |f|^2 |grad(reference)|^2>
 
@@ -26,7 +26,7 @@ from nerif.forward.images import LEAST, around, difference_variance, grey_varian
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.frames import as_float
 
-__all__ = ["CameraNoise", "PicturePair"]
+__all__ = ["CameraNoise", "ImagePair"]
 
 Grey = Shaped[np.ndarray, "row column"]
 Image = Float[np.ndarray, "row column"]
@@ -51,20 +51,20 @@ class CameraNoise:
     shot: float
 
     @classmethod
-    def of_repeats(cls, pictures: Sequence[np.ndarray], mean: Grey, count: int) -> CameraNoise:
-        """Return the noise by the variance of pictures of one thing, each as bright as a mean that they are part of.
+    def of_repeats(cls, images: Sequence[np.ndarray], mean: Grey, count: int) -> CameraNoise:
+        """Return the noise by the variance of images of one thing, each as bright as a mean that they are part of.
 
-        A picture of variance s^2 differs from the mean of `count` by s^2 (1 - 1/count).
+        An image of variance s^2 differs from the mean of `count` by s^2 (1 - 1/count).
         """
         squares, level = np.zeros(mean.shape), float(mean.mean())
-        for picture in pictures:
-            grey = np.asarray(picture, dtype=np.float64)
+        for image in images:
+            grey = np.asarray(image, dtype=np.float64)
             squares += (grey * (level / max(float(grey.mean()), 1e-9)) - mean) ** 2
-        return cls._fitted(mean, squares / (len(pictures) * (count - 1) / count), 1.0)
+        return cls._fitted(mean, squares / (len(images) * (count - 1) / count), 1.0)
 
     @classmethod
     def of_residual(cls, flow: Grey, predicted: Grey, good: Bool[np.ndarray, "row column"]) -> CameraNoise:
-        """Return the noise by what is left of a flow picture, half of it the reference's."""
+        """Return the noise by what is left of a flow image, half of it the reference's."""
         left = as_float(flow) - as_float(predicted)
         return cls._fitted(flow[good], left[good].astype(np.float64) ** 2 / 2, GAUSSIAN)
 
@@ -89,14 +89,14 @@ class CameraNoise:
 
 
 @dataclass(frozen=True)
-class PicturePair:
-    """The pictures of a view without and with flow.
+class ImagePair:
+    """The images of a view without and with flow.
 
     Parameters
     ----------
-    reference : grey values, the mean of all pictures without flow, moved as the camera shook
+    reference : grey values, the mean of all images without flow, moved as the camera shook
     flow : grey values; NaN where the sensor was full or the background is not seen
-    sigma : standard deviation of the difference between the flow picture and the reference, moved, grey values
+    sigma : standard deviation of the difference between the flow image and the reference, moved, grey values
     """
 
     reference: Image
@@ -113,15 +113,15 @@ class PicturePair:
         repeats: int,
         usable: Bool[np.ndarray, "row column"],
         valid: Bool[np.ndarray, "row column"],
-    ) -> PicturePair:
+    ) -> ImagePair:
         """Return the pair.
 
         Parameters
         ----------
         d : displacement, px
         noise : of the camera, or None where what is left has to tell it
-        repeats : pictures that the reference is the mean of
-        usable : pixels of the flow picture that were exposed well and see the background
+        repeats : images that the reference is the mean of
+        usable : pixels of the flow image that were exposed well and see the background
         valid : pixels where d holds
         """
         reference, flow = as_float(reference), as_float(flow)

@@ -21,7 +21,9 @@ def remove_shake(
     still : pixels without flow; outliers among them count little (Cauchy's loss)
     """
     if still.sum() < 8:
-        raise InputError(f"shake: expected at least 8 pixels without flow, got {int(still.sum())}; widen the border")
+        raise InputError(
+            f"expected at least 8 pixels without flow, got {int(still.sum())}; widen the border", field="shake"
+        )
     from scipy.optimize import least_squares
 
     rows, columns = np.mgrid[: d.shape[0], : d.shape[1]].astype(np.float64)
@@ -43,9 +45,9 @@ def remove_shake(
 
 
 def border(shape: tuple[int, ...], width: int) -> Bool[np.ndarray, "row column"]:
-    """Return the outer `width` px of a picture."""
+    """Return the outer `width` px of an image."""
     if 2 * width >= min(shape):
-        raise InputError(f"shake_border: expected less than half the picture ({min(shape) // 2} px), got {width}")
+        raise InputError(f"expected less than half the image ({min(shape) // 2} px), got {width}", field="shake_border")
     mask = np.ones(shape, dtype=bool)
     mask[width:-width, width:-width] = False
     return mask

@@ -1,4 +1,4 @@
-"""A picture or volume moved by a displacement map."""
+"""An image or volume moved by a displacement map."""
 
 from __future__ import annotations
 

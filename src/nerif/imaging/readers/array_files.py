@@ -23,12 +23,12 @@ class ArrayFrames(Frames):
                 with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
                     arrays = {key: found[key] for key in ([dataset] if dataset in found.files else found.files)}
         except Exception as error:
-            raise InputError(f"{name}: cannot be read, truncated or damaged? ({error}); copy it again") from None
+            raise InputError(f"cannot be read, truncated or damaged? ({error}); copy it again", field=name) from None
         key = _choose({k: a.ndim for k, a in arrays.items()}, dataset, name)
         self._array = arrays[key] if arrays[key].ndim == 3 else arrays[key][None]
         self._name = name
         if not len(self._array):
-            raise InputError(f"{name}: expected one frame at least, got none")
+            raise InputError("expected one frame at least, got none", field=name)
 
     def __len__(self) -> int:
         return len(self._array)
@@ -46,13 +46,13 @@ def _choose(dims: dict[str, int], wanted: str, name: str) -> str:
     there = f"the file holds {', '.join(dims) or 'none'}"
     if wanted:
         if wanted not in dims:
-            raise InputError(f"{name}:{wanted}: no such dataset; {there}")
+            raise InputError(f"no such dataset; {there}", field=f"{name}:{wanted}")
         if wanted not in fitting:
-            raise InputError(f"{name}:{wanted}: expected 2 or 3 dims (frame, row, column), got {dims[wanted]}")
+            raise InputError(f"expected 2 or 3 dims (frame, row, column), got {dims[wanted]}", field=f"{name}:{wanted}")
         return wanted
     if len(fitting) != 1:
         raise InputError(
-            f"{name}: expected one dataset of 2 or 3 dims, got {len(fitting)}; name it after ':' ({there})"
+            f"expected one dataset of 2 or 3 dims, got {len(fitting)}; name it after ':' ({there})", field=name
         )
     return fitting[0]
 
@@ -80,12 +80,12 @@ class Hdf5Frames(Frames):
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f"{name}: cannot be read as HDF5, truncated or damaged? ({error})") from None
+            raise InputError(f"cannot be read as HDF5, truncated or damaged? ({error})", field=name) from None
         self._bits = None if bits is None else int(bits)
         if not self._length:
-            raise InputError(f"{name}:{self._key}: expected one frame at least, got none")
+            raise InputError("expected one frame at least, got none", field=f"{name}:{self._key}")
         if times is not None and times.shape != (self._length,):
-            raise InputError(f"{name}: expected {self._length} times, one for each frame, got shape {times.shape}")
+            raise InputError(f"expected {self._length} times, one for each frame, got shape {times.shape}", field=name)
         self.times = times
 
     def __len__(self) -> int:

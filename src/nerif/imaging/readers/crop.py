@@ -36,11 +36,11 @@ class Crop:
     def __post_init__(self) -> None:
         for name in ("row", "column", "height", "width"):
             if getattr(self, name) < 0:
-                raise InputError(f"crop: expected {name} 0 or more (px), got {getattr(self, name)}")
+                raise InputError(f"expected {name} 0 or more (px), got {getattr(self, name)}", field="crop")
         if self.flip not in ("", "horizontal", "vertical", "both"):
-            raise InputError(f"crop: expected flip 'horizontal', 'vertical', 'both' or '', got '{self.flip}'")
+            raise InputError(f"expected flip 'horizontal', 'vertical', 'both' or '', got '{self.flip}'", field="crop")
         if self.rotate not in (0, 90, 180, 270):
-            raise InputError(f"crop: expected rotate 0, 90, 180 or 270 (degrees), got {self.rotate}")
+            raise InputError(f"expected rotate 0, 90, 180 or 270 (degrees), got {self.rotate}", field="crop")
 
     def shape_of(self, shape: tuple[int, int], name: str = "crop") -> tuple[int, int]:
         """Return height and width after this crop; InputError if it reaches beyond a frame of `shape`."""
@@ -48,8 +48,9 @@ class Crop:
         bottom, right = self.row + height, self.column + width
         if bottom > shape[0] or right > shape[1] or height < 1 or width < 1:
             raise InputError(
-                f"{name}: expected a crop within its {size_in_words(shape)}, got rows {self.row} to {bottom} "
-                f"and columns {self.column} to {right}"
+                f"expected a crop within its {size_in_words(shape)}, got rows {self.row} to {bottom} "
+                f"and columns {self.column} to {right}",
+                field=name,
             )
         return (width, height) if self.rotate in (90, 270) else (height, width)
 

@@ -122,8 +122,9 @@ class Frames(ABC):
         image, layout = self.single(i), self.layout
         if (image.shape, image.dtype) != (layout.shape, layout.dtype):
             raise InputError(
-                f"{self.name(i)}: expected {size_in_words(layout.shape)} of {layout.dtype} as in {layout.example}, "
-                f"got {size_in_words(image.shape)} of {image.dtype}; other frames need a sequence of their own"
+                f"expected {size_in_words(layout.shape)} of {layout.dtype} as in {layout.example}, "
+                f"got {size_in_words(image.shape)} of {image.dtype}; other frames need a sequence of their own",
+                field=self.name(i),
             )
         return image
 
@@ -165,24 +166,27 @@ def size_in_words(shape: Sequence[int]) -> str:
 def _grey_frame(image: np.ndarray, name: str) -> np.ndarray:
     """Return a stored image as a grey one in native byte order, its values checked."""
     if image.dtype == bool:
-        raise InputError(f"{name}: expected grey values of 8 to 16 bit, got a 1-bit image; export it with 8 or 16 bit")
+        raise InputError(
+            "expected grey values of 8 to 16 bit, got a 1-bit image; export it with 8 or 16 bit", field=name
+        )
     image = np.asarray(image, dtype=image.dtype.newbyteorder("="))
     if image.ndim == 3 and image.shape[2] <= 4:
         image = _grey(image)
     if image.ndim != 2 or not image.size:
-        raise InputError(f"{name}: expected an image (row, column), got an array of shape {image.shape}")
+        raise InputError(f"expected an image (row, column), got an array of shape {image.shape}", field=name)
     if image.dtype.kind != "f":
         if image.dtype not in (np.uint8, np.uint16):
-            raise InputError(f"{name}: expected grey values of 8 to 16 bit, got {image.dtype}; save it as uint16")
+            raise InputError(f"expected grey values of 8 to 16 bit, got {image.dtype}; save it as uint16", field=name)
         return image
     image = image.astype(np.float32)
     if bad := int(np.count_nonzero(~np.isfinite(image))):
-        raise InputError(f"{name}: expected numbers in all pixels, got NaN or infinity in {bad} of {image.size}")
+        raise InputError(f"expected numbers in all pixels, got NaN or infinity in {bad} of {image.size}", field=name)
     low, high = float(image.min()), float(image.max())
     if low < 0 or 1 < high < 16 or high > 65535:
         raise InputError(
-            f"{name}: expected float values from 0 to 1, or counts up to 255 to 65535, got {low:g} to {high:g}; "
-            "save the frames as 8- or 16-bit integers"
+            f"expected float values from 0 to 1, or counts up to 255 to 65535, got {low:g} to {high:g}; "
+            "save the frames as 8- or 16-bit integers",
+            field=name,
         )
     return image
 
@@ -197,7 +201,7 @@ def _grey(image: np.ndarray) -> np.ndarray:
 
 
 def read_each(frames: Frames, indices: Iterable[int]) -> Iterator[tuple[int, np.ndarray | InputError]]:
-    """Read frames one after the other, each once: the picture, or what is wrong with it."""
+    """Read frames one after the other, each once: the image, or what is wrong with it."""
     try:
         read = frames.__getitem__ if frames.shape else frames.single
     except InputError:  # none can be read

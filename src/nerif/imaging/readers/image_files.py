@@ -65,7 +65,7 @@ class FileFrames(Frames):
         try:
             return self._open(k).read(inner)
         except InputError as error:  # which does not know the name
-            raise InputError(f"{self.name(i)}: {error}") from None
+            raise error.inside(self.name(i)) from None
 
     @cached_property
     def _known_bits(self) -> int | None:
@@ -82,7 +82,7 @@ class FileFrames(Frames):
 
 
 class ImageFile(ABC):
-    """An open file of pictures."""
+    """An open file of images."""
 
     @abstractmethod
     def __init__(self, path: Path) -> None: ...
@@ -92,7 +92,7 @@ class ImageFile(ABC):
 
     @abstractmethod
     def read(self, i: int) -> np.ndarray:
-        """Return picture `i` as it is stored; channels, if any, as R, G, B."""
+        """Return image `i` as it is stored; channels, if any, as R, G, B."""
 
     @property
     def bits(self) -> int | None:
@@ -101,7 +101,7 @@ class ImageFile(ABC):
 
 
 class Tiff(ImageFile):
-    """A TIFF file, each page a picture."""
+    """A TIFF file, each page an image."""
 
     def __init__(self, path: Path) -> None:
         import tifffile
@@ -218,7 +218,7 @@ def _significant_bits(chunks: dict[bytes, bytes]) -> int | None:
     return bits if chunks[b"IHDR"][8] == 16 and 8 < bits < 16 else None
 
 
-class Picture(ImageFile):
+class Image(ImageFile):
     """What imageio reads: BMP, JPEG."""
 
     def __init__(self, path: Path) -> None:
@@ -231,13 +231,13 @@ class Picture(ImageFile):
 
 
 class LaVision(ImageFile):
-    """Counts of all pictures in a file, frame by frame (camera, exposure), as stored: masks and scales are left out."""
+    """Counts of all images in a file, frame by frame (camera, exposure), as stored: masks and scales are left out."""
 
     def __init__(self, path: Path) -> None:
         self._planes: list[np.ndarray] = []
         for frame in _lvpyio().read_buffer(str(path)):
             if "PIXEL" not in frame.components:
-                raise InputError("expected pictures, got vectors; give the .im7 files they were computed from")
+                raise InputError("expected images, got vectors; give the .im7 files they were computed from")
             self._planes += list(frame.components["PIXEL"].planes)
 
     def __len__(self) -> int:
@@ -245,7 +245,7 @@ class LaVision(ImageFile):
 
     def read(self, i: int) -> np.ndarray:
         if i >= len(self._planes):
-            raise InputError(f"expected at least {i + 1} pictures as in the first file, got {len(self._planes)}")
+            raise InputError(f"expected at least {i + 1} images as in the first file, got {len(self._planes)}")
         return np.asarray(self._planes[i])
 
 
@@ -254,14 +254,15 @@ def _lvpyio() -> Any:
         import lvpyio
     except ImportError:
         raise InputError(
-            "LaVision files (.im7, .vc7): expected the package lvpyio, which is not installed; "
-            f"get it by {install('lavision')} (it is under LaVision's own terms)"
+            "expected the package lvpyio, which is not installed; "
+            f"get it by {install('lavision')} (it is under LaVision's own terms)",
+            field="LaVision files (.im7, .vc7)",
         ) from None
     return lvpyio
 
 
 OPENERS: dict[str, type[ImageFile]] = {
-    ".tif": Tiff, ".tiff": Tiff, ".png": Png, ".bmp": Picture, ".jpg": Picture, ".jpeg": Picture,
+    ".tif": Tiff, ".tiff": Tiff, ".png": Png, ".bmp": Image, ".jpg": Image, ".jpeg": Image,
     ".im7": LaVision, ".vc7": LaVision,
 }  # fmt: skip
 

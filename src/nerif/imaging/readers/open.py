@@ -1,4 +1,4 @@
-"""Open pictures of any format by a file name, a folder or a pattern, with a selection of frames behind it.
+"""Open images of any format by a file name, a folder or a pattern, with a selection of frames behind it.
 
 Frames count from 0, in messages as in selections such as ``rec.cihx[0:50]``.
 """
@@ -63,9 +63,9 @@ def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frame
     """Open image files, or one recording, by their endings; `names` are for messages."""
     for path, name in zip(files, names, strict=True):
         if path.suffix.lower() not in SUFFIXES:
-            raise InputError(f"{name}: expected one of {' '.join(SUFFIXES)}, got '{path.suffix}'")
+            raise InputError(f"expected one of {' '.join(SUFFIXES)}, got '{path.suffix}'", field=name)
         if len(files) > 1 and path.suffix.lower() in SINGLE_SUFFIXES:
-            raise InputError(f"{name}: one of {len(files)} files of a pattern; name one recording at a time")
+            raise InputError(f"one of {len(files)} files of a pattern; name one recording at a time", field=name)
     match files[0].suffix.lower():
         case ".cih" | ".cihx" | ".mraw":
             return PhotronFrames(files[0], names[0])
@@ -80,14 +80,14 @@ def _select(frames: Frames, selection: str, name: str) -> Frames:
     n = len(frames)
     if ":" not in selection:
         if not -n <= int(selection) < n:
-            raise InputError(f"{name}[{selection}]: expected a frame from 0 to {n - 1}, got {selection}")
+            raise InputError(f"expected a frame from 0 to {n - 1}, got {selection}", field=f"{name}[{selection}]")
         return SelectedFrames(frames, [int(selection) % n])
     parts = [int(word) if word else None for word in selection.split(":")]
     if len(parts) == 3 and parts[2] == 0:
-        raise InputError(f"{name}[{selection}]: expected a step other than 0")
+        raise InputError("expected a step other than 0", field=f"{name}[{selection}]")
     indices = range(n)[slice(*parts)]
     if not indices:
-        raise InputError(f"{name}[{selection}]: selects none of the {n} frames, which count from 0")
+        raise InputError(f"selects none of the {n} frames, which count from 0", field=f"{name}[{selection}]")
     return SelectedFrames(frames, indices)
 
 
@@ -99,16 +99,16 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
         if not files:
             others = sorted(p.name for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
             remedy = f"name the file, such as '{shown}/{others[0]}'" if others else "is it the right folder?"
-            raise InputError(f"{shown}: expected images ({' '.join(FOLDER_SUFFIXES)}), got none; {remedy}")
+            raise InputError(f"expected images ({' '.join(FOLDER_SUFFIXES)}), got none; {remedy}", field=shown)
     elif path.is_file():
         return [path]
     elif re.search(r"[*?]", str(path)):
         found = (Path(p) for p in glob.glob(str(path).replace("[", "[[]"), recursive=True))
         files = [p for p in found if p.suffix.lower() in SUFFIXES and p.is_file()]
         if not files:
-            raise InputError(f"{shown}: expected files of this pattern, got none{_nearest(path, base)}")
+            raise InputError(f"expected files of this pattern, got none{_nearest(path, base)}", field=shown)
     else:
-        raise InputError(f"{shown}: no such file or folder{_nearest(path, base)}")
+        raise InputError(f"no such file or folder{_nearest(path, base)}", field=shown)
     return sorted(files, key=_natural)
 
 

@@ -71,8 +71,9 @@ class PhotronFrames(Frames):
         data = np.fromfile(self._path, np.uint8, end - begin, offset=begin)
         if len(data) < end - begin:
             raise InputError(
-                f"{self.name(i)}: expected {self._frames} frames as the header says, the file ends before this one "
-                f"does ({self._path.stat().st_size} bytes); copy it again"
+                f"expected {self._frames} frames as the header says, the file ends before this one "
+                f"does ({self._path.stat().st_size} bytes); copy it again",
+                field=self.name(i),
             )
         return data
 
@@ -89,7 +90,7 @@ def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
         for other in sorted(path.parent.iterdir()):
             if other.stem == path.stem and other.suffix.lower() == suffix:
                 return other
-    raise InputError(f"{name}: expected a {' or '.join(suffixes)} file of the same name beside it, got none")
+    raise InputError(f"expected a {' or '.join(suffixes)} file of the same name beside it, got none", field=name)
 
 
 def _header(path: Path, name: str) -> dict[str, str]:
@@ -101,14 +102,15 @@ def _header(path: Path, name: str) -> dict[str, str]:
         kind, stored = cih["File Format"], int(cih["Color Bit"])
     except (KeyError, ValueError, ElementTree.ParseError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{name}: cannot be read as a Photron header ({reason}); export it again") from None
+        raise InputError(f"cannot be read as a Photron header ({reason}); export it again", field=name) from None
     if kind.lower() != "mraw" or stored not in (8, 12, 16):
         raise InputError(
-            f"{name}: expected a monochrome MRaw recording of 8, 12 or 16 bit, got {kind} of {stored} bit; "
-            "export it so, or as TIFF"
+            f"expected a monochrome MRaw recording of 8, 12 or 16 bit, got {kind} of {stored} bit; "
+            "export it so, or as TIFF",
+            field=name,
         )
     if not positive:
-        raise InputError(f"{name}: expected {', '.join(NUMBERS)} above 0, got {[cih[key] for key in NUMBERS]}")
+        raise InputError(f"expected {', '.join(NUMBERS)} above 0, got {[cih[key] for key in NUMBERS]}", field=name)
     return cih
 
 

@@ -1,4 +1,4 @@
-"""Where the pictures of an experiment are: a folder with a folder a view, or a file views.toml that says it.
+"""Where the images of an experiment are: a folder with a folder a view, or a file views.toml that says it.
 
     experiment/
       cam1/target/*.tif  background/*.tif  reference/*.tif  flow/*.tif
@@ -29,24 +29,24 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known, read_toml
-from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewPictures
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
 from nerif.imaging.displacement.exposure import check_exposure, full_scale
 from nerif.imaging.masks import read_mask
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
 from nerif.imaging.readers.open import open_frames
 
-__all__ = ["SOURCES", "Pictures", "View", "find_targets", "find_views", "good_pictures", "pose_names"]
+__all__ = ["SOURCES", "Images", "View", "find_targets", "find_views", "good_images", "pose_names"]
 
 SOURCES = ("target", "background", "reference", "flow", "mask", "region")
-"""What a view may have: target pictures, the target on the background, pictures without and with flow, drawn masks."""
+"""What a view may have: target images, the target on the background, images without and with flow, drawn masks."""
 
 CROP = tuple(f.name for f in fields(Crop))
 
 
 @dataclass(frozen=True)
 class View:
-    """Where the pictures of one view are.
+    """Where the images of one view are.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class View:
     _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[type[View], tuple[object, ...]]:
-        """What another process gets: where the pictures are, which it opens for itself."""
+        """What another process gets: where the images are, which it opens for itself."""
         return View, (self.name, self.folder, self.sources, self.crop)
 
     def open(self, source: str) -> Frames:
@@ -76,8 +76,9 @@ class View:
         """
         if source not in self.sources:
             raise InputError(
-                f"view '{self.name}': no {source} pictures; expected {self.folder / self.name / source}/ or a line "
-                f'{source} = "..." in {self.folder / "views.toml"}'
+                f"no {source} images; expected {self.folder / self.name / source}/ or a line "
+                f'{source} = "..." in {self.folder / "views.toml"}',
+                field=f"view '{self.name}'",
             )
         if source not in self._opened:
             self._opened[source] = open_frames(self.sources[source], self.folder)
@@ -85,7 +86,7 @@ class View:
 
     @property
     def full_scale(self) -> float:
-        """Grey value of a full sensor, as far as the pictures without and with flow tell."""
+        """Grey value of a full sensor, as far as the images without and with flow tell."""
         return full_scale(self.open("reference"), self.open("flow"))
 
     def drawn(self, source: str, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"] | None:
@@ -93,7 +94,7 @@ class View:
         return read_mask(self.folder / self.sources[source], shape) if source in self.sources else None
 
     def check_alike(self) -> None:
-        """Check that the pictures without and with flow are of one size and bit depth.
+        """Check that the images without and with flow are of one size and bit depth.
 
         Raises
         ------
@@ -109,8 +110,9 @@ class View:
         for expected, got in (sizes, (f"{depths[0]} bit", f"{depths[1]} bit")):
             if expected != got:
                 raise InputError(
-                    f"view '{self.name}': {theirs.example}: expected {expected} as in its reference {ours.example}, "
-                    f"got {got}; record both alike"
+                    f"{theirs.example}: expected {expected} as in its reference {ours.example}, "
+                    f"got {got}; record both alike",
+                    field=f"view '{self.name}'",
                 )
 
     def cropped(self, image: np.ndarray, name: str) -> np.ndarray:
@@ -132,18 +134,19 @@ def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
         If the folder is missing, holds no view, or `only` names one that is not there.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; expected one with a folder for each view")
+        raise InputError("no such folder; expected one with a folder for each view", field=folder)
     file = folder / "views.toml"
     views = _from_file(file) if file.is_file() else _from_folders(folder)
     if not views:
         raise InputError(
-            f"{folder}: no view found; expected folders such as {folder.name}/cam1/reference and "
-            f"{folder.name}/cam1/flow, or a file views.toml"
+            f"no view found; expected folders such as {folder.name}/cam1/reference and "
+            f"{folder.name}/cam1/flow, or a file views.toml",
+            field=folder,
         )
     names = [v.name for v in views]
     for name in only:
         if name not in names:
-            raise InputError(f"views: expected some of {', '.join(names)}, got '{name}'")
+            raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
     return tuple(v for v in views if not only or v.name in only)
 
 
@@ -171,7 +174,7 @@ def _from_file(file: Path) -> list[View]:
     table = read_toml(file)
     tables = table.pop("views", {})
     if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
-        raise InputError(f"{file}: expected a table [views.NAME] for each view")
+        raise InputError("expected a table [views.NAME] for each view", field=file)
     views = []
     for name, own in tables.items():
         entries = {**table, **own}
@@ -179,15 +182,15 @@ def _from_file(file: Path) -> list[View]:
         for key, value in entries.items():
             wanted = str if key in (*SOURCES, "flip") else int
             if not isinstance(value, wanted) or isinstance(value, bool):
-                raise InputError(f"{file}: '{key}' of view '{name}': expected {wanted.__name__}, got {value!r}")
+                raise InputError(f"'{key}' of view '{name}': expected {wanted.__name__}, got {value!r}", field=file)
         crop = {k: v for k, v in entries.items() if k in CROP}
         sources = {k: v for k, v in entries.items() if k in SOURCES}
         views.append(View(name, file.parent, sources, Crop(**crop) if crop else None))
     return views
 
 
-class Pictures(Sequence[np.ndarray]):
-    """Some pictures of a view, its part of each frame, read whenever one is asked for."""
+class Images(Sequence[np.ndarray]):
+    """Some images of a view, its part of each frame, read whenever one is asked for."""
 
     def __init__(self, view: View, frames: Frames, indices: Sequence[int]) -> None:
         self._view, self._frames, self._indices = view, frames, indices
@@ -198,20 +201,20 @@ class Pictures(Sequence[np.ndarray]):
     @overload
     def __getitem__(self, i: int) -> np.ndarray: ...
     @overload
-    def __getitem__(self, i: slice) -> Pictures: ...
-    def __getitem__(self, i: int | slice) -> np.ndarray | Pictures:
+    def __getitem__(self, i: slice) -> Images: ...
+    def __getitem__(self, i: int | slice) -> np.ndarray | Images:
         if isinstance(i, slice):
-            return Pictures(self._view, self._frames, self._indices[i])
+            return Images(self._view, self._frames, self._indices[i])
         index = self._indices[i]
         return self._view.cropped(self._frames[index], self._frames.name(index))
 
 
-def good_pictures(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Pictures:
-    """Look for the pictures of a source that can be used; what is wrong with the others is said.
+def good_images(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Images:
+    """Look for the images of a source that can be used; what is wrong with the others is said.
 
     Parameters
     ----------
-    most : number of pictures to look at, evenly spread; 0 for all
+    most : number of images to look at, evenly spread; 0 for all
 
     Raises
     ------
@@ -233,22 +236,22 @@ def good_pictures(view: View, source: str, say: Callable[[str], None], most: int
             say(f"note: {exposure}")
     if not good:
         looked = f"{len(chosen)}" if len(chosen) == count else f"{len(chosen)} looked at out of {count}"
-        raise InputError(f"view '{view.name}': none of its {looked} {source} pictures can be used; {bad[0]}")
-    return Pictures(view, frames, good)
+        raise InputError(f"none of its {looked} {source} images can be used; {bad[0]}", field=f"view '{view.name}'")
+    return Images(view, frames, good)
 
 
 def find_targets(
     view: View,
     target: CalibrationTarget,
     say: Callable[[str], None],
-    on_picture: Callable[[], None] = lambda: None,
+    on_image: Callable[[], None] = lambda: None,
     on_background: CalibrationTarget | None = None,
-) -> ViewPictures:
-    """Find the target in all pictures of a view; say which pictures were of no use.
+) -> ViewImages:
+    """Find the target in all images of a view; say which images were of no use.
 
     `on_background` is the target that lay on the background, if that was another one (a larger print, say).
 
-    Poses are named by the last number in the name of a picture, so that pose_007.png of one camera and cam2-7.tif of
+    Poses are named by the last number in the name of an image, so that pose_007.png of one camera and cam2-7.tif of
     another are the same pose; by the number of the frame in a stack or recording.
     """
     found: dict[str, dict[str, Detection]] = {"target": {}, "background": {}}
@@ -264,25 +267,26 @@ def find_targets(
             if isinstance(image, InputError):
                 say(f"left out: {image}")
                 continue
-            picture = view.cropped(image, frames.name(i))
-            if size not in ((0, 0), picture.shape):
+            image = view.cropped(image, frames.name(i))
+            if size not in ((0, 0), image.shape):
                 raise InputError(
-                    f"{frames.name(i)}: expected a picture of {size[0]} x {size[1]} px as the others of view "
-                    f"'{view.name}', got {picture.shape[0]} x {picture.shape[1]}"
+                    f"expected an image of {size[0]} x {size[1]} px as the others of view "
+                    f"'{view.name}', got {image.shape[0]} x {image.shape[1]}",
+                    field=frames.name(i),
                 )
-            size = (picture.shape[0], picture.shape[1])
+            size = (image.shape[0], image.shape[1])
             used = on_background or target if source == "background" else target
-            detection = used.detect(picture)
-            on_picture()
+            detection = used.detect(image)
+            on_image()
             if detection is None:
                 say(f"left out: {frames.name(i)}: no {used.kind} of {used.columns} x {used.rows} found")
             else:
                 found[source][keys[i]] = detection
-    return ViewPictures(view.name, size, found["target"], found["background"])
+    return ViewImages(view.name, size, found["target"], found["background"])
 
 
 def pose_names(frames: Frames) -> list[str]:
-    """Return the names of the poses that pictures of a target show: see find_targets."""
+    """Return the names of the poses that images of a target show: see find_targets."""
     return _pose_keys([frames.name(i) for i in range(len(frames))])
 
 

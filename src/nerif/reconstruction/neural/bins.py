@@ -20,11 +20,11 @@ from nerif.geometry import Box, Camera, Rays
 __all__ = ["binned_rays", "coarsest_edge", "patches"]
 
 FEWEST = 128
-"""Bins that a picture keeps along its shorter side, so that they blur no more than the pixels of a small camera."""
+"""Bins that an image keeps along its shorter side, so that they blur no more than the pixels of a small camera."""
 
 
 def coarsest_edge(measurement: Measurement) -> int:
-    """Return the largest edge of bins that every picture of the measurement can do with, a power of two, px."""
+    """Return the largest edge of bins that every image of the measurement can do with, a power of two, px."""
     shortest = min(min(camera.image_size) for camera in measurement.cameras)
     return int(1 << max(0, (shortest // FEWEST).bit_length() - 1))
 

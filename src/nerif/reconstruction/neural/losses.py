@@ -49,9 +49,9 @@ class LossWeights:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not value >= 0:
-                raise InputError(f"weight of the {name} term: expected 0 or more, got {value}")
+                raise InputError(f"expected 0 or more, got {value}", field=f"weight of the {name} term")
         if self.numerical + self.head + self.automatic == 0:
-            raise InputError("loss weights: expected a positive numerical, head or automatic weight, got none")
+            raise InputError("expected a positive numerical, head or automatic weight, got none", field="loss weights")
 
 
 @runtime_checkable

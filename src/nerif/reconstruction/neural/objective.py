@@ -188,7 +188,7 @@ class Objective:
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Fit what is open beside the field, such as the brightness of pictures, to the field so far."""
+        """Fit what is open beside the field, such as the brightness of images, to the field so far."""
         for part in self.data.unsettled:
             rays = replace(part.rays, lens=None)
             seen = project(PathIntegral(part.model.integral, SETTLING), self.field, rays, self.data.device)
@@ -229,17 +229,17 @@ class Objective:
         return None if points is None else self.field.network(self.field.normalise(points))
 
     @torch.no_grad()
-    def held_back(self) -> float:
+    def withheld(self) -> float:
         """Return the mean square of the residual over sigma (over 1, where it is not known) on the rays held back."""
         low, self.network.low, drawn = self.network.low, False, torch.Generator().manual_seed(0)
         self.data.judge_alike()
-        held, weights, total = self.data.held_back, self.settings.weights, 0.0
+        held, weights, total = self.data.withheld, self.settings.weights, 0.0
         assert held is not None
         for part in held.parts:
             thin = part.rays.lens is None
             at_once = JUDGED_AT_ONCE if thin else JUDGED_AT_ONCE // 4
             for first in range(0, len(part), at_once):
-                some = self.data.refined(part[first : first + at_once], held_back=True)
+                some = self.data.refined(part[first : first + at_once], withheld=True)
                 draw = Draw(1, JUDGED_SAMPLES) if thin else Draw(LENS_RAYS, 4 * JUDGED_SAMPLES // LENS_RAYS)
                 rays = draw.rays_of(some, drawn)
                 s, interval = sample_rays(rays, draw.samples, drawn, "adaptive", self.density, draw.each)

@@ -39,6 +39,7 @@ from nerif.fields.network import Network, NetworkShape, encoded_width
 
 __all__ = ["OPTIMISERS", "Adam", "Muon", "NetworkOptimiser", "Update"]
 
+
 class Update(ABC):
     """A rule that moves weights, with a memory of each.
 
@@ -181,8 +182,9 @@ class NetworkOptimiser:
         if tensors and found != set(self.parts):  # before the first step there is nothing to take back
             asked = " and ".join(sorted(self.parts))
             raise InputError(
-                f"resume: expected a checkpoint of {asked}, got one of {' and '.join(sorted(found))}; "
-                "give the same --optimiser"
+                f"expected a checkpoint of {asked}, got one of {' and '.join(sorted(found))}; "
+                "give the same --optimiser",
+                field="resume",
             )
         for part in self.parts.values():
             for memory in part.memory:

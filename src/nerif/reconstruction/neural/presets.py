@@ -55,5 +55,5 @@ def preset(name: str) -> NeRIF:
     if name == "auto":
         return PRESETS["best" if torch.cuda.is_available() else "fast"]
     if name not in PRESETS:
-        raise InputError(f"preset: expected auto, {', '.join(PRESETS)}, got '{name}'")
+        raise InputError(f"expected auto, {', '.join(PRESETS)}, got '{name}'", field="preset")
     return replace(PRESETS[name])

@@ -59,8 +59,8 @@ class TrainingSettings(SharedSettings):
     """In equal intervals, one draw each ("random", the paper's), one a ray ("shifted") or midpoints ("regular"), or
     "adaptive", where the field varies."""
     source: str = "auto"
-    """What to go by (also --from): displacements, pictures (each pixel, after a start from displacements, or from
-    blurred pictures), both, or auto: pictures where there are some."""
+    """What to go by (also --from): displacements, images (each pixel, after a start from displacements, or from
+    blurred images), both, or auto: images where there are some."""
     lens_rays: int = 0
     """Rays through the lens of a pixel at the end, an even number, and about a third of them at the start; 0: 2
     to 12, as the cone is wide in pixels."""
@@ -111,7 +111,7 @@ class TrainingSettings(SharedSettings):
         super().__post_init__()
         for name, allowed in CHOICES.items():
             if getattr(self, name) not in allowed:
-                raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
+                raise InputError(f"expected one of {', '.join(allowed)}, got '{getattr(self, name)}'", field=name)
         for name in (
             "longest",
             "first_cycle",
@@ -123,23 +123,27 @@ class TrainingSettings(SharedSettings):
             "warm_up",
         ):
             if not getattr(self, name) > 0:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+                raise InputError(f"expected a positive number, got {getattr(self, name)}", field=name)
         for name in ("epochs", "max_steps", "stop_ratio", "sample_jitter", "wave_pixels"):
             if not getattr(self, name) >= 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+                raise InputError(f"expected 0 or more, got {getattr(self, name)}", field=name)
         if not (len(self.samples) == 2 and min(self._samples()) > self.sample_jitter):
             raise InputError(
-                f"samples: expected two counts above sample_jitter ({self.sample_jitter}), or 0 0, got {self.samples}"
+                f"expected two counts above sample_jitter ({self.sample_jitter}), or 0 0, got {self.samples}",
+                field="samples",
             )
         if self.lens_rays < 0 or self.lens_rays % 2:
-            raise InputError(f"lens_rays: expected an even number, or 0 for as many as it takes, got {self.lens_rays}")
+            raise InputError(
+                f"expected an even number, or 0 for as many as it takes, got {self.lens_rays}", field="lens_rays"
+            )
         if self.points_per_batch < max(self._samples()) + self.sample_jitter:
             raise InputError(
-                f"points_per_batch: expected room for one ray ({max(self._samples()) + self.sample_jitter} points), "
-                f"got {self.points_per_batch}"
+                f"expected room for one ray ({max(self._samples()) + self.sample_jitter} points), "
+                f"got {self.points_per_batch}",
+                field="points_per_batch",
             )
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
-            raise InputError("weights: the head and consistency terms need gradient_head = true")
+            raise InputError("the head and consistency terms need gradient_head = true", field="weights")
         check_model(self.model)
         check_source(self.source)
 

@@ -13,7 +13,7 @@ __all__ = ["hold_back", "some_pixels"]
 FEWEST = 1 << 8
 """Pixels of each technique that are taken at least, if it has as many."""
 
-HELD_BACK, LARGEST, MOST = 0.02, 0.1, 1 << 12
+WITHHELD_PIXELS, LARGEST, MOST = 0.02, 0.1, 1 << 12
 """Share of the pixels that is held back of many, of few, and how many at most."""
 BLOCK = 4
 """Edge of the blocks that are held back, px: the noise of neighbours is alike where optical flow looked at both."""
@@ -46,7 +46,7 @@ def hold_back(measurement: Measurement, edge: int) -> tuple[Measurement, Measure
     views, height, width = usable[0].shape
     size = max(edge, BLOCK)
     total = sum(int(mask.sum()) for mask in usable)
-    share = min(max(HELD_BACK, FEWEST / total), MOST / total, LARGEST)
+    share = min(max(WITHHELD_PIXELS, FEWEST / total), MOST / total, LARGEST)
     blocks = torch.rand(views, -(-height // size), -(-width // size), generator=torch.Generator().manual_seed(0))
     held = (blocks < share).repeat_interleave(size, 1).repeat_interleave(size, 2)[:, :height, :width]
     held &= torch.stack(usable).any(dim=0)

@@ -4,7 +4,7 @@
 
 until the budget is used up or, where there is no limit, until more brings nothing (convergence.py).
 
-Of large pictures the first steps see bins of pixels, and those after PIONEERS of the run the smallest bins of which it
+Of large images the first steps see bins of pixels, and those after PIONEERS of the run the smallest bins of which it
 can see all (bins.py). A loss or weights that turn non-finite, and a field that is or becomes empty (watch.py), take the
 run back to its last good state with a third of the learning rate.
 """
@@ -71,7 +71,9 @@ class Training:
         self.ranks.join(self.device)
         self.cores = Cores(self.device)
         if len(data) < self.ranks.size:
-            raise InputError(f"torchrun: expected at least a ray a process, got {len(data)} rays for {self.ranks.size}")
+            raise InputError(
+                f"expected at least a ray a process, got {len(data)} rays for {self.ranks.size}", field="torchrun"
+            )
         self.generator = torch.Generator().manual_seed(settings.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -266,14 +268,14 @@ class Training:
 
     def _judge(self) -> Outcome | None:
         """At the end of a cycle, what the rays held back say of going on; the weights of the best are kept."""
-        budget, cycles, held = self.budget, self.budget.cycles, self.data.held_back
+        budget, cycles, held = self.budget, self.budget.cycles, self.data.withheld
         if cycles is None or budget.progress < 1:
             return None
         (error,) = self.ranks.decided([self._error()], self.device)
         known = held is not None and held.sigma_known
         judged = "what was measured is" if held is None else "rays held back are"
         outcome = cycles.judge(error, float(known), budget.step, budget.seconds, judged)
-        self._log({"held_back": math.sqrt(error)})
+        self._log({"withheld_residual": math.sqrt(error)})
         if cycles.best:
             self.best, self.beside = self._weights(), self.data.kept()
         self.objective.settle()
@@ -282,7 +284,7 @@ class Training:
 
     def _error(self) -> float:
         """The mean square of the residual on rays held back; where there are none, the running mean of the loss."""
-        return self.running**2 if self.data.held_back is None else self.objective.held_back()
+        return self.running**2 if self.data.withheld is None else self.objective.withheld()
 
     def _weights(self) -> dict[str, Tensor]:
         return {name: value.detach().clone() for name, value in self.field.network.state_dict().items()}
@@ -381,8 +383,9 @@ class Training:
             self.field.scale, self.field.offset = float(scalars.pop("scale")), float(scalars.pop("offset"))
         except (RuntimeError, KeyError):
             raise InputError(
-                "resume: the checkpoint is of another network; give the same settings (of a run of a version before "
-                "--network.directions there are 3)"
+                "the checkpoint is of another network; give the same settings (of a run of a version before "
+                "--network.directions there are 3)",
+                field="resume",
             ) from None
         self.optimiser.restore(state.under("optimiser."))
         self.generator.set_state(tensors["generator"])

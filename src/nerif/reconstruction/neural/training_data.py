@@ -94,7 +94,7 @@ class TrainingData:
     ----------
     settings : TrainingSettings
     measurement : Measurement
-    coarsest : edge of the bins to begin with, px; None for what a picture of its size can do with
+    coarsest : edge of the bins to begin with, px; None for what an image of its size can do with
     judged : whether some of the rays are held back
 
     Attributes
@@ -104,14 +104,14 @@ class TrainingData:
     bounds : lowest and highest value of the field
     shape, samples : of the network, and of a ray at the start and at the end of a run
     lens_rays : rays through the lens of a pixel at the end of a run; 1 for a thin one
-    held_back : rays that are in no batch, to judge by them; None where there are none
+    withheld : rays that are in no batch, to judge by them; None where there are none
     stage, met : part of the run that the data are given for, and what the loss is of in it
     axis : of a symmetric flow
     refinement : of the rig, or None where it is as calibrated
     noise : mean square of the noise over that of what was measured; 0 where it is not known
     """
 
-    held_back: Target | None = None
+    withheld: Target | None = None
     stage: int = 0
     refinement: Refinement | None = None
 
@@ -119,7 +119,7 @@ class TrainingData:
         self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, judged: bool = False
     ) -> None:
         measurement = seen_through(measurement, settings.aperture)
-        preferred = "displacements" if "shift" in refined_words(settings.refine) else "pictures"  # these tell no shift
+        preferred = "displacements" if "shift" in refined_words(settings.refine) else "images"  # these tell no shift
         source = chosen_source(measurement, settings.source, preferred)
         final = of_source(measurement, source)
         check_target(final, settings.model)
@@ -144,9 +144,11 @@ class TrainingData:
                 if held is not None:
                     judges = of_source(held, source)
                     self.judging = judges.names
-                    self.held_back = Target.of(
-                        judges, settings.open_faces, model=settings.model, single=True
-                    ).without_outliers().to(self.device)
+                    self.withheld = (
+                        Target.of(judges, settings.open_faces, model=settings.model, single=True)
+                        .without_outliers()
+                        .to(self.device)
+                    )
                     self.measurement = rest
         self.stages, self.edge = stages(self.measurement, source), self.coarsest
         self.refine(self.coarsest)
@@ -194,9 +196,9 @@ class TrainingData:
         take_up(self.refinement, kept)
 
     def judge_alike(self) -> None:
-        """Let the pictures that are held back be as bright as those that are not."""
-        if self.held_back is not None:
-            for model, judge in zip(_settling(self.target), _settling(self.held_back), strict=False):
+        """Let the images that are held back be as bright as those that are not."""
+        if self.withheld is not None:
+            for model, judge in zip(_settling(self.target), _settling(self.withheld), strict=False):
                 judge.adopt(model.settled[[self.names.index(name) for name in self.judging]])
 
     def __len__(self) -> int:
@@ -206,11 +208,11 @@ class TrainingData:
         """Return the rays of those numbers with what they measured, technique by technique."""
         return [self.refined(part) for part in self.target[index].parts if len(part)]
 
-    def refined(self, part: Part, held_back: bool = False) -> Part:
+    def refined(self, part: Part, withheld: bool = False) -> Part:
         """Return a part, of the rays held back or of the others, as the refined rig has it."""
         if self.refinement is None:
             return part
-        names = self.judging if held_back else self.names
+        names = self.judging if withheld else self.names
         return self.refinement.of(part, [self.refinement.names.index(name) for name in names])
 
     def refined_by(self, seed: int) -> list[Part]:

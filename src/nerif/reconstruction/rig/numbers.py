@@ -13,11 +13,11 @@ from nerif.common.conventions import InputError
 from nerif.geometry import Camera
 from nerif.geometry.pose import GEOMETRY
 
-__all__ = ["NAMES", "PICTURE", "REFINED", "UNITS", "check_refined", "displaced", "prior", "refined_words"]
+__all__ = ["IMAGE", "NAMES", "REFINED", "UNITS", "check_refined", "displaced", "prior", "refined_words"]
 
-PICTURE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
-"""Displacement of a whole picture, px: constant, and growing from the middle to the edge along columns and rows."""
-NAMES = (*GEOMETRY, *PICTURE)
+IMAGE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
+"""Displacement of a whole image, px: constant, and growing from the middle to the edge along columns and rows."""
+NAMES = (*GEOMETRY, *IMAGE)
 UNITS = (*("rad",) * 3, *("mm",) * 3, "1", "mm", *("px",) * 6)
 REFINED = {"cameras": range(6), "focal": range(6, 7), "background": range(7, 8), "shift": range(8, 14)}
 """What can be refined, and which of NAMES it is."""
@@ -43,14 +43,14 @@ def check_refined(refine: Sequence[str], mm: float | None, deg: float | None, px
     """
     for word in refined_words(refine):
         if word not in REFINED:
-            raise InputError(f"refine: expected some of {', '.join(REFINED)}, got '{word}'")
+            raise InputError(f"expected some of {', '.join(REFINED)}, got '{word}'", field="refine")
     for name, value in (("pose_sigma_mm", mm), ("pose_sigma_deg", deg), ("shift_sigma_px", px)):
         if value is not None and not 0 < value < 1e6:
-            raise InputError(f"{name}: expected a standard deviation above 0, got {value}")
+            raise InputError(f"expected a standard deviation above 0, got {value}", field=name)
 
 
 def displaced(numbers: Float[Tensor, "n 6"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-    """Return the displacement of a whole picture, px, from its middle (PICTURE): at places, 1 at the edge."""
+    """Return the displacement of a whole image, px, from its middle (IMAGE): at places, 1 at the edge."""
     return numbers[:, :2] + torch.einsum("nij,nj->ni", numbers[:, 2:].unflatten(1, (2, 2)), place)
 
 
@@ -60,7 +60,7 @@ def prior(camera: Camera, mm: float | None, deg: float | None, px: float) -> Flo
     Parameters
     ----------
     mm, deg : of where it stands and how it is turned; None for what it knows of itself, or POSE_SIGMA
-    px : of the shift of its picture
+    px : of the shift of its image
     """
     rest = torch.tensor([ZOOM_SIGMA, BACKGROUND_SIGMA, px, px, *[LINEAR * px] * 4], dtype=torch.float64)
     return torch.cat([_pose_sigma(camera, mm, deg), rest])

@@ -28,7 +28,7 @@ UNTOLD = 0.3  # of what data tell of a view (posterior.py): below it, next to no
 
 
 def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) -> Measurement:
-    """Return a measurement with the cameras that a refinement found, and without the shifts of its pictures.
+    """Return a measurement with the cameras that a refinement found, and without the shifts of its images.
 
     Views that the table does not name stay as they are.
 
@@ -73,7 +73,9 @@ def check_table(table: Any) -> None:
         good = isinstance(values, dict) and isinstance(given.get("name"), str)
         numbers = values.items() if isinstance(values, dict) else ()
         if not good or not all(n in NAMES and isinstance(v, int | float) and math.isfinite(v) for n, v in numbers):
-            raise InputError(f"rig: expected for each view a name and finite values of {', '.join(NAMES)}, got {row!r}")
+            raise InputError(
+                f"expected for each view a name and finite values of {', '.join(NAMES)}, got {row!r}", field="rig"
+            )
 
 
 def _known(camera: Camera, sigma: dict[str, float]) -> Camera:
@@ -125,6 +127,8 @@ def take_up(refinement: Refinement | None, kept: Mapping[str, Tensor]) -> None:
     rig = {name.removeprefix("rig."): value for name, value in kept.items() if name.startswith("rig.")}
     if bool(rig) != (refinement is not None):
         was = "with" if rig else "without"
-        raise InputError(f"refine: the checkpoint is of a run {was} --refine; give the same settings to resume it")
+        raise InputError(
+            f"the checkpoint is of a run {was} --refine; give the same settings to resume it", field="refine"
+        )
     if refinement is not None:
         refinement.restore(rig)

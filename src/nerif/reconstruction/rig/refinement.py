@@ -1,12 +1,12 @@
-"""A rig refined together with the field: where cameras stand and look, and what shifts their pictures.
+"""A rig refined together with the field: where cameras stand and look, and what shifts their images.
 
-    d = A(theta_v) f + c_v + C_v x        theta_v: corrections of camera v (geometry/pose.py), x in the picture
+    d = A(theta_v) f + c_v + C_v x        theta_v: corrections of camera v (geometry/pose.py), x in the image
     min  sum |d - measured|^2 / sigma^2 + sum theta^2 / sigma_theta^2
 
 Every number is held by its standard deviation. A step is one of Gauss and Newton against the field as it is, camera by
 camera; between two steps the field follows. It follows cameras so well that a step sees but a part of what is wrong, so
-that steps of those gather momentum; shifts of pictures are seen whole. What the field follows for good, a rigid motion
-of all cameras and a stretch of all pictures alike, is taken out: the mean of the corrections, weighted by their priors,
+that steps of those gather momentum; shifts of images are seen whole. What the field follows for good, a rigid motion
+of all cameras and a stretch of all images alike, is taken out: the mean of the corrections, weighted by their priors,
 stays 0.
 
 While the field is not found yet, what it leaves is alike around and no noise. So data count little at first, and where
@@ -38,7 +38,7 @@ ALIKE = 20.0  # neighbours that what is not understood is alike in
 MOMENTUM = 0.6
 DRAWN = 150  # pixels a view, for a step
 SIGN, SIGNS = 0.012, 2  # share of a residual that a number explains, and how often, before cameras are moved
-STRETCHED = ("u_x", "v_y")  # of all pictures alike: as a field that is a parabola across, or along the axis, does it
+STRETCHED = ("u_x", "v_y")  # of all images alike: as a field that is a parabola across, or along the axis, does it
 UNTOLD = 0.05  # share that a movement has in the mean of all which no data tell
 
 Predict = Callable[[Part, Rays], Float[Tensor, "n k"]]
@@ -83,7 +83,7 @@ class Refinement:
         ----------
         mm, deg : standard deviations of where cameras stand and how they are turned; None for those that the cameras
             know of themselves, or POSE_SIGMA where they do not
-        px : by how much pictures are shifted
+        px : by how much images are shifted
         gauged : as for the class
 
         Raises
@@ -94,14 +94,19 @@ class Refinement:
         words = refined_words(refine)
         whole = torch.stack([prior(camera, mm, deg, px) for camera in measurement.cameras])
         if "cameras" in words and not bool(whole[:, :6].any()):
-            raise InputError("pose_sigma: expected some standard deviations above 0 to refine cameras, got none")
+            raise InputError(
+                "expected some standard deviations above 0 to refine cameras, got none", field="pose_sigma"
+            )
         if "shift" in words and any(not kind.windowed for kind in measurement.techniques):
             names = " and ".join(o.technique.measured for o in measurement.observations)
             raise InputError(
-                f"refine: expected displacements alone for 'shift', got {names}; of pictures give --from displacements"
+                f"expected displacements alone for 'shift', got {names}; of images give --from displacements",
+                field="refine",
             )
         if "background" in words and any(camera.background is None for camera in measurement.cameras):
-            raise InputError("refine: expected cameras that look at a background for 'background', got some without")
+            raise InputError(
+                "expected cameras that look at a background for 'background', got some without", field="refine"
+            )
         open_ = torch.zeros(len(NAMES), dtype=torch.bool)
         for word in words:
             open_[list(REFINED[word])] = True
@@ -145,7 +150,7 @@ class Refinement:
         return tuple(camera.name for camera in self.cameras)
 
     def of(self, part: Part, numbers: Sequence[int] | None = None) -> Part:
-        """Return a part with its rays as the refined cameras have them, and the displacement of its pictures.
+        """Return a part with its rays as the refined cameras have them, and the displacement of its images.
 
         Parameters
         ----------
@@ -323,7 +328,7 @@ class Refinement:
         return values - torch.einsum("vij,j->vi", modes, best)
 
     def _modes(self) -> Float[Tensor, "view 14 mode"]:
-        """What the field follows: six rigid motions, and pictures that all stretch alike, along columns or along rows.
+        """What the field follows: six rigid motions, and images that all stretch alike, along columns or along rows.
 
         Only those of which every view refines every number.
         """
@@ -350,7 +355,7 @@ class Refinement:
         return steps
 
     def _offset(self, values: Float[Tensor, "view 14"], rays: Rays) -> Tensor | None:
-        """The displacement of the pictures at the pixels of rays, px; None where it is not refined."""
+        """The displacement of the images at the pixels of rays, px; None where it is not refined."""
         if not any(i >= len(GEOMETRY) for i in self.columns):
             return None
         view = rays.view.long()

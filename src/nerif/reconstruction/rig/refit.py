@@ -29,7 +29,7 @@ def refit(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Return the table of the refined numbers of views (Refinement.table) that fit a given field best.
 
-    Views of which there are but pictures, whose brightness is not known, have none.
+    Views of which there are but images, whose brightness is not known, have none.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def refit(
     settings : of the reconstruction
     steps, each : of Gauss and Newton, and the pixels of a view that each is taken from
     """
-    if "pictures" in of_source(measurement, "auto", preferred="displacements").maps:
+    if "images" in of_source(measurement, "auto", preferred="displacements").maps:
         return []
     measurement = of_source(measurement, "auto", preferred="displacements")
     rig = Refinement.of_table(measurement, settings, (), gauged=False)

@@ -148,7 +148,7 @@ class Trials:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError(f"uncertainty: expected one of {', '.join(KINDS)}, got '{self.kind}'")
+            raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="uncertainty")
 
     @property
     def members(self) -> int:

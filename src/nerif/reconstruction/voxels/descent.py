@@ -91,9 +91,10 @@ class Descent:
         there = available_memory(self.device)
         if needed > there:
             raise InputError(
-                f"voxels: a grid of {' x '.join(map(str, finest.shape))} would need "
+                f"a grid of {' x '.join(map(str, finest.shape))} would need "
                 f"{needed / 2**30:.1f} GiB on {self.device}, which has {there / 2**30:.1f} GiB free; "
-                f"give fewer --voxels than {settings.voxels}"
+                f"give fewer --voxels than {settings.voxels}",
+                field="voxels",
             )
         masked = settings.hull and measurement.flow_mask is not None
         self.free = self.layout.free(measurement, finest) if masked else None
@@ -325,7 +326,7 @@ class Descent:
             or not 0 <= level < len(shapes)
             or tuple(state.tensors["x"].shape) != shapes[level]
         ):
-            raise InputError("resume: the checkpoint is of another method or grid; give the same settings")
+            raise InputError("the checkpoint is of another method or grid; give the same settings", field="resume")
         self.x = state.tensors["x"].clone()
         take_up(self.rig, state.tensors)
         self.spent, self.started = scalars.pop("seconds"), time.perf_counter()

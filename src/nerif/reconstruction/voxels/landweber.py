@@ -40,7 +40,7 @@ class Landweber(VoxelReconstructor):
         super().__post_init__()
         if not (0 < self.relaxation < 2) or (self.momentum and self.relaxation > 1):
             raise InputError(
-                f"relaxation: expected above 0 and below 2 (with momentum at most 1), got {self.relaxation}"
+                f"expected above 0 and below 2 (with momentum at most 1), got {self.relaxation}", field="relaxation"
             )
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:

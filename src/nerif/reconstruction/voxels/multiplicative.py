@@ -59,7 +59,7 @@ class Multiplicative(VoxelReconstructor):
 
 @dataclass(frozen=True)
 class MLEM(Multiplicative):
-    """Voxels by maximum likelihood and expectation maximisation, for absorption, emission and particle pictures.
+    """Voxels by maximum likelihood and expectation maximisation, for absorption, emission and particle images.
 
     It stops at the noise where sigma is known (discrepancy principle), else when an iteration gains less than the
     tolerance, or after the given iterations.
@@ -94,7 +94,7 @@ class MART(Multiplicative):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 < self.relaxation <= 1:
-            raise InputError(f"relaxation: expected above 0 and at most 1, got {self.relaxation}")
+            raise InputError(f"expected above 0 and at most 1, got {self.relaxation}", field="relaxation")
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
         """Return what a run will need at most: of every view its own operator, and where its rays pass, as well."""
@@ -171,8 +171,9 @@ def check_positive(problem: Problem) -> None:
     for part in problem.target.parts:
         if not part.model.additive:
             raise InputError(
-                f"method: mlem and mart take line integrals of what is never negative, not {part.model.name}; "
-                "give --method tikhonov, tv or nerif"
+                f"mlem and mart take line integrals of what is never negative, not {part.model.name}; "
+                "give --method tikhonov, tv or nerif",
+                field="method",
             )
 
 

@@ -70,13 +70,13 @@ class VoxelOperator:
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if not model.linear:
-            raise InputError(f"model: expected a linear one, got {type(model).__name__}")
+            raise InputError(f"expected a linear one, got {type(model).__name__}", field="model")
         if basis not in DEGREES:
-            raise InputError(f"basis: expected {' or '.join(DEGREES)}, got '{basis}'")
+            raise InputError(f"expected {' or '.join(DEGREES)}, got '{basis}'", field="basis")
         step = STEPS[basis] if step is None else step
         check_step(step, basis)
         if not bool(rays.crosses.any()):
-            raise InputError("rays: expected rays that cross the box, got none; check box, cameras and masks")
+            raise InputError("expected rays that cross the box, got none; check box, cameras and masks", field="rays")
         self.grid, self.basis, self.boundary = grid, basis, boundary or Boundary()
         self.degree = DEGREES[basis]
         self.layers = (self.degree + 1) // 2
@@ -92,7 +92,7 @@ class VoxelOperator:
             self.shares = rays.shares(each).reshape(-1, each, 1).to(self.device, dtype)
         if min(grid.shape[axis] for axis in self.padded_axes) < self.layers:
             raise InputError(
-                f"voxels: expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}"
+                f"expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}", field="voxels"
             )
         self.step = step
         self._follow(rays, model)
@@ -116,7 +116,7 @@ class VoxelOperator:
     def __call__(self, coefficients: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
         """Return what every ray sees."""
         if tuple(coefficients.shape) != self.domain_shape:
-            raise InputError(f"coefficients: expected {self.domain_shape}, got {tuple(coefficients.shape)}")
+            raise InputError(f"expected {self.domain_shape}, got {tuple(coefficients.shape)}", field="coefficients")
         return self.through(
             self.boundary.extend(coefficients.to(self.device, self.dtype), self.layers, self.padded_axes)
         )
@@ -131,7 +131,7 @@ class VoxelOperator:
     def T(self, seen: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
         """Return the adjoint of the operator, applied to what rays see."""
         if tuple(seen.shape) != self.range_shape:
-            raise InputError(f"seen: expected {self.range_shape}, got {tuple(seen.shape)}")
+            raise InputError(f"expected {self.range_shape}, got {tuple(seen.shape)}", field="seen")
         shape = [n + 2 * self.layers * (axis in self.padded_axes) for axis, n in enumerate(self.domain_shape)]
         padded = torch.zeros(shape, dtype=self.dtype, device=self.device)
         self._spread(self._of_rays(seen.to(self.device, self.dtype)), padded)
@@ -217,7 +217,9 @@ def rays_through(rays: Rays, length: float) -> int:
 def check_step(step: float, basis: str) -> None:
     """Refuse a distance of planes that no operator has."""
     if not 0 < step <= STEPS[basis]:
-        raise InputError(f"step: expected above 0 and at most {STEPS[basis]:g} voxels (basis {basis}), got {step}")
+        raise InputError(
+            f"expected above 0 and at most {STEPS[basis]:g} voxels (basis {basis}), got {step}", field="step"
+        )
 
 
 def made_of(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:

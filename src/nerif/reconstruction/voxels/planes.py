@@ -174,7 +174,7 @@ class Bundle:
         for matrix in (gradient, value):
             if matrix is not None and matrix.shape[1] != len(model.channels):
                 what = f"expected weights of {len(model.channels)} channels a ray, got {matrix.shape[1]}"
-                raise InputError(f"{type(model).__name__}: {what}")
+                raise InputError(str(what), field=type(model).__name__)
         count = last - first + 1
         return cls(
             planes, index, start, stride, profile, lost, first.to(torch.int32), count.to(torch.int32), gradient, value
@@ -192,7 +192,7 @@ def _check_inside(ends: Float[Tensor, "n 2 3"], grid: Grid) -> None:
     """Refuse rays that go on beyond the box, in voxels from its corner."""
     most = ends.new_tensor([float(n) for n in reversed(grid.shape)])
     if not bool(((ends >= -OUTSIDE) & (ends <= most + OUTSIDE)).all()):
-        raise InputError(f"rays: expected rays clipped to the box of the grid, {grid.box}, got longer ones")
+        raise InputError(f"expected rays clipped to the box of the grid, {grid.box}, got longer ones", field="rays")
 
 
 def is_even(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tensor) -> bool:

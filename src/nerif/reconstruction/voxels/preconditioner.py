@@ -3,7 +3,7 @@
     z = (S + weight T)^-1 s,      S = spectrum of F^T F,   T = spectrum of L^T L
 
 F^T F is no convolution, but near one: S is the spectrum of its answer to a single voxel in the middle of the box. Views
-see nothing of a wave that runs along none of their pictures, and S is small there; averaged over directions it is of no
+see nothing of a wave that runs along none of their images, and S is small there; averaged over directions it is of no
 use. For the method of conjugate gradients only the way depends on it, not where it leads.
 """
 

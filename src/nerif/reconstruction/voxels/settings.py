@@ -48,7 +48,7 @@ class VoxelReconstructor(SharedSettings):
     model: str = AUTO
     """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
     source: str = "auto"
-    """What to go by (also --from): displacements, pictures (each pixel, linear around the displacements), both, or
+    """What to go by (also --from): displacements, images (each pixel, linear around the displacements), both, or
     auto: displacements where there are some."""
     step: float | None = None
     """Longest distance between the planes on which rays are sampled, in voxels: at most, and by default, 1 (cubic) or
@@ -68,14 +68,14 @@ class VoxelReconstructor(SharedSettings):
         super().__post_init__()
         for name, allowed in (("basis", tuple(DEGREES)), ("precision", ("float32", "float64"))):
             if getattr(self, name) not in allowed:
-                raise InputError(f"{name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
+                raise InputError(f"expected one of {', '.join(allowed)}, got '{getattr(self, name)}'", field=name)
         for name in ("voxels", "iterations"):
             if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
+                raise InputError(f"expected at least 1, got {getattr(self, name)}", field=name)
         if self.step is not None:
             check_step(self.step, self.basis)
         if not self.tolerance >= 0:
-            raise InputError(f"tolerance: expected 0 or more, got {self.tolerance}")
+            raise InputError(f"expected 0 or more, got {self.tolerance}", field="tolerance")
         check_model(self.model)
         check_source(self.source)
 
@@ -146,7 +146,9 @@ class WeightedVoxelReconstructor(VoxelReconstructor):
         if self.regularisation != "auto" and not (
             isinstance(self.regularisation, int | float) and 0 <= self.regularisation < math.inf
         ):
-            raise InputError(f"regularisation: expected auto or a weight of 0 or more, got {self.regularisation}")
+            raise InputError(
+                f"expected auto or a weight of 0 or more, got {self.regularisation}", field="regularisation"
+            )
 
     @property
     def weight(self) -> float | None:
@@ -163,7 +165,7 @@ def _seen(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
 
 
 def _lens_rays(measurement: Measurement, grid: Grid) -> int:
-    """The most rays that a pixel has, as some pixels of each picture tell."""
+    """The most rays that a pixel has, as some pixels of each image tell."""
     most = 1
     for camera in measurement.cameras:
         some = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]

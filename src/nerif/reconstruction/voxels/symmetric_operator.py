@@ -98,9 +98,7 @@ class SymmetricOperator(VoxelOperator):
         curves, array = self.curves, padded.double().contiguous().numpy()
         for matrix in (curves.gradient, curves.value):
             if matrix is not None:
-                found = kernels_symmetric.integrate(
-                    self.degree, array, curves.path, curves.plane, matrix.shape[2] == 3
-                )
+                found = kernels_symmetric.integrate(self.degree, array, curves.path, curves.plane, matrix.shape[2] == 3)
                 seen[curves.index] += made_of(matrix, torch.from_numpy(found))
 
     def _spread(self, seen: Float[Tensor, "m c"], padded: Float[Tensor, "zp k xp"]) -> None:

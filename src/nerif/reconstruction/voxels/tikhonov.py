@@ -31,7 +31,7 @@ class Tikhonov(WeightedVoxelReconstructor):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.penalty not in Penalty.KINDS:
-            raise InputError(f"penalty: expected one of {', '.join(Penalty.KINDS)}, got '{self.penalty}'")
+            raise InputError(f"expected one of {', '.join(Penalty.KINDS)}, got '{self.penalty}'", field="penalty")
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         yield from minimise(problem, Penalty(problem, self.penalty), weight, x)

@@ -40,9 +40,9 @@ class TotalVariation(WeightedVoxelReconstructor):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.softness > 0:
-            raise InputError(f"softness: expected above 0, got {self.softness}")
+            raise InputError(f"expected above 0, got {self.softness}", field="softness")
         if self.round < 1:
-            raise InputError(f"round: expected at least 1 iteration, got {self.round}")
+            raise InputError(f"expected at least 1 iteration, got {self.round}", field="round")
 
     @property
     def patience(self) -> int:

@@ -203,7 +203,7 @@ async function main() {
   on("save", "click", () => {
     const link = document.createElement("a");
     link.download = document.querySelector("h1").textContent.replace(/[^\w.+-]+/g, "_") + ".png";
-    link.href = space.picture();
+    link.href = space.image();
     link.click();
   });
   space.opacity(document.getElementById("opacity").value / 100);

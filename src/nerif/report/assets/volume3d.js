@@ -120,18 +120,18 @@ function makeSpace(scene, canvas) {
   world.add(lines(edges, 0x16202b, 0.8));
 
   function label(text, at, height, colour) {
-    const picture = document.createElement("canvas"), ratio = 4;
-    let pen = picture.getContext("2d");
+    const image = document.createElement("canvas"), ratio = 4;
+    let pen = image.getContext("2d");
     pen.font = 14 * ratio + "px system-ui, sans-serif";
-    picture.width = Math.ceil(pen.measureText(text).width) + 4 * ratio; picture.height = 20 * ratio;
-    pen = picture.getContext("2d");
+    image.width = Math.ceil(pen.measureText(text).width) + 4 * ratio; image.height = 20 * ratio;
+    pen = image.getContext("2d");
     pen.font = 14 * ratio + "px system-ui, sans-serif"; pen.fillStyle = colour; pen.textBaseline = "middle";
     pen.fillText(text, 2 * ratio, 10 * ratio);
-    const map = new THREE.CanvasTexture(picture);
+    const map = new THREE.CanvasTexture(image);
     map.minFilter = THREE.LinearFilter; map.colorSpace = THREE.SRGBColorSpace;
     const sprite = new THREE.Sprite(new THREE.SpriteMaterial({ map, sizeAttenuation: false, depthTest: false, transparent: true }));
     sprite.position.set(...at);
-    sprite.scale.set((height * picture.width) / picture.height, height, 1);
+    sprite.scale.set((height * image.width) / image.height, height, 1);
     sprite.renderOrder = 2;
     return sprite;
   }
@@ -147,7 +147,7 @@ function makeSpace(scene, canvas) {
   const rig = new THREE.Group();
   let rigReach = reach;
   for (const camera of scene.cameras) {
-    const colour = camera.held_out ? 0xb85c00 : 0x0b5a9c, mean = (four) => [0, 1, 2].map((a) => four.reduce((s, p) => s + p[a], 0) / 4);
+    const colour = camera.withheld ? 0xb85c00 : 0x0b5a9c, mean = (four) => [0, 1, 2].map((a) => four.reduce((s, p) => s + p[a], 0) / 4);
     const c = mean(camera.starts), centre = mean(camera.ends);
     const away = middle.distanceTo(new THREE.Vector3(...c));
     rigReach = Math.max(rigReach, away);
@@ -158,9 +158,9 @@ function makeSpace(scene, canvas) {
       if (camera.background) sight.push(camera.ends[k], camera.ends[(k + 1) % 4]);
       rigReach = Math.max(rigReach, middle.distanceTo(new THREE.Vector3(...camera.ends[k])));
     }
-    rig.add(lines(body, colour, 0.95, camera.held_out), lines(sight, colour, 0.7, camera.held_out), lines([c, centre], colour, 0.22, false));
+    rig.add(lines(body, colour, 0.95, camera.withheld), lines(sight, colour, 0.7, camera.withheld), lines([c, centre], colour, 0.22, false));
     const beyond = c.map((v, a) => v + 0.07 * (v - middle.getComponent(a)));
-    rig.add(label(camera.name, beyond, 0.021, camera.held_out ? "#8a4b00" : "#0b5a9c"));
+    rig.add(label(camera.name, beyond, 0.021, camera.withheld ? "#8a4b00" : "#0b5a9c"));
   }
   world.add(rig);
 
@@ -207,9 +207,9 @@ function makeSpace(scene, canvas) {
     if (coarse) return;
     renderer.getContext().finish();
     slow = performance.now() - start;
-    if (slow > 700 && full > 0.5) full = Math.max(0.5, full * 0.7);  // no GPU: a softer picture rather than a wait
+    if (slow > 700 && full > 0.5) full = Math.max(0.5, full * 0.7);  // no GPU: a softer image rather than a wait
   }
-  // drawn only while it can be seen: without a GPU every picture costs the slices their time
+  // drawn only while it can be seen: without a GPU every image costs the slices their time
   let seen = false, wanted = false;
   function request() {
     wanted = true;
@@ -294,6 +294,6 @@ function makeSpace(scene, canvas) {
       moving();
     },
     look: { flow: () => look(oblique, near()), rig: () => look([0.5, -1, 0.75], far()), top: () => look([0, -0.001, 1], near()), front: () => look([0, -1, 0], near()) },
-    picture() { coarse = false; resize(); draw(); return canvas.toDataURL("image/png"); },
+    image() { coarse = false; resize(); draw(); return canvas.toDataURL("image/png"); },
   };
 }

@@ -1,6 +1,6 @@
 """A cloud of small bright particles, and the ideal volume that a reconstruction of it is judged by.
 
-    E(x) = sum_p b_p G(x - x_p),      G a Gaussian of integral 1, averaged over the voxel
+E(x) = sum_p b_p G(x - x_p),      G a Gaussian of integral 1, averaged over the voxel
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class Particles:
             If there would be no particle.
         """
         if count < 1:
-            raise InputError(f"count: expected at least 1 particle, got {count}")
+            raise InputError(f"expected at least 1 particle, got {count}", field="count")
         if not 0 <= variation < math.inf:
-            raise InputError(f"variation: expected 0 or more, got {variation}")
+            raise InputError(f"expected 0 or more, got {variation}", field="variation")
         generator = torch.Generator().manual_seed(seed)
         unit = torch.rand(count, 3, generator=generator, dtype=torch.float64)
         logarithm = variation * torch.randn(count, generator=generator, dtype=torch.float64)
@@ -104,7 +104,7 @@ def spread(
     shape : of the array; what falls beside it is lost
     """
     if not deviation > 0:
-        raise InputError(f"diameter: expected above 0, got {4 * deviation}")
+        raise InputError(f"expected above 0, got {4 * deviation}", field="diameter")
     reach = math.ceil(REACH * deviation)
     offsets = torch.arange(-reach, reach + 1)
     nearest = places.round().long()
@@ -129,6 +129,8 @@ def quality_factor(reconstructed: Float[Tensor, "z y x"], ideal: Float[Tensor, "
     """
     e1, e0 = reconstructed.double(), ideal.double()
     if e1.shape != e0.shape:
-        raise InputError(f"ideal: expected the shape of the reconstruction {tuple(e1.shape)}, got {tuple(e0.shape)}")
+        raise InputError(
+            f"expected the shape of the reconstruction {tuple(e1.shape)}, got {tuple(e0.shape)}", field="ideal"
+        )
     size = float(e1.square().sum() * e0.square().sum()) ** 0.5
     return float((e1 * e0).sum()) / size if size else 0.0

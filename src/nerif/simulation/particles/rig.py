@@ -16,7 +16,7 @@ __all__ = ["four_cameras"]
 PX_PER_MM = 10  # at the middle of the box
 DISTANCE = 500.0  # mm
 PITCH = 0.02  # mm
-MARGIN = 2  # px that the box stays away from the edges of the pictures
+MARGIN = 2  # px that the box stays away from the edges of the images
 
 
 def four_cameras(pixels: int = 200, depth: int = 40, angle: float = 30.0) -> tuple[tuple[Camera, ...], Box]:
@@ -26,7 +26,7 @@ def four_cameras(pixels: int = 200, depth: int = 40, angle: float = 30.0) -> tup
 
     Parameters
     ----------
-    pixels : of an edge of each picture
+    pixels : of an edge of each image
     depth : of the box along x, in pixels
     angle : between the x-axis and each line of sight, degrees
 
@@ -36,9 +36,9 @@ def four_cameras(pixels: int = 200, depth: int = 40, angle: float = 30.0) -> tup
         If there is no such box.
     """
     if not 0 < angle < 80:
-        raise InputError(f"angle: expected between 0 and 80 degrees, got {angle}")
+        raise InputError(f"expected between 0 and 80 degrees, got {angle}", field="angle")
     if depth < 1:
-        raise InputError(f"depth: expected at least 1 px, got {depth}")
+        raise InputError(f"expected at least 1 px, got {depth}", field="depth")
     aside = math.degrees(math.acos(math.sqrt(math.cos(math.radians(angle)))))  # azimuth and elevation both
     cameras: list[Camera] = []
     for side, elevation in (("below", -aside), ("above", aside)):
@@ -52,7 +52,9 @@ def four_cameras(pixels: int = 200, depth: int = 40, angle: float = 30.0) -> tup
         box = Box.around_origin((depth / PX_PER_MM, width / PX_PER_MM, width / PX_PER_MM))
         if all(_sees(camera, box) for camera in cameras):
             return tuple(cameras), box
-    raise InputError(f"pixels: expected pictures that hold a box {depth} px deep, got {pixels} px; give more of them")
+    raise InputError(
+        f"expected images that hold a box {depth} px deep, got {pixels} px; give more of them", field="pixels"
+    )
 
 
 def _sees(camera: Camera, box: Box) -> bool:

@@ -52,9 +52,11 @@ class VortexRing:
     def __post_init__(self) -> None:
         for name in ("radius", "core"):
             if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected a length above 0 mm, got {getattr(self, name)}")
+                raise InputError(f"expected a length above 0 mm, got {getattr(self, name)}", field=name)
         if self.core < THINNEST * self.radius:
-            raise InputError(f"core: expected at least {THINNEST} of the radius, {self.radius} mm, got {self.core}")
+            raise InputError(
+                f"expected at least {THINNEST} of the radius, {self.radius} mm, got {self.core}", field="core"
+            )
 
     @classmethod
     def within(cls, box: Box, speed: float) -> VortexRing:
@@ -103,7 +105,7 @@ class VortexRing:
             If there is no step.
         """
         if steps < 1:
-            raise InputError(f"steps: expected at least 1, got {steps}")
+            raise InputError(f"expected at least 1, got {steps}", field="steps")
         x, h = particles.positions.double(), seconds / steps
         for _ in range(steps):
             k1 = self.velocity(x)

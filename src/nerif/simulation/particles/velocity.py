@@ -74,12 +74,12 @@ def velocity_between(first: Volume, second: Volume, seconds: float, window: int 
     """
     grid = first.grid
     if grid != second.grid:
-        raise InputError(f"second: expected the grid of the first volume, {grid}, got {second.grid}")
+        raise InputError(f"expected the grid of the first volume, {grid}, got {second.grid}", field="second")
     if not seconds > 0:
-        raise InputError(f"seconds: expected a time above 0, got {seconds}")
+        raise InputError(f"expected a time above 0, got {seconds}", field="seconds")
     spacing = torch.tensor(grid.spacing, dtype=torch.float64)
     if not float(spacing.max()) < 1.05 * float(spacing.min()):
-        raise InputError(f"grid: expected cubic voxels, got edges of {grid.spacing} mm")
+        raise InputError(f"expected cubic voxels, got edges of {grid.spacing} mm", field="grid")
     start, end = (volume.values.float().cpu().numpy() for volume in (first, second))
     vectors = correlate(start, end, window, passes, central=True)
     movement = torch.from_numpy(vectors.movement).double()

@@ -76,19 +76,19 @@ def open_cluster(
         import dask
         from distributed import Client
     except ImportError:
-        raise InputError(f"cluster: Dask is not installed; {install('sequence')}") from None
+        raise InputError(f"Dask is not installed; {install('sequence')}", field="cluster") from None
     if where.startswith(PREFIX):
         with dask.config.set({"distributed.comm.timeouts.connect": ANSWER_WITHIN}):
             try:
                 client = Client(where)
             except (OSError, TimeoutError, ValueError) as error:
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                raise InputError(f"cluster: no scheduler answers at {where} ({reason})") from None
+                raise InputError(f"no scheduler answers at {where} ({reason})", field="cluster") from None
         with client:
             yield client, 0
         return
     if dashboard and importlib.util.find_spec("bokeh") is None:
-        raise InputError(f"dashboard: Bokeh is not installed; {install('sequence')}")
+        raise InputError(f"Bokeh is not installed; {install('sequence')}", field="dashboard")
     with _private() as scratch, dask.config.set({**CONFIG, **({} if dashboard else SILENT), **scratch}):
         if where == "local":
             count = workers or torch.cuda.device_count() or max(1, _cores() // 2)
@@ -114,7 +114,7 @@ def _certificate() -> Security:
     from distributed import Security
 
     if importlib.util.find_spec("cryptography") is None:
-        raise InputError(f"cluster: cryptography is not installed; {install('sequence')}")
+        raise InputError(f"cryptography is not installed; {install('sequence')}", field="cluster")
     return Security.temporary()
 
 
@@ -132,12 +132,13 @@ def check_workers(client: Client) -> None:
         versions = client.run(eval, ask)
     except ImportError as error:
         raise InputError(
-            f"cluster: a worker cannot import nerif ({error}); {install('sequence')} where it runs, or name "
-            "that environment in job_script_prologue"
+            f"a worker cannot import nerif ({error}); {install('sequence')} where it runs, or name "
+            "that environment in job_script_prologue",
+            field="cluster",
         ) from None
     for worker, version in versions.items():
         if version != __version__:
-            raise InputError(f"cluster: worker {worker}: expected nerif {__version__} as here, got {version}")
+            raise InputError(f"worker {worker}: expected nerif {__version__} as here, got {version}", field="cluster")
 
 
 @contextmanager
@@ -204,11 +205,11 @@ def slurm_cluster(path: Path, shared: Path | None = None, dashboard: bool = Fals
     settings = {"shared_temp_directory": shared or Path.cwd(), **read_slurm(path)}
     jobs = settings.pop("jobs", 1)
     if not isinstance(jobs, int) or jobs < 1:
-        raise InputError(f"{path}: jobs: expected a number of jobs of 1 or more, got {jobs!r}")
+        raise InputError(f"jobs: expected a number of jobs of 1 or more, got {jobs!r}", field=path)
     try:
         from dask_jobqueue import SLURMCluster
     except ImportError:
-        raise InputError(f"cluster: dask-jobqueue is not installed; {install('cluster')}") from None
+        raise InputError(f"dask-jobqueue is not installed; {install('cluster')}", field="cluster") from None
     check_known(settings, _slurm_names(), str(path), more="; see docs/sequences.md")
     http = f"{LOOPBACK}:0"
     options = _of_site(path, settings, "scheduler_options", {"host": "10.0.0.1"})
@@ -230,7 +231,7 @@ def _of_site(path: Path, settings: dict[str, Any], name: str, example: Any) -> A
 
     value = settings.get(name) or dask.config.get(f"jobqueue.slurm.{name.replace('_', '-')}", None) or type(example)()
     if not isinstance(value, type(example)):
-        raise InputError(f"{path}: {name}: expected e.g. {example}, got {value!r}")
+        raise InputError(f"{name}: expected e.g. {example}, got {value!r}", field=path)
     return value
 
 
@@ -249,23 +250,25 @@ def read_slurm(path: Path) -> dict[str, Any]:
     import yaml
 
     if not path.is_file():
-        raise InputError(f"cluster: expected local, tcp://HOST:PORT or a YAML file for SLURM, got '{path}'")
+        raise InputError(f"expected local, tcp://HOST:PORT or a YAML file for SLURM, got '{path}'", field="cluster")
     try:
         found = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from None
+        raise InputError(f"not a YAML file ({' '.join(str(error).split())})", field=path) from None
     if not isinstance(found, dict):
-        raise InputError(f"{path}: expected names and values such as 'queue: gpu', got {type(found).__name__}")
+        raise InputError(f"expected names and values such as 'queue: gpu', got {type(found).__name__}", field=path)
     wanted = {str(k).replace("-", "_"): v for k, v in found.items()}
     for name in ("cores", "memory"):
         if name not in wanted:
-            raise InputError(f"{path}: expected '{name}' of a job, e.g. '{name}: {'8' if name == 'cores' else '32GB'}'")
+            raise InputError(
+                f"expected '{name}' of a job, e.g. '{name}: {'8' if name == 'cores' else '32GB'}'", field=path
+            )
     # a job is one worker that takes one chunk of time at once, on all cores of the job
     prologue = wanted.get("job_script_prologue") or []
     if not isinstance(prologue, list):
         raise InputError(
-            f'{path}: job_script_prologue: expected a list of shell lines, ["source ~/nerif/bin/activate"], '
-            f"got {prologue!r}"
+            f'job_script_prologue: expected a list of shell lines, ["source ~/nerif/bin/activate"], got {prologue!r}',
+            field=path,
         )
     prologue = [*IN_JOBS, *prologue]
     return {"processes": 1, "job_cpu": wanted["cores"], **wanted, "cores": 1, "job_script_prologue": prologue}

@@ -39,7 +39,7 @@ def evaluate_sequence(
     """
     store, true = SequenceStore(Path(result)), VolumeSequence(truth)
     if len(store) != len(true) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, true.times, strict=True)):
-        raise InputError(f"{truth}: expected the instants of {result}, {len(store)} frames, got others")
+        raise InputError(f"expected the instants of {result}, {len(store)} frames, got others", field=truth)
     check_inside(Path(truth), true.grid.box, store.grid.box)
     quantity = technique(store.attributes.get("techniques", [ASSUMED.name])[0]).quantity
     frames: list[dict[str, Any]] = []
@@ -53,7 +53,7 @@ def evaluate_sequence(
         frames.append({"frame": i, "time_s": store.times[i], **errors})
         on_frame(len(frames), len(done))
     if not frames:
-        raise InputError(f"{result}: no frame of it is done yet; run nerif sequence again")
+        raise InputError("no frame of it is done yet; run nerif sequence again", field=result)
     mean = {name: sum(f[name] for f in frames) / len(frames) for name in ("l2", "l2_variation", "cc")}
     metrics = {"truth": str(Path(truth).resolve()), "frames": frames, "mean": mean}
     write_json(Path(result).with_suffix(".metrics.json"), metrics)

@@ -99,7 +99,7 @@ def _frame(
     plan: SequencePlan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, watch: OnStep
 ) -> Frame:
     begun = time.perf_counter()
-    training = measurement.select([name for name in measurement.names if name not in plan.settings.hold_out])
+    training = measurement.select([name for name in measurement.names if name not in plan.settings.withhold])
     result = settings(training, watch, None, start)
     if result.outcome.failed:
         raise ArithmeticError(result.outcome.message)

@@ -34,7 +34,7 @@ class SequenceSettings:
     """Steps of a frame that starts from the one before."""
     warm_rate: float = 0.7
     """Share of the learning rate such a frame begins with."""
-    hold_out: tuple[str, ...] = ()
+    withhold: tuple[str, ...] = ()
     """Views kept out of the reconstruction, and compared with it."""
     voxels: int = 100
     """Voxels of the volumes along the longest edge of the box."""
@@ -55,22 +55,24 @@ class SequenceSettings:
         for quantity in self.quantities:
             if quantity not in known:
                 names = " and ".join(kind.name for kind in measurement.techniques)
-                raise InputError(f"quantities: expected some of {', '.join(known)} for {names}, got '{quantity}'")
+                raise InputError(
+                    f"expected some of {', '.join(known)} for {names}, got '{quantity}'", field="quantities"
+                )
         written = self.quantities or tuple(q for q in known if q in (measurement.quantity, "density"))
         return replace(self, quantities=written, gas=self.gas.for_measurement(measurement))
 
     def __post_init__(self) -> None:
-        for name in ("hold_out", "quantities"):
+        for name in ("withhold", "quantities"):
             if isinstance(getattr(self, name), str):
-                raise InputError(f"{name}: expected a tuple of names, got the text '{getattr(self, name)}'")
+                raise InputError(f"expected a tuple of names, got the text '{getattr(self, name)}'", field=name)
         if not self.warm_rate > 0:
-            raise InputError(f"warm_rate: expected a share above 0, got {self.warm_rate}")
+            raise InputError(f"expected a share above 0, got {self.warm_rate}", field="warm_rate")
         for name, least in LEAST.items():
             if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+                raise InputError(f"expected {least} or more, got {getattr(self, name)}", field=name)
         for quantity in self.quantities:
             if quantity not in QUANTITIES:
-                raise InputError(f"quantities: expected some of {', '.join(QUANTITIES)}, got '{quantity}'")
+                raise InputError(f"expected some of {', '.join(QUANTITIES)}, got '{quantity}'", field="quantities")
 
 
 @dataclass(frozen=True)

@@ -68,23 +68,26 @@ def reconstruct_sequence(
     out, measurement, settings = Path(out), Path(measurement), settings or SequenceSettings()
     for name, value in (("workers", workers), ("threads", threads)):
         if value < 0:
-            raise InputError(f"{name}: expected 0 or more, got {value}")
+            raise InputError(f"expected 0 or more, got {value}", field=name)
     if out.suffix != ".zarr":
-        raise InputError(f"out: expected a name ending in .zarr, got '{out.name}'")
+        raise InputError(f"expected a name ending in .zarr, got '{out.name}'", field="out")
     if not isinstance(reconstructor, NeRIF):
-        raise InputError(f"reconstructor: expected NeRIF for a sequence, got {type(reconstructor).__name__}")
+        raise InputError(f"expected NeRIF for a sequence, got {type(reconstructor).__name__}", field="reconstructor")
     if reconstructor.time_limit:
-        raise InputError("time_limit: expected none in a sequence, whose frames are to be repeatable; give --max-steps")
-    if reconstructor.source in ("pictures", "both"):
-        raise InputError(f"from: expected auto or displacements for a sequence, got '{reconstructor.source}'")
+        raise InputError(
+            "expected none in a sequence, whose frames are to be repeatable; give --max-steps", field="time_limit"
+        )
+    if reconstructor.source in ("images", "both"):
+        raise InputError(f"expected auto or displacements for a sequence, got '{reconstructor.source}'", field="from")
     if reconstructor.refine:
         raise InputError(
-            "refine: expected nothing to refine in a sequence; refine one frame with nerif reconstruct, and give its "
-            "calibration.toml to the measurement"
+            "expected nothing to refine in a sequence; refine one frame with nerif reconstruct, and give its "
+            "calibration.toml to the measurement",
+            field="refine",
         )
     sequence = MeasurementSequence.read(measurement)
     like = seen_through(sequence.fullest(), reconstructor.aperture)
-    like.without(settings.hold_out)
+    like.without(settings.withhold)
     settings = settings.for_measurement(like)
     shape = reconstructor.resolved_by(like).network
     reconstructor = replace(reconstructor, network=shape, wave_pixels=0, source="displacements")
@@ -123,7 +126,7 @@ def _store(
         store = SequenceStore(plan.out)
         store.check_same(kept)
         return store
-    axis = axis_of(plan.cold, like.without(plan.settings.hold_out))
+    axis = axis_of(plan.cold, like.without(plan.settings.withhold))
     if axis is not None:
         for line in axis.sentences:
             say(line)

@@ -73,7 +73,9 @@ class SequenceStore(VolumeSequence):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
         if self.attributes.get("kind") != KIND:
-            raise InputError(f"{path}: expected the result of nerif sequence (attribute kind '{KIND}'), got another")
+            raise InputError(
+                f"expected the result of nerif sequence (attribute kind '{KIND}'), got another", field=path
+            )
 
     @classmethod
     def begin(
@@ -175,16 +177,18 @@ class SequenceStore(VolumeSequence):
     def field(self, index: int) -> NeuralField:
         """Return the field of a frame that is done."""
         if int(self.read("status", index)) != DONE:
-            raise InputError(f"{self.path}: frame {index} is not done; run nerif sequence again for what is missing")
+            raise InputError(
+                f"frame {index} is not done; run nerif sequence again for what is missing", field=self.path
+            )
         with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
             network = _network(self.attributes, self.grid.box, float(self.read("index_scale", index)))
         weights, at = torch.from_numpy(self.read("weights", index)), 0
         scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
         parameters = list(network.parameters())
         if len(weights) != sum(p.numel() for p in parameters) or not bool(torch.isfinite(weights).all()):
-            raise InputError(f"{self.path}: frame {index}: expected finite weights of its network; is it damaged?")
+            raise InputError(f"frame {index}: expected finite weights of its network; is it damaged?", field=self.path)
         if not math.isfinite(scale + offset):
-            raise InputError(f"{self.path}: frame {index}: expected finite index_scale and offset; is it damaged?")
+            raise InputError(f"frame {index}: expected finite index_scale and offset; is it damaged?", field=self.path)
         with torch.no_grad():
             for parameter in parameters:
                 parameter.copy_(weights[at : at + parameter.numel()].reshape(parameter.shape))
@@ -208,8 +212,9 @@ class SequenceStore(VolumeSequence):
                     name, kept, asked = changed[0], kept.get(changed[0]), asked[changed[0]]
             if kept != asked:
                 raise InputError(
-                    f"{self.path}: {name}: expected {kept!r}, with which it was begun, got {asked!r}; "
-                    "give another --out, or --force to begin anew"
+                    f"{name}: expected {kept!r}, with which it was begun, got {asked!r}; "
+                    "give another --out, or --force to begin anew",
+                    field=self.path,
                 )
 
 

@@ -36,37 +36,37 @@ class ImportSettings:
     scale_mm: float = 1.0
     """Millimetres in a unit of length of the file that is taken over."""
     pose: int = 1
-    """Number of the target picture that is the world frame, where a file of MATLAB's keeps a pose for each picture."""
+    """Number of the target image that is the world frame, where a file of MATLAB's keeps a pose for each image."""
     background_distance: float | None = None
     """Where planes are not known: background across the optical axis, this far behind the origin, mm; from target
-    pictures too, and with --simple, of which the origin is on the axis of the flow."""
+    images too, and with --simple, of which the origin is on the axis of the flow."""
     image_size: tuple[int, int] | None = None
-    """Height and width of the pictures where the file does not say, px."""
+    """Height and width of the images where the file does not say, px."""
     aperture_diameter: float | None = None
     """Of the entrance pupils (focal length over f-number), mm, through all of which a pixel then sees; 0 for thin rays,
     whatever the file says; of telecentric lenses of the cone where it passes z_cam = 0, which calibration has at the
-    origin. From target pictures too."""
+    origin. From target images too."""
     focus_distance: float | None = None
     """Where the lenses are focused, mm along the optical axis; default: as the file says, or on the background."""
     pose_sigma_mm: float | None = None
     """How far a camera may stand from where its calibration has it, mm (standard deviation; reconstruct --refine goes
-    by it); of target pictures beside their noise, 0.05 by default; 1 with --simple."""
+    by it); of target images beside their noise, 0.05 by default; 1 with --simple."""
     pose_sigma_deg: float | None = None
-    """How far a camera may be turned from how its calibration has it, degrees; of target pictures 0.005 by default;
+    """How far a camera may be turned from how its calibration has it, degrees; of target images 0.005 by default;
     0.5 with --simple."""
 
     def __post_init__(self) -> None:
         if self.focus_distance is not None and self.aperture_diameter is None:
-            raise InputError("focus_distance: expected together with aperture_diameter, got it alone")
+            raise InputError("expected together with aperture_diameter, got it alone", field="focus_distance")
         _ = self.lens
         for name in ("pose_sigma_mm", "pose_sigma_deg"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
-                raise InputError(f"{name}: expected a standard deviation of 0 or more, got {value}")
+                raise InputError(f"expected a standard deviation of 0 or more, got {value}", field=name)
         if (self.pose_sigma_mm is None) != (self.pose_sigma_deg is None):
-            raise InputError("pose_sigma_mm, pose_sigma_deg: expected both or neither")
+            raise InputError("expected both or neither", field="pose_sigma_mm, pose_sigma_deg")
         if not self.scale_mm > 0:
-            raise InputError(f"scale_mm: expected a positive number, got {self.scale_mm}")
+            raise InputError(f"expected a positive number, got {self.scale_mm}", field="scale_mm")
 
     @property
     def pose_sigma(self) -> tuple[float, float] | None:
@@ -83,12 +83,12 @@ class ImportSettings:
 
 
 def is_calibration(path: Path) -> bool:
-    """Tell a calibration, in a file or a folder of OpenCV files, from a folder with the pictures of an experiment."""
+    """Tell a calibration, in a file or a folder of OpenCV files, from a folder with the images of an experiment."""
     if not path.is_dir():
         return True
     entries = list(path.iterdir())
-    pictures = any(entry.is_dir() or entry.name == "views.toml" for entry in entries)
-    return not pictures and any(entry.suffix in OPENCV for entry in entries)
+    images = any(entry.is_dir() or entry.name == "views.toml" for entry in entries)
+    return not images and any(entry.suffix in OPENCV for entry in entries)
 
 
 def import_cameras(
@@ -110,7 +110,7 @@ def import_cameras(
     """
     path = Path(path)
     if not path.exists():
-        raise InputError(f"{path}: no such file; expected a calibration ({' '.join(ENDINGS)})")
+        raise InputError(f"no such file; expected a calibration ({' '.join(ENDINGS)})", field=path)
     if path.is_dir():
         cameras = read_opencv_folder(path)
     elif path.suffix == ".mat":
@@ -118,13 +118,13 @@ def import_cameras(
     elif path.suffix in READERS:
         cameras = READERS[path.suffix](path)
     else:
-        raise InputError(f"{path}: expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'")
+        raise InputError(f"expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'", field=path)
     if not cameras:
-        raise InputError(f"{path}: holds no camera")
+        raise InputError("holds no camera", field=path)
     check_names(cameras, str(path))
     for name in only:
         if name not in [c.name for c in cameras]:
-            raise InputError(f"views: expected some of {', '.join(c.name for c in cameras)}, got '{name}'")
+            raise InputError(f"expected some of {', '.join(c.name for c in cameras)}, got '{name}'", field="views")
     return tuple(checked(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
 
 

@@ -4,8 +4,8 @@ The toolbox counts pixels from 1. Its structs (cameraParameters and stereoParame
 
     K                             [fx s cx; 0 fy cy; 0 0 1], since R2022b
     IntrinsicMatrix               its transpose, before
-    RotationVectors               (picture, 3): x_cam = R x_world + t with R by Rodrigues' formula, as OpenCV's
-    TranslationVectors            (picture, 3), in WorldUnits
+    RotationVectors               (image, 3): x_cam = R x_world + t with R by Rodrigues' formula, as OpenCV's
+    TranslationVectors            (image, 3), in WorldUnits
     RadialDistortion              k1 k2, or k1 k2 k3;       TangentialDistortion  p1 p2;       ImageSize  rows, columns
     RotationOfCamera2             of row vectors, x_2 = x_1 R + t: the transpose of OpenCV's; so are RotationMatrices
 
@@ -47,7 +47,7 @@ DISTORTION = ("distortion", "dist", "dist_coeffs", "distCoeffs", "kc", "D")
 
 
 def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
-    """Read the cameras of a .mat file of version 5 or 7.3; `pose` is the target picture that is the world.
+    """Read the cameras of a .mat file of version 5 or 7.3; `pose` is the target image that is the world.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
             content = pymatreader.read_mat(str(path))
     except Exception as error:  # of SciPy and h5py, of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: not a readable MATLAB file ({reason})") from None
+        raise InputError(f"not a readable MATLAB file ({reason})", field=path) from None
     objects = _opaque(path, content)
     if "__function_workspace__" in content and not objects:
         objects = ["params"]
@@ -71,10 +71,11 @@ def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
     if cameras:
         return cameras
     if objects:
-        raise InputError(f"{path}: holds a MATLAB object '{objects[0]}', which only MATLAB can read; {EXPORT}")
+        raise InputError(f"holds a MATLAB object '{objects[0]}', which only MATLAB can read; {EXPORT}", field=path)
     raise InputError(
-        f"{path}: expected fc, cc, kc (Bouguet's toolbox), K or IntrinsicMatrix with RotationVectors "
-        f"(cameraParameters by toStruct), or K, R, t, got {', '.join(content) or 'nothing'}"
+        f"expected fc, cc, kc (Bouguet's toolbox), K or IntrinsicMatrix with RotationVectors "
+        f"(cameraParameters by toStruct), or K, R, t, got {', '.join(content) or 'nothing'}",
+        field=path,
     )
 
 
@@ -122,8 +123,9 @@ def _cameras(content: dict[str, Any], name: str, path: Path, pose: int) -> list[
     worlds = [c.name for c in cameras if c.name not in names and not bool(c.translation.any())]
     if len(worlds) > 1:
         raise InputError(
-            f"{path}: expected cameras in one world frame, got {', '.join(worlds)}, each the origin of its own; give "
-            "stereoParameters with the poses of target pictures, the same for all"
+            f"expected cameras in one world frame, got {', '.join(worlds)}, each the origin of its own; give "
+            "stereoParameters with the poses of target images, the same for all",
+            field=path,
         )
     return cameras
 
@@ -134,10 +136,10 @@ def _cameras(content: dict[str, Any], name: str, path: Path, pose: int) -> list[
 def _toolbox(
     content: dict[str, Any], name: str, where: str, pose: int, known: tuple[np.ndarray, np.ndarray] | None = None
 ) -> CalibratedCamera:
-    """cameraParameters as a struct; `known` is its rotation and translation where those of the pictures don't count."""
+    """cameraParameters as a struct; `known` is its rotation and translation where those of the images don't count."""
     given = next((content[k] for k in ("IntrinsicMatrix", "K") if k in content), None)
     if given is None:
-        raise InputError(f"{where}: expected K or IntrinsicMatrix, got {', '.join(content)}")
+        raise InputError(f"expected K or IntrinsicMatrix, got {', '.join(content)}", field=where)
     k = upright(np.asarray(given).tolist(), f"{where}: intrinsics").clone()
     k[:2, 2] -= 1
     rotation, translation = known or _pose(content, where, pose)
@@ -146,7 +148,8 @@ def _toolbox(
     )
     if radial.size > 3 or tangential.size > 2:
         raise InputError(
-            f"{where}: expected at most 3 radial and 2 tangential coefficients, got {radial.size} and {tangential.size}"
+            f"expected at most 3 radial and 2 tangential coefficients, got {radial.size} and {tangential.size}",
+            field=where,
         )
     k1, k2, k3 = np.concatenate([radial, np.zeros(3)])[:3]
     p1, p2 = np.concatenate([tangential, np.zeros(2)])[:2]
@@ -161,7 +164,7 @@ def _toolbox(
 
 
 def _pose(content: dict[str, Any], where: str, pose: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation, world to camera, of one target picture."""
+    """Rotation and translation, world to camera, of one target image."""
     import cv2
 
     def each(key: str, count: int) -> np.ndarray:
@@ -174,21 +177,22 @@ def _pose(content: dict[str, Any], where: str, pose: int) -> tuple[np.ndarray, n
         rotations = list(each("RotationMatrices", 9).reshape(3, 3, -1).transpose(2, 1, 0))
     if not 1 <= pose <= min(len(rotations), len(translations)):
         raise InputError(
-            f"{where}: expected the pose of picture {pose} in RotationVectors and TranslationVectors, got "
-            f"{len(rotations)} and {len(translations)} poses"
+            f"expected the pose of image {pose} in RotationVectors and TranslationVectors, got "
+            f"{len(rotations)} and {len(translations)} poses",
+            field=where,
         )
     return rotations[pose - 1], translations[pose - 1]
 
 
 def _stereo(content: dict[str, Any], where: str, pose: int) -> list[CalibratedCamera]:
-    """stereoParameters as a struct; without target pictures the first camera is the world."""
+    """stereoParameters as a struct; without target images the first camera is the world."""
     first, second = content["CameraParameters1"], content["CameraParameters2"]
     if not (isinstance(first, dict) and isinstance(second, dict)):
-        raise InputError(f"{where}: expected CameraParameters1 and CameraParameters2 as structs; {EXPORT}")
+        raise InputError(f"expected CameraParameters1 and CameraParameters2 as structs; {EXPORT}", field=where)
     if np.size(first.get("RotationVectors", [])):
         return [_toolbox(own, f"cam{i}", f"{where}: camera {i}", pose) for i, own in ((1, first), (2, second))]
     if "RotationOfCamera2" not in content or "TranslationOfCamera2" not in content:
-        raise InputError(f"{where}: expected RotationOfCamera2 and TranslationOfCamera2, got {', '.join(content)}")
+        raise InputError(f"expected RotationOfCamera2 and TranslationOfCamera2, got {', '.join(content)}", field=where)
     turn, shift = np.asarray(content["RotationOfCamera2"]).T, np.ravel(content["TranslationOfCamera2"])
     return [
         _toolbox(first, "cam1", f"{where}: camera 1", pose, (np.eye(3), np.zeros(3))),
@@ -205,14 +209,15 @@ def _size(content: dict[str, Any], key: str, where: str) -> tuple[int, int] | No
 
 
 def _bouguet(content: dict[str, Any], path: Path, pose: int) -> CalibratedCamera:
-    """fc, cc, alpha_c, kc, and the pose of one picture."""
+    """fc, cc, alpha_c, kc, and the pose of one image."""
     rotation, translation = content.get(f"Rc_{pose}"), content.get(f"Tc_{pose}")
-    # of a picture that was not used they are NaN
+    # of an image that was not used they are NaN
     there = sorted(k for k in content if k.startswith("Rc_") and np.isfinite(flat(content[k], f"{path}: {k}")).all())
     if f"Rc_{pose}" not in there or translation is None:
         raise InputError(
-            f"{path}: expected the pose of picture {pose} (Rc_{pose}, Tc_{pose}), got {', '.join(there) or 'no pose'}; "
-            "give the number of another --pose, or save the extrinsic parameters in one world frame"
+            f"expected the pose of image {pose} (Rc_{pose}, Tc_{pose}), got {', '.join(there) or 'no pose'}; "
+            "give the number of another --pose, or save the extrinsic parameters in one world frame",
+            field=path,
         )
     fc, cc = (numbers(np.ravel(content[k]).tolist(), (2,), f"{path}: {k}") for k in ("fc", "cc"))
     size = image_size([content["ny"], content["nx"]], f"{path}: ny, nx") if {"nx", "ny"} <= set(content) else None
@@ -250,7 +255,7 @@ def _plain(content: dict[str, Any], name: str, path: Path) -> CalibratedCamera:
     where = f"{path}: {name}"
     translation = content.get("t", content.get("T"))
     if "R" not in content or translation is None:
-        raise InputError(f"{where}: expected R and t beside K, got {', '.join(content)}")
+        raise InputError(f"expected R and t beside K, got {', '.join(content)}", field=where)
     known = next((key for key in DISTORTION if key in content), "")
     check_distortion(content, (known,), DISTORTION, where)
     return CalibratedCamera(

@@ -41,10 +41,10 @@ def read_transforms(path: Path) -> list[CalibratedCamera]:
     try:
         whole = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError):
-        raise InputError(f"{path}: not a JSON file, or truncated") from None
+        raise InputError("not a JSON file, or truncated", field=path) from None
     frames = whole.get("frames") if isinstance(whole, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        raise InputError(f"{path}: expected NeRF's transforms.json with a list 'frames', got none")
+        raise InputError("expected NeRF's transforms.json with a list 'frames', got none", field=path)
     cameras = [_camera({**whole, **frame}, i, f"{path}: frame {i}") for i, frame in enumerate(frames)]
     if len({c.name for c in cameras}) < len(cameras):
         return [replace(c, name=f"cam{i}") for i, c in enumerate(cameras)]
@@ -67,10 +67,10 @@ def _camera(given: dict[str, Any], i: int, where: str) -> CalibratedCamera:
     elif "camera_angle_x" in given and size is not None:
         fx = 0.5 * size[1] / math.tan(0.5 * number("camera_angle_x"))
     else:
-        raise InputError(f"{where}: no focal length; expected fl_x, or camera_angle_x and w")
+        raise InputError("no focal length; expected fl_x, or camera_angle_x and w", field=where)
     fy = number("fl_y") if "fl_y" in given else fx
     if size is None and not {"cx", "cy"} <= set(given):
-        raise InputError(f"{where}: no principal point; expected cx and cy, or w and h")
+        raise InputError("no principal point; expected cx and cy, or w and h", field=where)
     height, width = size or (0, 0)
     cx = (number("cx") if "cx" in given else width / 2) - 0.5
     cy = (number("cy") if "cy" in given else height / 2) - 0.5

@@ -40,7 +40,7 @@ def read_opencv_folder(folder: Path) -> list[CalibratedCamera]:
     """One file a camera, named by the file."""
     files = sorted(p for p in folder.iterdir() if p.suffix in ENDINGS)
     if not files:
-        raise InputError(f"{folder}: expected OpenCV files ({' '.join(ENDINGS)}), one a camera, found none")
+        raise InputError(f"expected OpenCV files ({' '.join(ENDINGS)}), one a camera, found none", field=folder)
     cameras: dict[str, CalibratedCamera] = {}
     origins: dict[str, Path] = {}
     for file in files:
@@ -48,8 +48,9 @@ def read_opencv_folder(folder: Path) -> list[CalibratedCamera]:
         for camera in [replace(own[0], name=file.stem)] if len(own) == 1 else own:
             if camera.name in cameras:
                 raise InputError(
-                    f"{file}: expected cameras of different names, got '{camera.name}' here and in "
-                    f"{origins[camera.name].name}; rename one, or take its file out of the folder"
+                    f"expected cameras of different names, got '{camera.name}' here and in "
+                    f"{origins[camera.name].name}; rename one, or take its file out of the folder",
+                    field=file,
                 )
             cameras[camera.name], origins[camera.name] = camera, file
     return list(cameras.values())
@@ -65,14 +66,14 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
     except (cv2.error, SystemError):
         keys = []
     if not keys:
-        raise InputError(f"{path}: not a file written by OpenCV's FileStorage, or empty")
+        raise InputError("not a file written by OpenCV's FileStorage, or empty", field=path)
     values: dict[str, Any] = {}
     for key in keys:
         node = storage.getNode(key)
         try:
             value = node.mat() if node.isMap() else _plain(node)
         except cv2.error as error:
-            raise InputError(f"{path}: {key}: expected a matrix as FileStorage writes it ({error.err})") from None
+            raise InputError(f"{key}: expected a matrix as FileStorage writes it ({error.err})", field=path) from None
         values[key] = np.asarray(value, dtype=object) if isinstance(value, list) else value  # rows of any lengths
     storage.release()
     for key in MODELS:
@@ -91,8 +92,9 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
     suffixes = [s for s in ("", *map(str, range(1, 33))) if find("intrinsics", s) is not None]
     if not suffixes:
         raise InputError(
-            f"{path}: no camera matrix; expected {', '.join(WORDS['intrinsics'])} (with a number behind each for "
-            f"several cameras), got {', '.join(keys)}"
+            f"no camera matrix; expected {', '.join(WORDS['intrinsics'])} (with a number behind each for "
+            f"several cameras), got {', '.join(keys)}",
+            field=path,
         )
     size = _size(values, str(path))
     check_distortion(keys, {*(key_of("distortion", s) for s in suffixes), *MODELS}, WORDS["distortion"], str(path))
@@ -107,8 +109,9 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
             translation = np.zeros(3) if first else find("translation", "")
         if rotation is None or translation is None:
             raise InputError(
-                f"{where}: no pose; expected {', '.join(WORDS['rotation'])} and {', '.join(WORDS['translation'])} "
-                f"beside the camera matrix, got {', '.join(keys)}"
+                f"no pose; expected {', '.join(WORDS['rotation'])} and {', '.join(WORDS['translation'])} "
+                f"beside the camera matrix, got {', '.join(keys)}",
+                field=where,
             )
         rotation = np.asarray(rotation)
         if rotation.size == 3:

@@ -36,11 +36,13 @@ def read_tables(path: Path) -> list[CalibratedCamera]:
     for name, own in table.items():
         where = f"{path}: camera '{name}'"
         if not isinstance(own, dict):
-            raise InputError(f"{path}: expected format = '{FORMAT}' or a table [{name}] with K, R and t, got {own!r}")
+            raise InputError(
+                f"expected format = '{FORMAT}' or a table [{name}] with K, R and t, got {own!r}", field=path
+            )
         check_known(own, known, where)
         for key in ("K", "R", "t"):
             if key not in own:
-                raise InputError(f"{where}: '{key}' is missing")
+                raise InputError(f"'{key}' is missing", field=where)
         cameras.append(
             CalibratedCamera(
                 name=name,
@@ -66,16 +68,16 @@ def read_csv(path: Path) -> list[CalibratedCamera]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file") from None
+        raise InputError("not a text file", field=path) from None
     lines = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if len(lines) < 2:
-        raise InputError(f"{path}: expected a line of column names and one line a camera, got {len(lines)} lines")
+        raise InputError(f"expected a line of column names and one line a camera, got {len(lines)} lines", field=path)
     rows = list(csv.DictReader(lines, delimiter=";" if ";" in lines[0] else ",", skipinitialspace=True))
     names = [str(n).strip() for n in rows[0]]
     check_known(names, COLUMNS, str(path), "column")
     for column in NEEDED:
         if column not in names:
-            raise InputError(f"{path}: column '{column}' is missing")
+            raise InputError(f"column '{column}' is missing", field=path)
     cameras = []
     for i, row in enumerate(rows):
         given = {str(k).strip(): str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
@@ -89,7 +91,7 @@ def read_csv(path: Path) -> list[CalibratedCamera]:
                 return value
             except (KeyError, ValueError):
                 raise InputError(
-                    f"{path}: line {line}: '{key}': expected a number, got '{given.get(key, '')}'"
+                    f"line {line}: '{key}': expected a number, got '{given.get(key, '')}'", field=path
                 ) from None
 
         rotation = [[number(f"r{r}{c}") for c in (1, 2, 3)] for r in (1, 2, 3)]

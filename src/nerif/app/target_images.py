@@ -1,4 +1,4 @@
-"""Pictures of the target of one view: the corners found in each, its error, and a button that leaves it out."""
+"""Images of the target of one view: the corners found in each, its error, and a button that leaves it out."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from nerif.imaging.calibration.result import ImageError
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.imaging.readers.views import View, pose_names
 
-__all__ = ["TargetPictures"]
+__all__ = ["TargetImages"]
 
 SOURCES = {"target": "In space", "background": "On the background"}
 LARGEST = 420  # px
 
 
-class TargetPictures:
-    """The pictures, where the page is being built.
+class TargetImages:
+    """The images, where the page is being built.
 
     Parameters
     ----------
     work : Workspace
-    toggled : told the name of a picture that is left out, or taken again
+    toggled : told the name of an image that is left out, or taken again
     """
 
     def __init__(self, work: Workspace, toggled: Callable[[str], None]) -> None:
@@ -38,14 +38,14 @@ class TargetPictures:
         self, view: View, targets: Mapping[str, CalibrationTarget], errors: Mapping[str, ImageError],
         left_out: Collection[str],
     ) -> None:  # fmt: skip
-        """Show the pictures of a view, one after the other; what is asked for later takes the place.
+        """Show the images of a view, one after the other; what is asked for later takes the place.
 
         Parameters
         ----------
         view : of find_views
-        targets : to look for in the pictures in space and on the background
-        errors : by the name of the picture
-        left_out : names of pictures
+        targets : to look for in the images in space and on the background
+        errors : by the name of the image
+        left_out : names of images
         """
         self._turn += 1
         turn = self._turn
@@ -69,7 +69,7 @@ class TargetPictures:
             for number, pose in enumerate(names):
                 name = f"{view.name}/{source}/{pose}"
                 try:
-                    address = await self.work.beside(self.files.picture, view, source, number, LARGEST, view.crop)
+                    address = await self.work.beside(self.files.image, view, source, number, LARGEST, view.crop)
                     found = await self.work.beside(self.files.found, view, source, number, targets[source])
                     shape = await self.work.beside(self._shape, view, source)
                 except InputError as error:

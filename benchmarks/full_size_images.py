@@ -1,9 +1,9 @@
 """Cameras of full size: seconds and memory of nerif displacement, mask and check on 12 views of 2048 x 2048 px.
 
-    python benchmarks/full_size_pictures.py --write benchmarks/results/full-size-pictures-cpu.md
-    python benchmarks/full_size_pictures.py --pixels 256 --views 4          # a quick trial
+    python benchmarks/full_size_images.py --write benchmarks/results/full-size-images-cpu.md
+    python benchmarks/full_size_images.py --pixels 256 --views 4          # a quick trial
 
-The pictures are random dots with noise, displaced by what a smooth blob of hot gas in the middle of the box does to
+The images are random dots with noise, displaced by what a smooth blob of hot gas in the middle of the box does to
 parallel rays; each command is a process of its own, its children's memory with it. Two figures of memory: the largest
 process, and the largest sum over all processes at one moment.
 """
@@ -34,7 +34,7 @@ BOX = ("--lower", "-25", "-25", "-25", "--upper", "25", "25", "25")
 
 
 def write_view(folder: Path, camera: Camera, references: int, seed: int) -> None:
-    """Write the pictures of one view: a 12-bit camera before dots of about 3 px."""
+    """Write the images of one view: a 12-bit camera before dots of about 3 px."""
     rng = np.random.default_rng(seed)
     height, width = camera.image_size
     dots = gaussian_filter((rng.random((height + 16, width + 16)) < 0.04).astype(np.float32), 1.2)
@@ -51,12 +51,12 @@ def write_view(folder: Path, camera: Camera, references: int, seed: int) -> None
             tifffile.imwrite(path / f"{source}_{i}.tif", np.clip(grey, 0, 4095).astype(np.uint16))
 
 
-def write_pictures(folder: Path, views: int, pixels: int, references: int) -> None:
-    """Write an experiment: the pictures of all views, and their calibration."""
+def write_images(folder: Path, views: int, pixels: int, references: int) -> None:
+    """Write an experiment: the images of all views, and their calibration."""
     ring = Ring(views=views, arc=(0.0, 165.0), pixel_pitch=0.02 * 200 / pixels, image_size=(pixels, pixels))
     cameras = ring.cameras()
     for seed, camera in enumerate(cameras):
-        write_view(folder / "pictures", camera, references, seed)
+        write_view(folder / "images", camera, references, seed)
     write_cameras(folder / "calibration.toml", [CalibratedCamera.from_camera(c) for c in cameras])
 
 
@@ -87,26 +87,26 @@ def run(words: list[str]) -> tuple[float, float, float, int]:
 
 
 def main() -> None:
-    """Make the pictures, run the commands, print the table."""
+    """Make the images, run the commands, print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--pixels", type=int, default=2048)
     parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--references", type=int, default=5)
-    parser.add_argument("--folder", type=Path, help="where to keep pictures and results; a temporary one if left out")
+    parser.add_argument("--folder", type=Path, help="where to keep images and results; a temporary one if left out")
     add_write(parser)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.folder or Path(temporary)
         if not (folder / "calibration.toml").exists():
-            write_pictures(folder, given.views, given.pixels, given.references)
+            write_images(folder, given.views, given.pixels, given.references)
         calibration, measured, masked = (str(folder / n) for n in ("calibration.toml", "m.nc", "masked.nc"))
         commands = {
-            "displacement": [str(folder / "pictures"), "--calibration", calibration, *BOX, "-o", measured, "--force"],
+            "displacement": [str(folder / "images"), "--calibration", calibration, *BOX, "-o", measured, "--force"],
             "mask": [measured, "-o", masked, "--force"],
             "check": [masked],
         }
-        size = f"{given.views} views of {given.pixels} x {given.pixels} px, {given.references} reference pictures each"
-        table = Table("Pictures of full size", COLUMNS, given.write, f"; {size}")
+        size = f"{given.views} views of {given.pixels} x {given.pixels} px, {given.references} reference images each"
+        table = Table("Images of full size", COLUMNS, given.write, f"; {size}")
         for verb, words in commands.items():
             seconds, largest, together, code = run([verb, *words])
             table.row((verb, f"{seconds:.0f}", f"{largest:.2f}", f"{together:.2f}", str(code)))

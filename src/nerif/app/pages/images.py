@@ -1,4 +1,4 @@
-"""Pictures: what is in the folder, whether it can be used, and which part of the frames is each view's own."""
+"""Images: what is in the folder, whether it can be used, and which part of the frames is each view's own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
-from nerif.imaging.picture_looks import SourceLook
+from nerif.imaging.image_quality import SourceLook
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View
 from nerif.imaging.readers.views_file import write_crops
@@ -25,11 +25,11 @@ __all__ = ["PAGE"]
 
 SOURCES = ("reference", "flow")
 THUMBNAIL, LARGE = 280, 900  # px
-MOST = 12  # pictures of a source that are read at first
-LAYOUT = "Put pictures into folders such as run1/cam1/reference and run1/cam1/flow, or name them in run1/views.toml."
+MOST = 12  # images of a source that are read at first
+LAYOUT = "Put images into folders such as run1/cam1/reference and run1/cam1/flow, or name them in run1/views.toml."
 
 
-class PicturesPage:
+class ImagesPage:
     """The page in one tab."""
 
     def __init__(self, work: Workspace, experiments: Sequence[str]) -> None:
@@ -43,13 +43,13 @@ class PicturesPage:
         self.first: dict[str, int] = {}
         self.editor: CropEditor | None = None
         with ui.element("div").classes("stack"):
-            with card("Folder of pictures"):
+            with card("Folder of images"):
                 select = ui.select(list(experiments), label="Experiment", value=self.experiment)
                 select.props('outlined dense options-dense aria-label="Experiment"').classes("short")
                 self.summary = ui.element("div")
                 text_html("The next step on the command line", "h3")
                 self.command = CommandLine()
-            with card("Views", "The first good picture of each, its grey values, and what cannot be used."):
+            with card("Views", "The first good image of each, its grey values, and what cannot be used."):
                 self.grid = ui.element("div").classes("views")
             self.closer = ui.element("div")
 
@@ -60,7 +60,7 @@ class PicturesPage:
         select.on_value_change(turned)
 
     async def build(self) -> None:
-        """Build everything for the experiment that is chosen; pictures come one after the other."""
+        """Build everything for the experiment that is chosen; images come one after the other."""
         self.turn += 1
         turn = self.turn
         with refusals():
@@ -111,11 +111,11 @@ class PicturesPage:
                 wrong.append(str(error))
         wrong += [f"{name}: {why}" for look in looks.values() for name, why in look.bad]
         wrong += [note for look in looks.values() for note in look.notes]
-        pictures: dict[str, str] = {}
+        images: dict[str, str] = {}
         for source, look in looks.items():
             with refusals(wrong.append):
-                pictures[source] = await self.work.beside(
-                    self.files.picture, view, source, look.first, THUMBNAIL, view.crop
+                images[source] = await self.work.beside(
+                    self.files.image, view, source, look.first, THUMBNAIL, view.crop
                 )
         if turn != self.turn:
             return wrong
@@ -125,7 +125,7 @@ class PicturesPage:
             text_html(view.name, "h3")
             with ui.element("div").classes("pair"):
                 for source in SOURCES:
-                    _figure(view, source, looks.get(source), pictures.get(source, ""))
+                    _figure(view, source, looks.get(source), images.get(source, ""))
             if wrong:
                 lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
                 ui.html(f"<ul class=notes>{lines}</ul>", sanitize=False)
@@ -158,7 +158,7 @@ class PicturesPage:
                 look = await self.work.beside(self.files.look, view, source, self.most)
                 first[source] = look.first
                 if not address:
-                    address = await self.work.beside(self.files.picture, view, source, look.first, LARGE, None)
+                    address = await self.work.beside(self.files.image, view, source, look.first, LARGE, None)
                     frame = look.frame_shape
         if turn != self.closer_turn:  # another view has been chosen meanwhile
             return
@@ -166,7 +166,7 @@ class PicturesPage:
         with self.closer, card(view.name, "Drag over the whole frame to crop it, or type; the result is on the right."):
             self.closer.classes("closer")
             if not address:
-                text_html("There is no picture to show: " + " ".join(said), classes="note")
+                text_html("There is no image to show: " + " ".join(said), classes="note")
                 return
             with ui.element("div").classes("halves wide"):
                 with ui.element("div"):
@@ -214,7 +214,7 @@ class PicturesPage:
         await self._show_result()
 
     async def _show_result(self) -> None:
-        """Show what the crop leaves of the pictures, and what is not yet in the folder."""
+        """Show what the crop leaves of the images, and what is not yet in the folder."""
         self.keep()
         view, crop = self.views[self.chosen], self.edits.now[self.chosen]
         changed = self.edits.changed
@@ -228,7 +228,7 @@ class PicturesPage:
         shown: dict[str, str] = {}
         for source, first in self.first.items():
             with refusals():
-                shown[source] = await self.work.beside(self.files.picture, view, source, first, LARGE, crop)
+                shown[source] = await self.work.beside(self.files.image, view, source, first, LARGE, crop)
         if shown and (view, crop) == (self.views.get(self.chosen), self.edits.now.get(self.chosen)):
             one = next(iter(shown.values()))
             self.blink.show(shown.get("reference", one), shown.get("flow", one))
@@ -243,9 +243,9 @@ class PicturesPage:
 
 
 def _figure(view: View, source: str, look: SourceLook | None, address: str) -> None:
-    """A picture, its grey values, and its figures."""
+    """An image, its grey values, and its figures."""
     if look is None or not address:
-        text_html(f"No {source} picture", classes="missing note")
+        text_html(f"No {source} image", classes="missing note")
         return
     height, width = look.shape
     with ui.element("figure"):
@@ -266,12 +266,12 @@ async def build(work: Workspace) -> None:
     found = await work.beside(work.project.contents)
     if not found.experiments:
         with card("In this folder"):
-            text_html("There are no pictures in this folder yet. " + LAYOUT, classes="note")
+            text_html("There are no images in this folder yet. " + LAYOUT, classes="note")
         return
-    page = PicturesPage(work, found.experiments)
+    page = ImagesPage(work, found.experiments)
     with ui.element("div"):
-        ui.timer(0.01, page.build, once=True)  # the page is there before its pictures are read
+        ui.timer(0.01, page.build, once=True)  # the page is there before its images are read
 
 
 ABOUT = "What is in the folder, whether it can be used, and which part of the frames is each view's own."
-PAGE = Page("pictures", "Pictures", "/pictures", ABOUT, build)
+PAGE = Page("images", "Images", "/images", ABOUT, build)

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/drawings.py before pages are read."""
+"""Draws the images of docs/drawings.py before pages are read."""
 
 from __future__ import annotations
 

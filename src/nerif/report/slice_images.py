@@ -1,4 +1,4 @@
-"""Slices of a volume as small pictures for a page, at any voxel along an axis."""
+"""Slices of a volume as small images for a page, at any voxel along an axis."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from nerif.data.volume import Volume
 from nerif.plotting.drawing import COLOUR_MAPS, PLANES, SEQUENTIAL
-from nerif.report.view_images import picture_address
+from nerif.report.view_images import image_address
 
-__all__ = ["bar_picture", "colours_of", "slice_aspect", "slice_picture"]
+__all__ = ["bar_image", "colours_of", "slice_aspect", "slice_image"]
 
 
 def colours_of(quantity: str) -> str:
@@ -16,7 +16,7 @@ def colours_of(quantity: str) -> str:
     return COLOUR_MAPS.get(quantity.partition("_")[0], SEQUENTIAL)
 
 
-def slice_picture(volume: Volume, normal: str, index: int, limits: tuple[float, float], colours: str) -> str:
+def slice_image(volume: Volume, normal: str, index: int, limits: tuple[float, float], colours: str) -> str:
     """Return the slice across an axis as a PNG in a data address, a pixel a voxel, masked voxels grey.
 
     Parameters
@@ -31,7 +31,7 @@ def slice_picture(volume: Volume, normal: str, index: int, limits: tuple[float, 
     plane = np.take(volume.values.numpy(), index, axis=axis)
     if volume.quantity == "n":  # as drawing.shown has it
         plane = plane.astype(np.float64) - 1
-    return picture_address(plane[::-1], limits, colours)
+    return image_address(plane[::-1], limits, colours)
 
 
 def slice_aspect(volume: Volume, normal: str) -> float:
@@ -41,6 +41,6 @@ def slice_aspect(volume: Volume, normal: str) -> float:
     return edges["xyz".index(across)] / edges["xyz".index(up)]
 
 
-def bar_picture(colours: str) -> str:
+def bar_image(colours: str) -> str:
     """Return a colour bar, low on the left, as a PNG in a data address."""
-    return picture_address(np.linspace(0.0, 1.0, 256)[None], (0.0, 1.0), colours)
+    return image_address(np.linspace(0.0, 1.0, 256)[None], (0.0, 1.0), colours)

@@ -1,4 +1,4 @@
-"""A look at the pictures of a view: how many, how they are exposed, which cannot be read; and small ones to show."""
+"""A look at the images of a view: how many, how they are exposed, which cannot be read; and small ones to show."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ SHARPEST = 0.999, 1.05  # quantile of the grey values that is shown white, and h
 
 @dataclass(frozen=True)
 class SourceLook:
-    """What the pictures of one source of a view are like.
+    """What the images of one source of a view are like.
 
     Parameters
     ----------
-    count, looked : pictures there are, and those that were read
+    count, looked : images there are, and those that were read
     shape : height and width of the view's part of a frame, px
     frame_shape : height and width of a frame, px
     full : grey value of a full sensor
-    saturated : share of the pixels of the first good picture at which the sensor was full
+    saturated : share of the pixels of the first good image at which the sensor was full
     histogram : (bin,) share of its pixels from 0 to full scale
-    bad : names of pictures that are of no use, and why
-    notes : pictures that are badly exposed
-    first : number of the first good picture
+    bad : names of images that are of no use, and why
+    notes : images that are badly exposed
+    first : number of the first good image
     """
 
     count: int
@@ -50,13 +50,13 @@ class SourceLook:
 
 
 def look_at(view: View, source: str, most: int = 12) -> SourceLook:
-    """Read pictures of a source, evenly spread.
+    """Read images of a source, evenly spread.
 
     Parameters
     ----------
     view : of find_views
     source : such as "reference" or "flow"
-    most : number of pictures to read; 0 for all
+    most : number of images to read; 0 for all
 
     Raises
     ------
@@ -83,7 +83,7 @@ def look_at(view: View, source: str, most: int = 12) -> SourceLook:
         first = first or (i, image)
     if first is None:
         name, why = bad[0]
-        raise InputError(f"view '{view.name}': none of its {count} {source} pictures can be used; {name}: {why}")
+        raise InputError(f"none of its {count} {source} images can be used; {name}: {why}", field=f"view '{view.name}'")
     number, image = first
     full = full_scale(frames)
     counts, _ = np.histogram(image, bins=BINS, range=(0, max(full, float(image.max()))))
@@ -94,7 +94,7 @@ def look_at(view: View, source: str, most: int = 12) -> SourceLook:
 
 
 def reduced(image: np.ndarray, largest: int) -> np.ndarray:
-    """Return a picture whose longer side is `largest` px at most, its pixels averaged."""
+    """Return an image whose longer side is `largest` px at most, its pixels averaged."""
     import cv2
 
     factor = largest / max(image.shape)
@@ -105,7 +105,7 @@ def reduced(image: np.ndarray, largest: int) -> np.ndarray:
 
 
 def address_of(image: np.ndarray, largest: int, white: float = 0.0) -> str:
-    """Return a grey picture as a JPEG in a data address, its longer side `largest` px at most.
+    """Return a grey image as a JPEG in a data address, its longer side `largest` px at most.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""From pictures to the field: by displacements, and straight, on rendered pictures of a flame with 12-bit noise.
+"""From images to the field: by displacements, and straight, on rendered images of a flame with 12-bit noise.
 
-    python benchmarks/pictures.py --write benchmarks/results/pictures-cpu.md
+    python benchmarks/images.py --write benchmarks/results/images-cpu.md
 
-Pictures are rendered by curved rays, averaged over pixels and lens, with shot noise of 10,000 electrons at full well.
-All routes see the same pictures and the same cameras; each reconstruction is a process of its own, alone. The last
+Images are rendered by curved rays, averaged over pixels and lens, with shot noise of 10,000 electrons at full well.
+All routes see the same images and the same cameras; each reconstruction is a process of its own, alone. The last
 columns are of the displacements that windows found: their rms error, and that in units of their sigma.
 """
 
@@ -39,12 +39,12 @@ CHECKER = "checker"
 ROUTES = (
     ("nerif", "correlation", "displacements"),
     ("nerif", "dis", "displacements"),
-    ("nerif", "correlation", "pictures"),
-    ("nerif", "none", "pictures"),
+    ("nerif", "correlation", "images"),
+    ("nerif", "none", "images"),
     ("tv", "correlation", "displacements"),
-    ("tv", "correlation", "pictures"),
+    ("tv", "correlation", "images"),
 )
-"""Method, optical flow (none: the pictures alone), and what the reconstruction goes by."""
+"""Method, optical flow (none: the images alone), and what the reconstruction goes by."""
 EVERY = tuple(range(len(ROUTES)))
 
 
@@ -56,12 +56,12 @@ class Case:
     ----------
     pixels : of an edge
     seconds : of training of NeRIF
-    goal : L2 that the pictures are to reach
+    goal : L2 that the images are to reach
     f_number : of 50 mm lenses, or 0 for pinholes
     background : kind of pattern
     dot : its size, px
     shift : largest displacement, px; 0 for that of the flame in the rig
-    drift : of the light from one side of the picture to the other, and as much over all of it
+    drift : of the light from one side of the image to the other, and as much over all of it
     routes : that are taken, see ROUTES
     """
 
@@ -86,6 +86,8 @@ CASES = {
     "shifts of 4 px": Case(shift=4.0, routes=(0, 2, 3)),
     "light drifts by 5 %": Case(drift=0.05),
 }
+
+
 def pattern(case: Case, seed: int, width: float, height: float, pixel: float) -> np.ndarray:
     """Return the background of a view, four texels a pixel."""
     texel = pixel / 4
@@ -96,7 +98,7 @@ def pattern(case: Case, seed: int, width: float, height: float, pixel: float) ->
 
 
 def photographed(case: Case, folder: Path) -> None:
-    """Render the pictures, find displacements by each optical flow, and write the measurements and the truth."""
+    """Render the images, find displacements by each optical flow, and write the measurements and the truth."""
     cameras, box = paper_rig(case.pixels)
     if case.f_number:
         from nerif.geometry import Lens
@@ -125,9 +127,9 @@ def photographed(case: Case, folder: Path) -> None:
     scene = Scene(box, Surroundings(n_ambient=N_AMBIENT))
     for flow in ("correlation", "dis"):
         settings = DisplacementSettings(flow)
-        found = [measure(references, [picture], settings) for references, picture in taken]
+        found = [measure(references, [image], settings) for references, image in taken]
         views = ((camera, one, None) for camera, one in zip(cameras, found, strict=True))
-        join_views(views, scene, pictures=True).write(folder / f"{flow}.nc")
+        join_views(views, scene, images=True).write(folder / f"{flow}.nc")
     whole = Measurement.read(folder / "correlation.nc")
     replace(whole, displacement=None, sigma=None).write(folder / "none.nc")
 
@@ -165,7 +167,7 @@ def main() -> None:
     asked = parser.parse_args()
     columns = ["case", "method", "optical flow", "from", "L2", "of variation", "goal", "s"]
     columns += ["error [px]", "error / sigma"]
-    table = Table("From pictures to the field", columns, asked.write, "\n\nMedians of the seeds.")
+    table = Table("From images to the field", columns, asked.write, "\n\nMedians of the seeds.")
     for name, case in CASES.items():
         if not any(words in name for words in asked.only):
             continue
@@ -178,7 +180,7 @@ def main() -> None:
                 seeds = asked.seeds if method == "nerif" else asked.seeds[:1]
                 runs = [alone(reconstruct, folder, method, flow, source, case.seconds, seed) for seed in seeds]
                 middle = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
-                goal = "" if case.goal is None or (method, source) != ("nerif", "pictures") else f"{case.goal:.1%}"
+                goal = "" if case.goal is None or (method, source) != ("nerif", "images") else f"{case.goal:.1%}"
                 error = [f"{middle['error']:.4f}", f"{middle['over_sigma']:.1f}"] if "error" in middle else ["", ""]
                 share = [f"{middle['l2']:.2%}", f"{middle['variation']:.2%}", goal, f"{middle['seconds']:.0f}"]
                 table.row([name, method, flow, source, *share, *error])

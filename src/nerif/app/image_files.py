@@ -1,4 +1,4 @@
-"""Pictures of a project as a page shows them: looks and small pictures, kept until their files change."""
+"""Images of a project as a page shows them: looks and small images, kept until their files change."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any
 from nerif.app.project import Project
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
-from nerif.imaging.picture_looks import SourceLook, address_of, look_at
+from nerif.imaging.image_quality import SourceLook, address_of, look_at
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View
 
-__all__ = ["PictureFiles"]
+__all__ = ["ImageFiles"]
 
 MOST = 400  # entries that are kept
 
 
-class PictureFiles:
-    """What is shown of the pictures of one project.
+class ImageFiles:
+    """What is shown of the images of one project.
 
     Parameters
     ----------
@@ -39,26 +39,26 @@ class PictureFiles:
         path = view.folder / name
         where = path if path.exists() else path.parent
         if not where.resolve().is_relative_to(self.project.folder):
-            raise InputError(f"{name}: expected pictures in {self.project.folder}, got some outside of it")
+            raise InputError(f"expected images in {self.project.folder}, got some outside of it", field=name)
         found = [os.stat(where), *(entry.stat() for entry in os.scandir(where))] if where.is_dir() else [os.stat(where)]
         return len(found), max(f.st_mtime_ns for f in found), sum(f.st_size for f in found)
 
     def look(self, view: View, source: str, most: int) -> SourceLook:
-        """Return how the pictures of a source are; InputError where there are none of use."""
+        """Return how the images of a source are; InputError where there are none of use."""
         return self._once(view, source, ("look", most), lambda: look_at(view, source, most))
 
-    def picture(self, view: View, source: str, number: int, largest: int, crop: Crop | None, white: float = 0.0) -> str:
-        """Return a picture in a data address: of a frame, or of the part that `crop` leaves of it."""
+    def image(self, view: View, source: str, number: int, largest: int, crop: Crop | None, white: float = 0.0) -> str:
+        """Return an image in a data address: of a frame, or of the part that `crop` leaves of it."""
 
         def read() -> str:
             frames = view.open(source)
             image = frames[number]
             return address_of(crop(image, frames.name(number)) if crop else image, largest, white)
 
-        return self._once(view, source, ("picture", number, largest, crop, white), read)
+        return self._once(view, source, ("image", number, largest, crop, white), read)
 
     def found(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
-        """Return what is found of a target in a picture; None if it is not found."""
+        """Return what is found of a target in an image; None if it is not found."""
 
         def read() -> Detection | None:
             frames = view.open(source)

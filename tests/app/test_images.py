@@ -1,4 +1,4 @@
-"""The Pictures page in a real browser: what is wrong is named; crops by mouse and numbers, undone, kept, written."""
+"""The Images page in a real browser: what is wrong is named; crops by mouse and numbers, undone, kept, written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from app.serving import Served, opened
 from nerif.app.crop_edits import CropEdits
-from nerif.app.picture_files import PictureFiles
+from nerif.app.image_files import ImageFiles
 from nerif.app.project import Project
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import find_views
@@ -23,7 +23,7 @@ NAMES = ("cam1", "cam <2>", "cam3")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three views: one in order, one with a broken picture, one without flow."""
+    """Three views: one in order, one with a broken image, one without flow."""
     found = tmp_path_factory.mktemp("project")
     rng = np.random.default_rng(3)
     for name in NAMES:
@@ -57,7 +57,7 @@ def test_steps_are_undone_and_kept():
 
 def visit(driver: Any, server: Served) -> None:
     """Open the page and wait until all views have been looked at."""
-    opened(driver, server, "pictures", "document.querySelectorAll('.view button').length === 3")
+    opened(driver, server, "images", "document.querySelectorAll('.view button').length === 3")
     wait_for(driver, "return document.querySelector('.both img.flow')?.complete")
 
 
@@ -78,7 +78,7 @@ def test_what_is_there_and_what_is_wrong(browser, server):
     wrong = browser.execute_script(f"return {listed}.map(e => e.textContent)")
     assert len(wrong) == 2
     assert wrong[0].startswith("cam <2>/reference/p1.png: cannot be read")
-    assert wrong[1].startswith("view 'cam3': no flow pictures; expected")
+    assert wrong[1].startswith("view 'cam3': no flow images; expected")
     assert browser.execute_script("return document.querySelectorAll('.pair img').length") == 5
     assert browser.execute_script("return document.querySelectorAll('.histogram svg[aria-label]').length") == 5
     assert "0.00% saturated" in text(browser, ".share")
@@ -143,18 +143,18 @@ def test_a_crop_is_drawn_undone_typed_kept_and_written(browser, server, folder):
     assert errors(browser) == []
 
 
-def test_pictures_are_kept_until_their_files_change(folder, monkeypatch):
-    files = PictureFiles(Project(folder))
+def test_images_are_kept_until_their_files_change(folder, monkeypatch):
+    files = ImageFiles(Project(folder))
     view = next(v for v in find_views(folder / "run") if v.name == "cam1")
-    monkeypatch.setattr("nerif.app.picture_files.MOST", 2)
-    first = files.picture(view, "flow", 0, 280, None)
-    assert files.picture(view, "flow", 0, 280, None) is first
-    files.picture(view, "flow", 1, 280, None)
-    assert files.picture(view, "flow", 0, 280, None) is first  # it is the other one that was asked for longer ago
-    files.picture(view, "flow", 0, 32, None)
-    assert files.picture(view, "flow", 0, 280, None) is first
+    monkeypatch.setattr("nerif.app.image_files.MOST", 2)
+    first = files.image(view, "flow", 0, 280, None)
+    assert files.image(view, "flow", 0, 280, None) is first
+    files.image(view, "flow", 1, 280, None)
+    assert files.image(view, "flow", 0, 280, None) is first  # it is the other one that was asked for longer ago
+    files.image(view, "flow", 0, 32, None)
+    assert files.image(view, "flow", 0, 280, None) is first
     iio.imwrite(folder / "run" / "cam1" / "flow" / "p0.png", np.full((HEIGHT, WIDTH), 90, np.uint8))
-    assert files.picture(view, "flow", 0, 280, None) != first
+    assert files.image(view, "flow", 0, 280, None) != first
 
 
 @needs_browser

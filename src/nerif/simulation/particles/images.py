@@ -1,4 +1,4 @@
-"""Pictures of particles: Gaussian images of a given diameter in px, integrated over the pixels, with shot noise.
+"""Images of particles: Gaussian images of a given diameter in px, integrated over the pixels, with shot noise.
 
     L(p) = sum_i b_i / a_i integral over pixel p of G(p' - p_i) dp'
 
@@ -20,12 +20,12 @@ from nerif.forward.registry import technique_of
 from nerif.geometry import Camera
 from nerif.simulation.particles.cloud import DIAMETER, QUANTITY, Particles, spread
 
-__all__ = ["picture", "pictures"]
+__all__ = ["image", "images"]
 
-STEP = 1e-3  # mm, over which the scale of a picture is taken
+STEP = 1e-3  # mm, over which the scale of an image is taken
 
 
-def pictures(
+def images(
     particles: Particles,
     cameras: Sequence[Camera],
     counts: float = 1000.0,
@@ -36,7 +36,7 @@ def pictures(
 
     Parameters
     ----------
-    counts : detected quanta of a particle of mean brightness in one picture, whose shot noise there is; 0 for none
+    counts : detected quanta of a particle of mean brightness in one image, whose shot noise there is; 0 for none
     diameter : of a particle image, four standard deviations, px
     seed : of the noise
 
@@ -46,7 +46,7 @@ def pictures(
         If a number cannot be one, or a camera sees no particle.
     """
     if not 0 <= counts < math.inf:
-        raise InputError(f"counts: expected 0 or more, got {counts}")
+        raise InputError(f"expected 0 or more, got {counts}", field="counts")
     kind = technique_of(QUANTITY)
     generator = torch.Generator().manual_seed(seed)
     height, width = (max(c.image_size[i] for c in cameras) for i in (0, 1))
@@ -54,9 +54,11 @@ def pictures(
     sigma = torch.full_like(radiance, float("nan"))
     for i, camera in enumerate(cameras):
         h, w = camera.image_size
-        clean = picture(particles, camera, diameter)
+        clean = image(particles, camera, diameter)
         if not float(clean.sum()) > 0:
-            raise InputError(f"particles: expected some in view '{camera.name}', got none; check camera and box")
+            raise InputError(
+                f"expected some in view '{camera.name}', got none; check camera and box", field="particles"
+            )
         if counts:
             unit = float(clean.sum()) / (counts * len(particles))  # radiance of one quantum
             found = torch.poisson(clean / unit, generator)
@@ -69,7 +71,7 @@ def pictures(
     return measurement.observed({kind.name: radiance[..., None]}, {kind.name: sigma[..., None]})
 
 
-def picture(particles: Particles, camera: Camera, diameter: float = DIAMETER) -> Float[Tensor, "row column"]:
+def image(particles: Particles, camera: Camera, diameter: float = DIAMETER) -> Float[Tensor, "row column"]:
     """Return the radiance of particles in the pixels of a camera, without noise.
 
     Parameters
