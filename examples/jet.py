@@ -2,10 +2,10 @@
 
     python examples/jet.py jet_reference.tif jet_flow.tif --out jet
 
-The images are of github.com/alexlib/OpticFlow-BOS (MIT). The positions of camera and background are unknown: distances and
-scale below are plausible values, so the index is determined up to one factor and lengths up to another. The right half
-is withheld and predicted from the left; then the whole image is reconstructed, from displacements and from the grey
-values themselves. The spacing of the shock cells is compared with that of the displacement.
+The images are of github.com/alexlib/OpticFlow-BOS (MIT). The positions of camera and background are unknown: distances
+and scale below are plausible values, so the index is determined up to one factor and lengths up to another. The right
+half is withheld and predicted from the left; then the whole image is reconstructed, from displacements and from grey
+values. The spacing of the shock cells is compared with that of the displacement.
 """
 
 from __future__ import annotations
