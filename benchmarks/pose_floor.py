@@ -30,8 +30,7 @@ from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera
-from nerif.reconstruction.rig.refinement import Refinement
-from nerif.reconstruction.rig.refinement import refit
+from nerif.reconstruction.rig.refinement import Refinement, refit
 
 RIGS = ("pose_small", "pose_large")
 PIXELS, ROUNDS = 3000, 10  # of a view, and steps, to fit cameras to the truth

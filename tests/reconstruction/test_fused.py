@@ -7,7 +7,7 @@ import torch
 
 from nerif.fields.network import UNBOUNDED, Network, NetworkShape
 from nerif.reconstruction.neural import fused
-from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.losses import MixedPrecision
 
 CPU = torch.device("cpu")
 
@@ -46,8 +46,8 @@ def test_value_gradient_and_derivatives_are_those_of_the_plain_network(depth, bo
 def test_where_it_is_taken(shape, precision, compile, expected):
     mixed = MixedPrecision(Network(shape), CPU, precision, compile)
     called = []
-    if mixed.by_layers is not None:
-        whole = mixed.by_layers
-        mixed.by_layers = lambda *given: called.append(1) or whole(*given)
+    if mixed.fused is not None:
+        whole = mixed.fused
+        mixed.fused = lambda *given: called.append(1) or whole(*given)
     mixed.value_and_gradient(torch.rand(5, 3), False)
     assert bool(called) == expected

@@ -15,11 +15,10 @@ from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.files import read_field
+from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Draw, Objective
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.precision import MixedPrecision
-from nerif.reconstruction.neural.settings import LossWeights
 from nerif.reconstruction.neural.training_data import TrainingData
 
 SMALL = [
@@ -83,7 +82,7 @@ def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_and_counts_fo
     settings = NeRIF(device="cpu", precision="float32", weights=weights, network=heads)
     data = TrainingData(settings, both, coarsest=1)
     torch.manual_seed(0)
-    field = data.untrained()
+    field = data.initial_field()
     network = MixedPrecision(field.network, data.device, settings.precision, settings.compile)
     index = torch.tensor([0, len(data) - 1])
 
@@ -96,7 +95,7 @@ def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_and_counts_fo
         sum(terms.values()).backward()
         weighed = {name for name, p in field.network.named_parameters() if p.grad is not None}
         share = sum(piece.numbers for piece in pieces) / whole
-        assert share or float(objective.of_nothing([p.part for p in pieces], [p.numbers for p in pieces])) == 0
+        assert share or float(objective.ambient_term([p.part for p in pieces], [p.numbers for p in pieces])) == 0
         return {name: share * float(term.detach()) for name, term in terms.items()}, weighed, share
 
     alone, weighed, _ = of(Ranks())

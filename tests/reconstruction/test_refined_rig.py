@@ -11,6 +11,9 @@ from dataclasses import replace
 import pytest
 import torch
 from matplotlib.figure import Figure
+from nerif.reconstruction.rig.numbers import NAMES
+from nerif.reconstruction.rig.refined import UNTOLD, moved_lines, with_corrections
+from nerif.reconstruction.rig.refit import refit
 
 from nerif.analysis.rig_check import check_rig
 from nerif.cli.cli import main
@@ -19,11 +22,8 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.reconstruction.rig.numbers import NAMES
 from nerif.reconstruction.rig.posterior import with_posterior
-from nerif.reconstruction.rig.refined import UNTOLD, moved_lines, with_corrections
 from nerif.reconstruction.rig.refinement import Refinement
-from nerif.reconstruction.rig.refit import refit
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report.moves_figure import draw_moves

@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nerif.reconstruction.rig.numbers import NAMES, displaced
+from nerif.reconstruction.rig.refined import moved_lines, with_corrections
 
 from nerif.analysis.alignment import Moved, aligned
 from nerif.cli.cli import main
@@ -22,8 +24,6 @@ from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.training_data import TrainingData
-from nerif.reconstruction.rig.numbers import NAMES, displaced
-from nerif.reconstruction.rig.refined import moved_lines, with_corrections
 from nerif.reconstruction.rig.refinement import Refinement
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate

@@ -18,9 +18,9 @@ from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid
+from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.precision import MixedPrecision
-from nerif.reconstruction.neural.warm_start import adopt, fit_network
+from nerif.reconstruction.neural.warm_start import copy_weights, fit_network
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 BOX = Box((-3.0, -2.0, -1.0), (3.0, 2.0, 1.0))
@@ -113,6 +113,6 @@ def test_a_bounded_network_starts_from_one_of_the_same_bounds_in_its_own_scale()
 
     points = torch.rand(40, 3) * 4 - 2
     before, after = field(2e-3, -1e-3), field(5e-3, -1e-3)
-    assert adopt(after, before)
+    assert copy_weights(before, after)
     assert torch.equal(after(points), before(points))
-    assert not adopt(field(5e-3, -2e-3), before)
+    assert not copy_weights(before, field(5e-3, -2e-3))

@@ -31,8 +31,8 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.schedule import SlowRun
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.parameters import moved_lines, with_corrections
+from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refinement import refit
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source

@@ -17,8 +17,19 @@ from nerif.geometry import Camera
 from nerif.geometry.pose import GEOMETRY, Corrections
 
 __all__ = [
-    "GROUPS", "IMAGE", "MOVED", "NAMES", "UNITS", "UNCONSTRAINED", "check_refined", "check_table", "displaced",
-    "moved_lines", "prior", "refined_groups", "with_corrections",
+    "GROUPS",
+    "IMAGE",
+    "MOVED",
+    "NAMES",
+    "UNCONSTRAINED",
+    "UNITS",
+    "check_refined",
+    "check_table",
+    "displaced",
+    "moved_lines",
+    "prior",
+    "refined_groups",
+    "with_corrections",
 ]  # fmt: skip
 
 IMAGE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
