@@ -1,6 +1,6 @@
 """The paper's network (App. A): sinusoidal encoding, fully connected layers with a skip, heads for n and grad(n).
 
-The encoding runs along the axes, as in the paper (Eq. (postionencode)), and along the diagonals, for oblique fronts. The
+The encoding runs along the axes, as in the paper (Eq. (postionencode)), and along diagonals, for oblique fronts. The
 gradient of the n head is the reverse pass written out as forward operations. The training loss, which contains this
 gradient, then needs a single call of autograd and can be compiled (`torch.compile` cannot differentiate twice).
 """
@@ -148,7 +148,7 @@ class NetworkShape:
                 raise InputError(f"expected at least {least}, got {getattr(self, name)}", field=name)
 
     def without_waves_below(self, length: float) -> NetworkShape:
-        """Return the shape without octaves whose wavelengths, 2^(1 - k), are shorter than a length; one octave stays."""
+        """Return the shape without octaves with wavelengths 2^(1 - k) below a length; one octave stays."""
         finest = sum(2.0 ** (1 - k) >= length for k in range(self.octaves))
         return replace(self, octaves=min(self.octaves, max(finest, 1)))
 
