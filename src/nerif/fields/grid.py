@@ -38,9 +38,8 @@ class VoxelField(Field):
         self.grid, self.degree, self.layers = grid, degree, (degree + 1) // 2
         shape = tuple(n + 2 * self.layers for n in grid.shape)
         if tuple(coefficients.shape) != shape:
-            raise InputError(
-                f"expected the shape {shape} (z, y, x), got {tuple(coefficients.shape)}", field="coefficients"
-            )
+            got = tuple(coefficients.shape)
+            raise InputError(f"expected the shape {shape} (z, y, x), got {got}", field="coefficients")
         self.coefficients = coefficients
 
     @classmethod
@@ -52,9 +51,7 @@ class VoxelField(Field):
     def through(cls, values: Float[Tensor, "z y x"], grid: Grid) -> VoxelField:
         """Return the cubic spline that passes through `values` at the voxel centres, mirrored about the outermost."""
         if tuple(values.shape) != grid.shape:
-            raise InputError(
-                f"expected values of shape {grid.shape} (z, y, x), got {tuple(values.shape)}", field="volume"
-            )
+            raise InputError(f"expected the shape {grid.shape} (z, y, x), got {tuple(values.shape)}", field="volume")
         coefficients = values.to(torch.float64)
         for axis in range(3):
             coefficients = _prefilter(coefficients, axis)
@@ -149,11 +146,9 @@ class Boundary:
 
 
 def spline_weights(t: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """Return weights of the 2 (degree 1) or 4 (degree 3) nearest neighbours, on a new last axis, and their derivatives.
+    """Return weights of the 2 or 4 nearest neighbours on a new last axis, and their derivatives.
 
-    Parameters
-    ----------
-    t : distance from the neighbour before, in voxels
+    t is the distance from the neighbour before, in voxels.
     """
     s = 1 - t
     if degree == 1:

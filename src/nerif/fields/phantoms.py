@@ -27,14 +27,7 @@ __all__ = ["Flame", "GaussianBalls", "Octahedron", "Scaled", "make_phantom"]
 
 
 class GaussianBalls(Field):
-    """A sum of Gaussian balls, n - n_ambient = sum_k a_k exp(-|x - c_k|^2 / (2 w_k^2)).
-
-    Parameters
-    ----------
-    centres : (k, 3) mm
-    widths : (k,) standard deviations w, mm
-    amplitudes : (k,) index excess at the centre
-    """
+    """A sum of Gaussian balls, n - n_ambient = sum_k a_k exp(-|x - c_k|^2 / (2 w_k^2)), c and w in mm."""
 
     def __init__(
         self, centres: Float[Tensor, "k 3"], widths: Float[Tensor, " k"], amplitudes: Float[Tensor, " k"]

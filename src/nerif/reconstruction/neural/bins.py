@@ -37,13 +37,9 @@ def coarsest_edge(measurement: Measurement) -> int:
 def binned_rays(
     measurement: Measurement, observation: Observation, edge: int, open_faces: tuple[str, ...] = ()
 ) -> tuple[Rays, Float[Tensor, "n c"], Float[Tensor, "n c"]]:
-    """Return rays, values and sigma of square bins of usable pixels, without those that cross an open face.
+    """Return rays, values and sigma of bins of usable pixels (edge in px), without those that cross an open face.
 
     An unknown sigma of a pixel counts as 1.
-
-    Parameters
-    ----------
-    edge : of a bin, px
     """
     usable, channels = measurement.usable_for(observation), observation.values.shape[-1]
     parts, values, sigma = [], [], []
@@ -75,14 +71,9 @@ def binned_rays(
 def patches(
     measurement: Measurement, observation: Observation, edge: int, open_faces: tuple[str, ...] = ()
 ) -> tuple[Rays, Float[Tensor, "n c"], Float[Tensor, "n c"]]:
-    """Return the rays of bins, and value and sigma of each of their pixels, row by row.
+    """Return the rays of bins, and value and sigma of each of their pixels, row by row, for a technique of one channel.
 
     An unusable pixel has the value 0 and an infinite sigma. An unknown sigma counts as 1.
-
-    Parameters
-    ----------
-    observation : of a technique of one channel
-    edge : of a bin, px
     """
     rays, _, _ = binned_rays(measurement, observation, edge, open_faces)
     usable, within = measurement.usable_for(observation), torch.arange(edge)
@@ -131,11 +122,8 @@ def pixel_subset(measurement: Measurement, count: int) -> Measurement:
 def withhold_pixels(measurement: Measurement, edge: int) -> tuple[Measurement, Measurement | None]:
     """Return the measurement without some blocks of pixels, and these alone; None if there are too few pixels.
 
-    Every view keeps pixels of each technique. Of each technique some are withheld, but not of every view.
-
-    Parameters
-    ----------
-    edge : of the bins of the rest, px; blocks are at least as large
+    Blocks are at least as large as the bins of the rest (edge in px). Every view keeps pixels of each technique. Of
+    each technique some are withheld, but not of every view.
     """
     usable = [measurement.usable_for(observation) & measurement.sees_box for observation in measurement.observations]
     views, height, width = usable[0].shape

@@ -214,16 +214,10 @@ def by_differences(
     value: Callable[[Float[Tensor, "n 3"]], Float[Tensor, " n"]], integral: Weights, p: Float[Tensor, "n m 3"],
     reach: Float[Tensor, "n m"],
 ) -> Float[Tensor, "n c"]:  # fmt: skip
-    """Return the prediction by central differences of n (paper, Eq. (samplegrad)).
+    """Return the prediction by central differences of n (paper, Eq. (samplegrad)), in units of the network.
 
-    B grad(n) needs derivatives along the rows of B only: two evaluations per sample and channel.
-
-    Parameters
-    ----------
-    value : n head
-    integral : weights in the units of the network
-    p : sample points in network coordinates
-    reach : of the differences to either side, in network coordinates; 0 where a ray misses the box
+    B grad(n) needs derivatives along the rows of B only: two evaluations per sample and channel, at a distance `reach`
+    to either side, which is 0 where a ray misses the box.
     """
     assert integral.slope is not None
     length = integral.slope.norm(dim=-1)

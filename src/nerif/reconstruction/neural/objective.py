@@ -45,12 +45,7 @@ FULL_RAYS = 5  # rays through a lens, beyond two, that need as many samples as a
 
 
 class SamplingDensity:
-    """Density of samples in space, from the largest |grad N| of each cell and its neighbours.
-
-    Parameters
-    ----------
-    field : gives box and coordinates
-    """
+    """Density of samples in space, from the largest |grad N| of each cell and its neighbours."""
 
     def __init__(self, field: NeuralField) -> None:
         self.field = field
@@ -230,12 +225,7 @@ class Objective:
         return terms
 
     def ambient_term(self, parts: Sequence[Part], numbers: Sequence[int]) -> Tensor:
-        """Return the value of each data term in the ambient field.
-
-        Parameters
-        ----------
-        numbers : measured values of each part, as weights
-        """
+        """Return the value of each data term in the ambient field, for parts with `numbers` of measured values."""
         terms = (reduce(part.of_nothing, self.settings.norm) for part in parts)
         total = sum(share * term for share, term in zip(shares(numbers), terms, strict=True))
         assert isinstance(total, Tensor)

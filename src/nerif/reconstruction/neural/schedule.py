@@ -55,13 +55,7 @@ MAX_CYCLES = 6
 
 
 class Cycles(Resumable):
-    """The cycles of a run without a limit.
-
-    Parameters
-    ----------
-    first : steps of the first cycle
-    longest : seconds after which the run ends at the latest
-    """
+    """The cycles of a run without a limit: `first` steps in the first, at most `longest` seconds in all."""
 
     STATE = ("length", "step", "seconds", "errors", "verdict")
 
@@ -79,14 +73,11 @@ class Cycles(Resumable):
     def end(
         self, error: float, noise: float, step: int, seconds: float, label: str = "residual of withheld pixels"
     ) -> Outcome | None:
-        """End a cycle: begin the next, or return why there is none.
+        """End a cycle at a step and time of the run: begin the next, or return why there is none.
 
         Parameters
         ----------
-        error : mean square of the residual, over sigma
-        noise : its part due to noise; 0 if sigma is unknown
-        step, seconds : of the run
-        label : name of the residual in messages
+        error, noise : mean square of the residual over sigma, and its part due to noise; 0 if sigma is unknown
         """
         self.errors.append(error)
         before, least = min(self.errors[:-PATIENCE], default=math.inf), min(self.errors[-PATIENCE:])
@@ -120,8 +111,7 @@ class Budget:
     ----------
     settings : epochs, max_steps and time_limit are the limits; without one the run consists of Cycles
     rays : per epoch
-    ranks : processes; all follow the clock of the first
-    device : where the ranks communicate
+    ranks : all processes follow the clock of the first
     """
 
     def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
@@ -183,12 +173,7 @@ class Budget:
         return self._pace_rays / max(time.perf_counter() - self._pace_start, 1e-9)
 
     def remaining(self, rays: int) -> float:
-        """Return for how many more rays there is time at the pace so far; inf without a limit of steps or time.
-
-        Parameters
-        ----------
-        rays : done at that pace since the start
-        """
+        """Return for how many more rays there is time, after `rays` so far; inf without a limit of steps or time."""
         share = max(self._shares() if self.cycles is None else [*self._shares(), self.share], default=0.0)
         return rays * (1 - share) / share if share else math.inf
 
@@ -281,12 +266,7 @@ class FitMonitor(Resumable):
         return self.lowest < HALF / 2
 
     def collapsed(self, final: bool) -> bool:
-        """Return whether the field has stayed or become ambient.
-
-        Parameters
-        ----------
-        final : whether the run is over, so that fewer steps are enough
-        """
+        """Return whether the field has stayed or become ambient; at the end (`final`) fewer steps are enough."""
         if self.has_fitted:
             return self.since >= MIN_STEPS and self.unexplained > HALF
         return self.since >= (MIN_STEPS if final else self.patience) and self.unexplained > EMPTY
@@ -318,12 +298,7 @@ PACE_STEPS, PACE_SHARE = 5, 0.05  # steps, or share of the time limit, after whi
 class SlowRun:
     """Callback that warns once if the time limit allows too few steps.
 
-    The first step does not count, since it may compile the network.
-
-    Parameters
-    ----------
-    settings : of the run; methods without a network are never warned of
-    say : receives the line
+    The first step does not count, since it may compile the network. Methods without a network have no warning.
     """
 
     def __init__(self, settings: Reconstructor, say: Callable[[str], None]) -> None:

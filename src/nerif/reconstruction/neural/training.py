@@ -226,12 +226,7 @@ class Training:
         self._log({"bin_edge": float(edge)})
 
     def _begin_stage(self, label: str) -> None:
-        """Adapt to the data of a new stage, and fit its nuisance parameters to the present field.
-
-        Parameters
-        ----------
-        label : of the data before
-        """
+        """Adapt to the data of a new stage, and fit its nuisance parameters; `label` is that of the stage before."""
         if self.data.label != label:
             self.notes.append(f"the loss changes from {label} to {self.data.label} and jumps")
         self._data_changed()

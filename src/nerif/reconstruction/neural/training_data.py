@@ -44,13 +44,7 @@ NUISANCE_PIXELS = 1024  # per view
 
 
 def shuffled(first: int, length: int, count: int, seed: int) -> Int[Tensor, " n"]:
-    """Return places first .. first + length - 1 of an endless random order with each of 0 .. count - 1 once per epoch.
-
-    Parameters
-    ----------
-    first : place, counted from the start of the first epoch
-    seed : of the orders; every epoch has another
-    """
+    """Return `length` places from `first` of an endless random order with each of 0 .. count - 1 once per epoch."""
     place = np.arange(first, first + length, dtype=np.int64)
     epochs = place // count
     parts = [

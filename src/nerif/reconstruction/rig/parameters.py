@@ -16,21 +16,7 @@ from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
 from nerif.geometry.pose import GEOMETRY, Corrections
 
-__all__ = [
-    "GROUPS",
-    "IMAGE",
-    "MOVED",
-    "NAMES",
-    "UNCONSTRAINED",
-    "UNITS",
-    "check_refined",
-    "check_table",
-    "displaced",
-    "moved_lines",
-    "prior",
-    "refined_groups",
-    "with_corrections",
-]  # fmt: skip
+__all__ = ["GROUPS", "MOVED", "NAMES", "check_refined", "displaced", "moved_lines", "prior", "with_corrections"]
 
 IMAGE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
 """Displacement of a whole image, px: constant, and growing from the middle to the edge along columns and rows."""
@@ -64,12 +50,7 @@ def check_refined(refine: Sequence[str], mm: float | None, deg: float | None, px
 
 
 def displaced(numbers: Float[Tensor, "n 6"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-    """Return the displacement of an image by IMAGE parameters, px.
-
-    Parameters
-    ----------
-    place : position from the middle of the image, 1 at the edge
-    """
+    """Return the displacement (px) by IMAGE parameters at places from the middle of the image, 1 at the edge."""
     return numbers[:, :2] + torch.einsum("nij,nj->ni", numbers[:, 2:].unflatten(1, (2, 2)), place)
 
 
@@ -93,13 +74,9 @@ def prior(camera: Camera, mm: float | None, deg: float | None, px: float) -> Flo
 
 
 def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) -> Measurement:
-    """Return a measurement with the refined cameras of a table, and without the shifts of its images.
+    """Return a measurement with the refined cameras of a `Refinement.table`, and without the shifts of its images.
 
     Views that are not in the table are unchanged.
-
-    Parameters
-    ----------
-    table : see Refinement.table; also stored in metrics.json
     """
     if not table:
         return measurement
@@ -149,7 +126,7 @@ def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
     most = max(table, key=lambda row: row["moved"])
     lines = [f"refined {len(table)} views; largest correction: {most['name']}, {most['moved']:.1f} sigma"]
     if most["moved"] < ROUNDING:
-        lines = [f"refined {len(table)} views: no significant pose error; cameras unchanged"]
+        lines = [f"refined {len(table)} views: pose errors are not significant; cameras unchanged"]
     if len(table) <= FEW_VIEWS:
         lines.append(f"with {len(table)} views the field can be fitted for nearly any poses; corrections are uncertain")
     weak = [row["name"] for row in table if row.get("constrained", 1.0) < UNCONSTRAINED]

@@ -79,13 +79,7 @@ class Refinement:
         cls, measurement: Measurement, refine: Sequence[str], mm: float | None = None, deg: float | None = None,
         px: float = 0.05, gauged: bool = True,
     ) -> Refinement:  # fmt: skip
-        """Return the refinement of some of GROUPS.
-
-        Parameters
-        ----------
-        mm, deg, px : prior standard deviations, see `prior`
-        gauged : as for the class
-        """
+        """Return the refinement of some of GROUPS, with standard deviations as for `prior`."""
         groups = refined_groups(refine)
         sigma = torch.stack([prior(camera, mm, deg, px) for camera in measurement.cameras])
         if "cameras" in groups and not bool(sigma[:, :6].any()):
@@ -107,13 +101,7 @@ class Refinement:
     def of_table(
         cls, measurement: Measurement, settings: Mapping[str, Any], table: Sequence[dict[str, Any]], gauged: bool = True
     ) -> Refinement:
-        """Return the refinement of settings, with the values of a table.
-
-        Parameters
-        ----------
-        settings : refine, pose_sigma_mm, pose_sigma_deg and shift_sigma_px by name
-        table : of the views of the measurement, and possibly of others
-        """
+        """Return the refinement of settings with the values of a table, of these and possibly other views."""
         sigma = (settings["pose_sigma_mm"], settings["pose_sigma_deg"], settings["shift_sigma_px"])
         rig = cls.for_measurement(measurement, settings["refine"], *sigma, gauged=gauged)
         rows, values = {row["name"]: row["values"] for row in table}, rig.values.clone()
@@ -148,12 +136,7 @@ class Refinement:
         return self.signs >= SIGNS
 
     def of(self, part: Part, cameras: Sequence[int] | None = None) -> Part:
-        """Return a part with the rays of the refined cameras and the displacement of its images.
-
-        Parameters
-        ----------
-        cameras : indices of the cameras of the views of the part; None if they are all
-        """
+        """Return a part, of all views or those of some cameras, with refined rays and displacements of its images."""
         rays = part.rays
         if cameras is not None and list(cameras) != list(range(len(self.cameras))):
             rays = replace(rays, view=torch.tensor(cameras, device=rays.view.device).to(rays.view)[rays.view.long()])
@@ -276,13 +259,7 @@ class Refinement:
     def residual(
         self, part: Part, values: Float[Tensor, "view 14"], predict: Predict, integral: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the residual of a part with other parameters, without reducing outliers, and the path integral.
-
-        Parameters
-        ----------
-        part : pixels with their calibrated rays
-        integral : path integral, if it is known
-        """
+        """Return the residual of a part of calibrated rays, without reducing outliers, and the path integral."""
         if integral is None:
             integral = predict(part, self._of(values).moved(part.rays, self.box))
         offset = self._offset(values, part.rays)
@@ -302,12 +279,7 @@ class Refinement:
     def _centred(
         self, values: Float[Tensor, "view 14"], weights: Float[Tensor, "view k k"] | None = None
     ) -> Float[Tensor, "view 14"]:
-        """The parameters without the modes that no camera determines: minus the weighted mean of `_modes`.
-
-        Parameters
-        ----------
-        weights : square roots of the weights of parameters in units of sigma; None for equal ones
-        """
+        """The parameters minus the mean of `_modes`, with square roots of weights for parameters in units of sigma."""
         modes = self._modes()
         if not self.gauged or not modes.shape[-1]:
             return values
@@ -383,11 +355,8 @@ def load_rig(rig: Refinement | None, tensors: Mapping[str, Tensor]) -> None:
     """Load `rig_state` from the tensors of a checkpoint; both runs must refine a rig, or neither."""
     state = {name.removeprefix("rig."): value for name, value in tensors.items() if name.startswith("rig.")}
     if bool(state) != (rig is not None):
-        raise InputError(
-            f"the checkpoint is of a run {'with' if state else 'without'} --refine; give the same settings to resume "
-            "it",
-            field="refine",
-        )
+        run = "with" if state else "without"
+        raise InputError(f"the checkpoint is of a run {run} --refine; give the same settings", field="refine")
     if rig is not None:
         rig.load_state_dict(state)
 
@@ -399,12 +368,8 @@ def refit(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Return the table of the refined parameters of views, such as withheld ones, against a fixed field.
 
-    It is empty for images without displacements, whose brightness is unknown.
-
-    Parameters
-    ----------
-    settings : of the reconstruction
-    steps, per_view : Gauss-Newton steps, and pixels per view in each
+    It is empty for images without displacements, whose brightness is unknown. Each of the Gauss-Newton steps uses
+    `per_view` pixels per view.
     """
     measurement = of_source(measurement, "auto", preferred="displacements")
     if "images" in measurement.maps:
