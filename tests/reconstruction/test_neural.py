@@ -194,18 +194,6 @@ def test_waves_shorter_than_the_pixels_are_left_out(pixels, octaves):
     assert resolved.resolved_by(measured) == resolved
 
 
-@pytest.mark.slow
-def test_waves_shorter_than_the_pixels_would_increase_the_error(measurement):
-    """By a factor of 1.4 and more."""
-    cameras, box = paper_rig(16)
-    phantom = make_phantom("flame", box, 5)
-    measured = simulate(phantom, cameras[:9], box, 1.00027, 0.05, 1)
-    truth = phantom.sample(grid := Grid.of_resolution(box, 32))
-    settings = NeRIF(max_steps=150, samples=(24, 48), device="cpu")
-    errors = [(s(measured).field.sample(grid) - truth).norm() for s in (settings, replace(settings, wave_pixels=0))]
-    assert errors[1] > 1.4 * errors[0]
-
-
 def test_networks_of_older_files_without_gains_weight_octaves_equally():
     network = Network(NetworkShape(depth=1, width=4, octaves=7))
     assert network.gains.tolist() == [1, 1, 1, 1, 1, 0.25, 0.0625]
@@ -239,14 +227,6 @@ def test_stop_ratio_refers_to_the_ambient_field_also_after_a_start(measurement, 
     result = replace(SMALL, stop_ratio=0.9)(measurement, start=undisturbed.field)
     assert result.outcome.reason == "converged"
     assert result.history[-1]["step"] < 5
-
-
-def test_a_small_learning_rate_has_more_steps_before_a_collapse(measurement):
-    """Preset paper stays at the ambient field for about 450 steps of 2048 points, and then leaves it."""
-    slow, usual = (
-        training.Training(s, TrainingData(SMALL, measurement)) for s in (replace(SMALL, learning_rate=1e-3), SMALL)
-    )
-    assert slow.monitor.patience == 15 * usual.monitor.patience
 
 
 def test_ambient_is_ambient_on_the_faces(measurement, trained):
