@@ -167,22 +167,19 @@ FLAME_INTERVAL = 1e-4  # s between the six instants in place of the paper's Phan
 
 def make_phantom(name: str, box: Box, seed: int = 0, time: float = 0.0) -> Field:
     """Return the phantom called `name`: one of those above, or the paper's number 1-7."""
-    if name in ("gaussians", "1"):
-        return GaussianBalls.random(box, seed)
-    if name == "flame":
-        return Flame(box, time, seed)
     if name in ("2", "3", "4", "5", "6", "7"):
         return Flame(box, (int(name) - 2) * FLAME_INTERVAL + time, seed)
-    if name == "octahedron":
-        return Octahedron(box)
-    if name == "turbulence":
-        return TurbulentPlume(box, seed)
-    if name == "fire":
-        return Fire(box, seed)
-    if name in AXISYMMETRIC:
-        return AXISYMMETRIC[name](box)
-    raise InputError(
-        f"expected gaussians, flame, octahedron, turbulence, fire, {', '.join(AXISYMMETRIC)}, "
-        f"1-7 (the paper's) or a .nc or .vti volume, got '{name}'",
-        field="phantom",
-    )
+    makers: dict[str, Callable[[], Field]] = {
+        "gaussians": lambda: GaussianBalls.random(box, seed),
+        "flame": lambda: Flame(box, time, seed),
+        "octahedron": lambda: Octahedron(box),
+        "turbulence": lambda: TurbulentPlume(box, seed),
+        "fire": lambda: Fire(box, seed),
+        **{name: partial(phantom, box) for name, phantom in AXISYMMETRIC.items()},
+    }
+    name = "gaussians" if name == "1" else name
+    if name not in makers:
+        raise InputError(
+            f"expected {', '.join(makers)}, 1-7 (the paper's) or a .nc or .vti volume, got '{name}'", field="phantom"
+        )
+    return makers[name]()

@@ -26,8 +26,8 @@ learning, arXiv:2310.17813 (2023), for Muon.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -37,7 +37,7 @@ from torch.optim.adam import adam
 from nerif.common.conventions import InputError
 from nerif.fields.network import Network, NetworkShape, encoded_width
 
-__all__ = ["OPTIMISERS", "Adam", "Muon", "NetworkOptimiser", "Optimiser"]
+__all__ = ["OPTIMISERS", "NetworkOptimiser", "Optimiser", "adam_step"]
 
 OPTIMISERS = ("muon", "adam")
 REFERENCE = NetworkShape(width=128, directions=3)
@@ -46,16 +46,17 @@ ITERATIONS = 5
 A, B, C = 3.4445, -4.7750, 2.0315  # of the polynomial a s + b s^3 + c s^5 of the singular values
 
 
-class Optimiser(ABC):
-    """Updates weights, with a memory for each.
+class Optimiser:
+    """Updates weights by a rule, with a memory for each.
 
     Parameters
     ----------
     shares : of the rate, one for each weight
+    rule : updates a weight and its memory, empty at first, in place; called with weight, gradient, memory and rate
     """
 
-    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float]) -> None:
-        self.weights, self.shares = list(weights), list(shares)
+    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], rule: Callable[..., None]) -> None:
+        self.weights, self.shares, self.rule = list(weights), list(shares), rule
         self.memory: list[dict[str, Tensor]] = [{} for _ in self.weights]
 
     def zero_grad(self) -> None:
@@ -68,26 +69,16 @@ class Optimiser(ABC):
         """Update all weights that have a gradient."""
         for weight, share, memory in zip(self.weights, self.shares, self.memory, strict=True):
             if weight.grad is not None:
-                self.update(weight, weight.grad, memory, rate * share)
-
-    @abstractmethod
-    def update(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        """Update a weight and its memory in place; the memory is empty at first."""
+                self.rule(weight, weight.grad, memory, rate * share)
 
 
-class Muon(Optimiser):
-    """Muon with momentum mu, for weight matrices."""
-
-    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], momentum: float) -> None:
-        super().__init__(weights, shares)
-        self.momentum = momentum
-
-    def update(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        if not memory:
-            memory["momentum_buffer"] = torch.zeros_like(weight)
-        buffer = memory["momentum_buffer"]
-        buffer.lerp_(gradient, 1 - self.momentum)
-        weight.add_(orthogonal(gradient.lerp(buffer, self.momentum)).to(weight), alpha=-rate)
+def muon_step(weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float, momentum: float) -> None:
+    """Update a weight matrix by Muon."""
+    if not memory:
+        memory["momentum_buffer"] = torch.zeros_like(weight)
+    buffer = memory["momentum_buffer"]
+    buffer.lerp_(gradient, 1 - momentum)
+    weight.add_(orthogonal(gradient.lerp(buffer, momentum)).to(weight), alpha=-rate)
 
 
 def orthogonal(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
@@ -101,21 +92,17 @@ def orthogonal(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
     return x if wide is matrix else x.T
 
 
-class Adam(Optimiser):
-    """Adam with decay rates b1 and b2."""
-
-    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], betas: tuple[float, float]) -> None:
-        super().__init__(weights, shares)
-        self.betas = betas
-
-    def update(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        if not memory:
-            memory |= {"step": torch.tensor(0.0), "exp_avg": torch.zeros_like(weight)}
-            memory["exp_avg_sq"] = torch.zeros_like(weight)
-        adam(
-            [weight], [gradient], [memory["exp_avg"]], [memory["exp_avg_sq"]], [], [memory["step"]], amsgrad=False,
-            beta1=self.betas[0], beta2=self.betas[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
-        )  # fmt: skip
+def adam_step(
+    weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float, betas: tuple[float, float]
+) -> None:
+    """Update a weight by Adam."""
+    if not memory:
+        memory |= {"step": torch.tensor(0.0), "exp_avg": torch.zeros_like(weight)}
+        memory["exp_avg_sq"] = torch.zeros_like(weight)
+    adam(
+        [weight], [gradient], [memory["exp_avg"]], [memory["exp_avg_sq"]], [], [memory["step"]], amsgrad=False,
+        beta1=betas[0], beta2=betas[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
+    )  # fmt: skip
 
 
 class NetworkOptimiser:
@@ -136,9 +123,10 @@ class NetworkOptimiser:
         for p in network.parameters():
             (matrices if kind == "muon" and p.ndim == 2 and min(p.shape) > 1 else others).append(p)
         shares = [adam_share(network, p) if by_shape else 1.0 for p in others]
-        self.parts: dict[str, Optimiser] = {"adam": Adam(others, shares, betas)}
+        self.parts: dict[str, Optimiser] = {"adam": Optimiser(others, shares, partial(adam_step, betas=betas))}
         if matrices:
-            self.parts["muon"] = Muon(matrices, [muon_share(network, p) for p in matrices], momentum)
+            shares = [muon_share(network, p) for p in matrices]
+            self.parts["muon"] = Optimiser(matrices, shares, partial(muon_step, momentum=momentum))
 
     def zero_grad(self) -> None:
         """Discard the gradients."""

@@ -399,18 +399,9 @@ class Training:
         ambient = self.objective.ambient_values(LEVEL_POINTS, torch.Generator().manual_seed(0))
         if ambient is not None and self.data.gauge_free and self.field.network.limits == UNBOUNDED:
             self.field.offset = float(ambient.mean())
+        rig = [] if self.data.refinement is None else self.data.refinement.table()
         return Reconstruction(
-            field=self.field,
-            box=self.data.box,
-            n_ambient=self.data.n_ambient,
-            history=self.history,
-            outcome=outcome,
-            settings=asdict(self.settings),
-            seconds=self.budget.seconds,
-            peak_memory_bytes=peak_memory(self.device),
-            device=str(self.device),
-            state=state,
-            quantity=self.data.quantity,
-            rig=[] if self.data.refinement is None else self.data.refinement.table(),
-            axis=self.data.axis,
-        )
+            self.field, self.data.box, self.data.n_ambient, self.history, outcome, asdict(self.settings),
+            self.budget.seconds, peak_memory(self.device), str(self.device), state, self.data.quantity, rig,
+            self.data.axis,
+        )  # fmt: skip

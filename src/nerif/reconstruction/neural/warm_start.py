@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import nn
@@ -17,7 +18,7 @@ from nerif.fields.base import Field
 from nerif.fields.network import UNBOUNDED, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.reconstruction.neural.losses import Evaluator
-from nerif.reconstruction.neural.optimiser import Adam
+from nerif.reconstruction.neural.optimiser import Optimiser, adam_step
 
 __all__ = ["copy_weights", "fit_network"]
 
@@ -70,7 +71,7 @@ def fit_network(
     on_step : called with step and loss; True ends the fit
     """
     weights = list(field.network.parameters())
-    adam = Adam(weights, [1.0] * len(weights), BETAS)
+    adam = Optimiser(weights, [1.0] * len(weights), partial(adam_step, betas=BETAS))
     device = weights[0].device
     start = start.to(device)
     lower, edges = torch.tensor(field.box.lower), torch.tensor(field.box.edges)
