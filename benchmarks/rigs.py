@@ -57,8 +57,6 @@ def goals(name: str, method: str, way: Way) -> tuple[float | None, float | None]
 
 def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[str, Any]:
     """Reconstruct a file, and compare with the truth beside it."""
-    from nerif.reconstruction.rig.refined import with_corrections
-
     from nerif.analysis.alignment import aligned
     from nerif.analysis.evaluation import evaluate_views, evaluate_volume
     from nerif.analysis.prediction import reproject
@@ -67,6 +65,7 @@ def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[st
     from nerif.reconstruction.aperture import seen_through
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
+    from nerif.reconstruction.rig.parameters import with_corrections
     from nerif.reconstruction.sources import of_source
     from nerif.reconstruction.voxels.total_variation import TotalVariation
 

@@ -87,39 +87,22 @@ def test_a_run_that_had_a_limit_continues_with_a_cycle(measurement):
     assert first["step"] == 30
 
 
-@pytest.fixture
-def _worse_after_the_first_cycle(monkeypatch):
-    errors = itertools.chain([2.0], itertools.repeat(3.0))
+@pytest.mark.parametrize(
+    ("first", "refine", "interrupted"),
+    [(20, (), True), pytest.param(20, (), False, marks=pytest.mark.slow),
+     pytest.param(6, ("cameras",), False, marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_the_result_is_that_of_the_best_cycle(measurement, monkeypatch, first, refine, interrupted):
+    """Here of the first cycle."""
+    errors, states = itertools.chain([2.0], itertools.repeat(3.0)), []
     monkeypatch.setattr(objective.Objective, "withheld_residual", lambda self: next(errors))
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_worse_after_the_first_cycle")
-def test_the_result_has_the_rig_of_the_best_cycle(measurement, monkeypatch):
     monkeypatch.setattr("nerif.reconstruction.rig.refinement.SIGN", -1.0)  # the rig counts as off
-    rigs = []
-
-    def on_step(step: Step) -> None:
-        if step.step == 6:
-            rigs.append(step.capture().tensors["data.rig.values"])
-
-    result = replace(ENDLESS, first_cycle=6, refine=("cameras",))(measurement, on_step)
-    values = torch.tensor([list(row["values"].values()) for row in result.rig], dtype=torch.float64)
-    last = result.state.tensors["data.rig.values"]
-    assert torch.equal(values, rigs[0][:, : values.shape[1]])
-    assert not torch.equal(values, last[:, : values.shape[1]])
-
-
-@pytest.mark.usefixtures("_worse_after_the_first_cycle")
-@pytest.mark.parametrize("interrupted", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_the_result_has_the_weights_of_the_best_cycle(measurement, interrupted):
-    states = []
-    settings = replace(ENDLESS, first_cycle=20)
+    settings = replace(ENDLESS, first_cycle=first, refine=refine)
 
     def on_step(step: Step) -> bool:
-        if step.step == 20:
+        if step.step == first:
             states.append(step.capture())
-        return interrupted and step.step == 30
+        return interrupted and step.step == first + 10
 
     result = settings(measurement, on_step)
     if interrupted:
@@ -128,6 +111,11 @@ def test_the_result_has_the_weights_of_the_best_cycle(measurement, interrupted):
     assert result.outcome.reason == "converged"
     weights = result.field.network.state_dict()
     assert all(torch.equal(weights[k], v) for k, v in states[0].under("network.").items())
+    if refine:
+        values = torch.tensor([list(row["values"].values()) for row in result.rig], dtype=torch.float64)
+        best, last = (s.tensors["data.rig.values"][:, : values.shape[1]] for s in (states[0], result.state))
+        assert torch.equal(values, best)
+        assert not torch.equal(values, last)
 
 
 @pytest.mark.parametrize(("setting", "value"), [("longest", 0.0), ("first_cycle", 0), ("longest", math.nan)])

@@ -18,10 +18,7 @@ from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_m
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
 
-__all__ = [
-    "LINEAR", "NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "deviation",
-    "masked_lines",
-]  # fmt: skip
+__all__ = ["NOT_UNIFORM", "GasChanges", "GasSettings", "derive", "derive_all", "deviation", "masked_lines"]
 
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; outside, gases of the table condense or dissociate."""
@@ -35,9 +32,6 @@ NOT_UNIFORM = (
     "the pressure is not uniform (density is both above and below ambient, as behind compression and expansion waves); "
     "--gas.uniform-pressure yes computes temperature anyway"
 )
-
-LINEAR = "n", "density"
-"""Quantities that are linear functions of the index excess."""
 
 
 @dataclass(frozen=True)

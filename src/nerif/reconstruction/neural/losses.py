@@ -57,10 +57,9 @@ class LossWeights:
 
 @runtime_checkable
 class Evaluator(Protocol):
-    """Evaluates a network."""
+    """Evaluates the n head of a network."""
 
-    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the n head."""
+    def value(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]: ...
 
     def value_and_gradient(
         self, p: Float[Tensor, "n 3"], heads: bool

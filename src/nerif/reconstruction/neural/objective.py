@@ -146,15 +146,7 @@ class Piece:
 
 
 class Objective:
-    """The loss of a network on data.
-
-    Parameters
-    ----------
-    field : with the network in full precision
-    network : its network in the precision of the training
-    generator : of the samples
-    ranks : processes that share a batch
-    """
+    """The loss of a field on data; `network` evaluates its network in the precision of the run."""
 
     def __init__(
         self, settings: TrainingSettings, data: TrainingData, field: NeuralField, network: MixedPrecision,
@@ -240,8 +232,10 @@ class Objective:
 
     def ambient_values(self, count: int, generator: torch.Generator) -> Tensor | None:
         """Return the network in full precision at points that are ambient; None if there are none."""
-        points = self.data.ambient_points(count, generator)
-        return None if points is None else self.field.network(self.field.normalise(points))
+        if self.data.ambient is None:
+            return None
+        points = sent(self.data.ambient.sample(count, generator), self.data.device)
+        return self.field.network(self.field.normalise(points))
 
     @torch.no_grad()
     def withheld_residual(self) -> float:
@@ -266,10 +260,6 @@ class Objective:
         return total / withheld.numbers * withheld.chi_square
 
     # -- between steps ------------------------------------------------------------------------------------------
-
-    def update_density(self) -> None:
-        """Take the density of samples from the present field."""
-        self.density.update(self.network)
 
     @torch.no_grad()
     def fit_nuisance(self) -> None:

@@ -106,14 +106,7 @@ def adam_step(
 
 
 class NetworkOptimiser:
-    """Updates the weights of a network.
-
-    Parameters
-    ----------
-    kind : one of OPTIMISERS
-    betas, momentum : Adam's decay rates, Muon's momentum
-    by_shape : whether Adam's rates depend on the shape of the network; else all weights have the same
-    """
+    """Updates the weights of a network by one of OPTIMISERS; with `by_shape` Adam's rates depend on its shape."""
 
     def __init__(
         self, kind: str, network: Network, betas: tuple[float, float], momentum: float, by_shape: bool = True

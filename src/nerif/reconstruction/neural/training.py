@@ -51,11 +51,7 @@ SCALARS |= {"drawn": "ray_count"}
 class Training:
     """One run: data, network, optimiser and loop.
 
-    Parameters
-    ----------
-    data : on its device
-    resume : state of an earlier run to continue
-    start : field to fit the network to before the first step; ignored when resuming
+    It continues from the state of an earlier run (`resume`), or begins with a fit of the network to a field (`start`).
     """
 
     def __init__(
@@ -174,7 +170,7 @@ class Training:
                 self.field, self.network, self.start, settings.fit_steps, settings.points_per_batch,
                 settings.learning_rate, self.generator, report,
             )  # fmt: skip
-        self.objective.update_density()
+        self.objective.density.update(self.network)
         self.rate_factor, self.good_state = settings.rate_after_fit, self.state_dict()
         return outcome
 
@@ -193,7 +189,7 @@ class Training:
         budget.count(rays)
         self.ray_count += rays
         if self.settings.sampling == "adaptive" and budget.step and budget.step % DENSITY_EVERY == 0:
-            objective.update_density()
+            objective.density.update(self.network)
         return objective.batch(index, draw)
 
     def _learning_rate(self) -> float:

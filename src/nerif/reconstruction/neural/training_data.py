@@ -14,11 +14,10 @@ from contextlib import suppress
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement
 from nerif.fields.network import Network, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
@@ -88,6 +87,7 @@ class TrainingData:
     ----------
     fingerprint : digest of each part of the data
     gauge_free : whether the data leave a constant of the field undetermined
+    ambient : region in which the field is ambient, or None
     bounds : lowest and highest value of the field
     shape, samples : of the network; per ray at the start and at the end of a run
     lens_rays : rays per pixel at the end of a run; 1 without a lens
@@ -176,10 +176,6 @@ class TrainingData:
         if self.refinement is None or self.names != self.refinement.names:
             return []
         return random_pixels(self.target, len(self.names), seed)
-
-    def ambient_points(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"] | None:
-        """Draw about `count` points at which the field is ambient, mm; None if no such region is known."""
-        return None if self.ambient is None else sent(self.ambient.sample(count, generator), self.device)
 
     def initial_field(self) -> NeuralField:
         """Return a field within the bounds, with random weights from torch's global generator."""

@@ -59,15 +59,12 @@ def fit_network(
     field: NeuralField, network: Evaluator, start: Field, steps: int, points_per_batch: int, learning_rate: float,
     generator: torch.Generator, on_step: Callable[[int, float], bool] | None = None,
 ) -> None:  # fmt: skip
-    """Fit the network of a field to another field, values and gradients, by Adam.
+    """Fit the network of a field to the values and gradients of another field by Adam.
 
     Parameters
     ----------
-    field : owner of the network, in its own scale
     network : evaluates that network in the precision of the run
-    start : field to fit to, on any device
-    steps, points_per_batch, learning_rate : of the fit; the rate falls to a tenth by a cosine
-    generator : of the points
+    learning_rate : at the start; it falls to a tenth by a cosine
     on_step : called with step and loss; True ends the fit
     """
     weights = list(field.network.parameters())

@@ -80,7 +80,7 @@ def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) 
     """
     if not table:
         return measurement
-    check_table(table)
+    _check_table(table)
     rows = {row["name"]: row for row in table}
     estimates = [rows.get(name, {}).get("values", {}) for name in measurement.names]
     values = torch.tensor([[row.get(name, 0.0) for name in NAMES] for row in estimates], dtype=torch.float64)
@@ -106,8 +106,7 @@ def _with_sigma(camera: Camera, sigma: dict[str, float]) -> Camera:
     return replace(camera, pose_sigma=torch.tensor([sigma[name] for name in NAMES[:6]], dtype=torch.float64))
 
 
-def check_table(table: Any) -> None:
-    """Refuse what is no table of refined parameters."""
+def _check_table(table: Any) -> None:
     for row in table if isinstance(table, Sequence) else [None]:
         row = row if isinstance(row, dict) else {}
         values = row.get("values")
