@@ -39,7 +39,7 @@ WITHHELD_SAMPLES, WITHHELD_BATCH = 64, 128  # samples of a thin ray, pixels; wit
 NUISANCE_SAMPLES = 24  # per ray
 RIG_SAMPLES, RIG_LENS_RAYS, RIG_BATCH = 16, 4, 512  # samples of a thin ray, rays through a lens, pixels
 RIG_FROM, RIG_EVERY, RIG_UNTIL, RIG_SLOW_FROM = 0.1, 0.04, 0.94, 0.75  # shares of the run
-EARLY, SIGN_UNTIL, EARLY_FACTOR = 0.26, 0.5, 1.7  # shares of the run; a sign of a pose error before EARLY is this clear
+SIGN_UNTIL, EARLY, EARLY_FACTOR = 0.5, 0.26, 1.7  # a pose error must show by then; early ones by this factor clearer
 MIN_LENS_SAMPLES = 4  # per ray through a lens
 FULL_RAYS = 5  # rays through a lens, beyond two, that need as many samples as a thin ray (docs/decisions/025)
 
