@@ -55,7 +55,7 @@ def row(path: Path, settings: NeRIF, fewest: int | None, threads: int) -> list[s
     """Reconstruct one measurement, and return its row."""
     torch.set_num_threads(threads)
     keep_freed_memory()
-    bins.FEWEST = fewest or bins.FEWEST
+    bins.MIN_BINS = fewest or bins.MIN_BINS
     measurement = Measurement.read(path)
     begun = time.perf_counter()
     result = settings(measurement)

@@ -27,7 +27,7 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.warm_start import fit_network
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.pipeline import write_report

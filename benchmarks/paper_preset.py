@@ -25,7 +25,7 @@ from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.reconstruction.neural import schedule as budget
-from nerif.reconstruction.neural.losses import DATA
+from nerif.reconstruction.neural.losses import DATA_TERMS
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import preset
 from nerif.simulation.simulate import simulate
@@ -72,7 +72,7 @@ def run(method: NeRIF, measurement: Measurement, phantom: str) -> Score:
 def ends(result: Reconstruction) -> tuple[dict[str, float], dict[str, float]]:
     """Return the terms of the loss at the first step, and their means over the last records of the history."""
     records = [r for r in result.history if "loss" in r]
-    names = [n for n in (*TERMS, *DATA, "loss") if n in records[0]]
+    names = [n for n in (*TERMS, *DATA_TERMS, "loss") if n in records[0]]
     return {n: records[0][n] for n in names}, {n: fmean(r[n] for r in records[-LAST:]) for n in names}
 
 

@@ -30,8 +30,7 @@ from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera
-from nerif.reconstruction.rig.refinement import Refinement
-from nerif.reconstruction.rig.refit import refit
+from nerif.reconstruction.rig.refinement import Refinement, refit
 
 RIGS = ("pose_small", "pose_large")
 PIXELS, ROUNDS = 3000, 10  # of a view, and steps, to fit cameras to the truth
@@ -42,13 +41,13 @@ def fitted(measurement: Measurement, truth: Volume) -> tuple[Camera, ...]:
     settings: dict[str, Any] = {"refine": ("cameras",), "open_faces": ()}
     settings |= {"pose_sigma_mm": None, "pose_sigma_deg": None, "shift_sigma_px": 0.05}
     field = VoxelField.through(truth.values.double(), truth.grid)
-    table = refit(field, measurement, settings, steps=ROUNDS, each=PIXELS)
+    table = refit(field, measurement, settings, steps=ROUNDS, per_view=PIXELS)
     return Refinement.of_table(measurement, settings, table, gauged=False).corrected
 
 
 def untold(measurement: Measurement, true: tuple[Camera, ...]) -> Tensor:
     """Return b, the shift of everything that the priors leave, mm."""
-    rig = Refinement.asked(measurement, ("cameras",))
+    rig = Refinement.for_measurement(measurement, ("cameras",))
     middle = torch.tensor([measurement.box.centre], dtype=torch.float64)
     curvature, pull = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     for v, (stated, camera) in enumerate(zip(measurement.cameras, true, strict=True)):

@@ -65,7 +65,7 @@ def run(path: Path, method: str, way: Way, seconds: float, seed: int) -> dict[st
     from nerif.reconstruction.aperture import seen_through
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
-    from nerif.reconstruction.rig.refined import with_corrections
+    from nerif.reconstruction.rig.parameters import with_corrections
     from nerif.reconstruction.sources import of_source
     from nerif.reconstruction.voxels.total_variation import TotalVariation
 

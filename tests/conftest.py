@@ -23,8 +23,8 @@ from jaxtyping import install_import_hook
 
 CHECKED = ("common.conventions", "geometry", "fields", "data", "physics", "imaging", "simulation", "analysis", "report")
 CHECKED += ("forward.path_integral", "forward.ray_tracing", "workflow.sequence")
-# what Numba compiles stays as it is written; schedule and watch hold no array, and are asked many times a step
-UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "schedule", "watch")
+# what Numba compiles stays as it is written; schedule holds no array, and is asked many times a step
+UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "schedule")
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 SOLVERS = [p for p in (SOURCE / "reconstruction").rglob("[!_]*.py") if p.stem not in UNCHECKED]
 CHECKED += tuple(".".join(p.relative_to(SOURCE).with_suffix("").parts) for p in SOLVERS)

@@ -265,7 +265,7 @@ def test_a_run_tells_where_images_take_over_and_its_pace_goes_on(balls, taken):
     settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
     Training(settings, TrainingData(settings, both)).run(steps.append)
     assert [(s.step, s.note) for s in steps if s.note] == [
-        (5, "the loss is of images from here on, of displacements before: it jumps")
+        (5, "the loss changes from displacements to images and jumps")
     ]
     assert all(s.rays_per_second > 0 for s in steps)
 
@@ -324,7 +324,7 @@ def test_without_a_limit_a_run_is_judged_by_pixels_withheld(taken):
     settings = replace(NETWORK, max_steps=0, first_cycle=120)
     result = settings(taken, lambda step: step.step > 121)
     held = [row["withheld_residual"] for row in result.history if "withheld_residual" in row]
-    judges = TrainingData(settings, taken, judged=True).withheld
+    judges = TrainingData(settings, taken, withhold=True).withheld
     assert judges is not None
     assert len(judges) > 200
     assert held[-1] < 0.5 * math.sqrt(judges.chi_square)  # of what is left of them without a field

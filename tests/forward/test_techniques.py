@@ -351,8 +351,8 @@ def test_a_run_that_began_from_another_scale_goes_on_as_if_it_had_not_stopped(me
         replace(settings, upper=0.4)(m, resume=half.state)
     training = Training(settings, TrainingData(settings, m), None, start)
     bounds = training.field.bounds
-    training._fit(None)
-    training._restore(training.first)
+    training._begin(None)
+    training.load_state_dict(training.first_state)
     assert training.field.bounds == bounds
 
 

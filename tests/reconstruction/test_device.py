@@ -15,7 +15,7 @@ from nerif.reconstruction.device import (
     peak_memory,
     resolve_device,
 )
-from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from refusals import refused
 

@@ -30,7 +30,7 @@ from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box
 from nerif.plotting.notebook import number
 from nerif.reconstruction.aperture import seen_through
-from nerif.reconstruction.rig.refined import with_corrections
+from nerif.reconstruction.rig.parameters import with_corrections
 from nerif.results.directory import METRICS, VOLUME, ResultDirectory
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow

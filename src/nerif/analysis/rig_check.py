@@ -13,8 +13,8 @@ from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.rig.parameters import MOVED, moved_lines
 from nerif.reconstruction.rig.posterior import with_posterior
-from nerif.reconstruction.rig.refined import MOVED, moved_lines
 from nerif.reconstruction.sources import of_source
 
 __all__ = ["RigCheck", "check_rig"]

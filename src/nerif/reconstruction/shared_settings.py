@@ -9,7 +9,7 @@ from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
 from nerif.reconstruction.aperture import check_aperture
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
-from nerif.reconstruction.rig.numbers import check_refined
+from nerif.reconstruction.rig.parameters import check_refined
 
 __all__ = ["SharedSettings"]
 

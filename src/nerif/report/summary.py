@@ -17,7 +17,7 @@ from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.plotting.drawing import LABELS, drawn_of, shown
 from nerif.plotting.notebook import number, percent, span
 from nerif.reconstruction.files import FIELD
-from nerif.reconstruction.rig.refined import moved_lines
+from nerif.reconstruction.rig.parameters import moved_lines
 from nerif.report.packing import relation
 from nerif.results.directory import METRICS, VOLUME, Result
 

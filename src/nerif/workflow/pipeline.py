@@ -29,11 +29,11 @@ from nerif.reconstruction.device import Cores
 from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.slow_run import SlowRun
+from nerif.reconstruction.neural.schedule import SlowRun
 from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.rig.parameters import moved_lines, with_corrections
 from nerif.reconstruction.rig.posterior import with_posterior
-from nerif.reconstruction.rig.refined import moved_lines, with_corrections
-from nerif.reconstruction.rig.refit import refit
+from nerif.reconstruction.rig.refinement import refit
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis

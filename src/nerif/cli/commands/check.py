@@ -68,12 +68,12 @@ def _rig(settings: Check) -> RigCheck:
     sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg)
     measurement = Measurement.read(settings.measurement)
     found = check_rig(measurement, settings.refine, settings.time_limit, *sigma, MONITOR, settings.aperture)
-    heads = ("moved [sigma]", "aside [px]", "+- [px]", "told", "residual [sigma]")
+    heads = ("moved [sigma]", "aside [px]", "+- [px]", "constrained", "residual [sigma]")
     say(f"{'view':<14}" + "".join(f"{head:>18}" for head in heads))
     for row in found.table:
         left = f"{row['rms_before']:.2f} -> {row['rms_after']:.2f}" if "rms_after" in row else "unknown"
         aside = (f"{row['aside_px']:.3f}", f"{row['aside_sigma_px']:.3f}")
-        figures = (f"{row['moved']:.1f}", *aside, f"{row['told']:.0%}", left)
+        figures = (f"{row['moved']:.1f}", *aside, f"{row['constrained']:.0%}", left)
         say(f"{row['name']:<14}" + "".join(f"{figure:>18}" for figure in figures))
     for remark in found.remarks:
         say(f"note: {remark}")

@@ -1,4 +1,4 @@
-"""NeRIF: a coordinate network trained until what it predicts is what was measured (paper, Alg. 1)."""
+"""NeRIF: a coordinate network trained to predict the measurement (paper, Alg. 1)."""
 
 from __future__ import annotations
 
@@ -25,4 +25,4 @@ class NeRIF(TrainingSettings):
         resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:
-        return Training(self, TrainingData(self, measurement, judged=not self.limited), resume, start).run(on_step)
+        return Training(self, TrainingData(self, measurement, withhold=not self.limited), resume, start).run(on_step)

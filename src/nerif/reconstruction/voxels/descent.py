@@ -31,9 +31,8 @@ from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
 from nerif.reconstruction.files import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import ambient_faces, check_gauge
-from nerif.reconstruction.neural.some_pixels import some_pixels
-from nerif.reconstruction.rig.refined import kept_of, take_up
-from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, drawn
+from nerif.reconstruction.neural.bins import pixel_subset
+from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target
@@ -109,7 +108,7 @@ class Descent:
         self.rig = None
         if settings.refine:
             sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg, settings.shift_sigma_px)
-            self.rig = Refinement.asked(measurement, settings.refine, *sigma)
+            self.rig = Refinement.for_measurement(measurement, settings.refine, *sigma)
         # a weight is sought on the last grid but one and mended on the last; where there is no other, sought at the end
         self.choosing = [first - 1, first if first and start is None else len(self.levels) - 1]
         self.weight = settings.weight
@@ -182,7 +181,7 @@ class Descent:
             return operator.for_rays(rays, part.model)(found.x * self.scale)
 
         momentum = MOMENTUM if self.round < ROUNDS - CALM else 0.0
-        parts = drawn(self.last, len(self.measurement.names), self.round)
+        parts = random_pixels(self.last, len(self.measurement.names), self.round)
         rig.step(parts, predict, self.last.sigma_known, momentum)
         self.round, self.done = self.round + 1, 0
 
@@ -214,7 +213,7 @@ class Descent:
     @cached_property
     def judges(self) -> Target:
         """The pixels that judge what bins leave."""
-        return replace(self._target(1, some_pixels(self.measurement, JUDGES)), scale=self.scale)
+        return replace(self._target(1, pixel_subset(self.measurement, JUDGES)), scale=self.scale)
 
     def _problems(self, level: Level) -> tuple[Problem, Problem | None]:
         """The problem of a level and, where it has bins, that of the pixels that judge what they leave."""
@@ -315,7 +314,7 @@ class Descent:
         scalars: dict[str, Any] = {name: getattr(self, name) for name in KEPT}
         scalars |= {"method": type(self.settings).__name__, "seconds": self.seconds, "history": list(self.history)}
         scalars["fingerprint"] = self.fingerprint
-        return State({"x": self.x.detach().clone(), **kept_of(self.rig)}, scalars)
+        return State({"x": self.x.detach().clone(), **rig_state(self.rig)}, scalars)
 
     def _restore(self, state: State) -> None:
         scalars, shapes = dict(state.scalars), [level.grid.shape for level in self.levels]
@@ -328,7 +327,7 @@ class Descent:
         ):
             raise InputError("the checkpoint is of another method or grid; give the same settings", field="resume")
         self.x = state.tensors["x"].clone()
-        take_up(self.rig, state.tensors)
+        load_rig(self.rig, state.tensors)
         self.spent, self.started = scalars.pop("seconds"), time.perf_counter()
         self.history = list(scalars.pop("history"))
         for name, value in scalars.items():
