@@ -14,6 +14,7 @@ from nerif.cli.commands.output import MONITOR, check_file, counting_bar, say
 from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
+from nerif.reconstruction.shared_settings import Aperture
 
 __all__ = ["Check", "main", "run"]
 
@@ -32,7 +33,7 @@ class Check(Settings):
     """Measurement file."""
     voxels: int = 24
     """Of the quick reconstructions, along the longest edge of the box."""
-    aperture: str = "auto"
+    aperture: Aperture = "auto"
     """Views see through the whole of their lens where its aperture is known (auto, or on to insist), or by thin rays
     (off)."""
     refine: tuple[str, ...] = ()
