@@ -205,7 +205,7 @@ def test_images_that_were_not_rendered_are_not_rendered_over(tmp_path):
 
 def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
-    from nerif.data.measurement_sequence import MEASURED, check_store
+    from nerif.data.measurement_sequence import MEASUREMENTS, check_store
     from nerif.data.volume_sequence import FIELDS
 
     def store(name: str, attributes: dict, *arrays: str) -> Path:
@@ -215,10 +215,10 @@ def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
 
     fields, measured = store("f.zarr", {"box_lower_mm": [0]}, "density"), store("m.zarr", {}, "written", "displacement")
     check_store(fields, FIELDS)
-    check_store(measured, MEASURED)
+    check_store(measured, MEASUREMENTS)
     check_store(tmp_path / "none.zarr", FIELDS)
     folder, file = put(tmp_path / "photos.zarr" / "a.jpg").parent, put(tmp_path / "file.zarr")
-    for path, kind in ((measured, FIELDS), (fields, MEASURED), (folder, FIELDS), (file, MEASURED)):
+    for path, kind in ((measured, FIELDS), (fields, MEASUREMENTS), (folder, FIELDS), (file, MEASUREMENTS)):
         with pytest.raises(InputError, match="exists already, is not"):
             check_store(path, kind)
     put(fields / "notes.txt")

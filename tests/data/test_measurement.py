@@ -241,7 +241,7 @@ def test_truncated_file_is_refused_in_silence(full, tmp_path, capfd):
 @pytest.mark.parametrize("distortion", [0.0, -0.1])
 def test_rows_and_corners_without_a_wanted_pixel_are_passed_over(measurement, monkeypatch, distortion):
     """Pixels are traced in blocks of rows; one that is masked, or beyond a smaller image, has none."""
-    monkeypatch.setattr("nerif.data.measurement.CHUNK", 3 * measurement.displacement.shape[2])
+    monkeypatch.setattr("nerif.data.measurement.PIXELS_AT_A_TIME", 3 * measurement.displacement.shape[2])
     cameras = [replace(c, distortion=torch.tensor([distortion, 0, 0, 0, 0]).double()) for c in measurement.cameras]
     height, width = cameras[1].image_size
     cameras[1] = cameras[1].view(0, 0, height - 12, width)
