@@ -222,7 +222,7 @@ def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
         with pytest.raises(InputError, match="exists already, is not"):
             check_store(path, kind)
     put(fields / "notes.txt")
-    with pytest.raises(InputError, match=r"since notes\.txt in it is no part of the store"):
+    with pytest.raises(InputError, match=r"since notes\.txt in it is not part of the store"):
         check_store(fields, FIELDS)
 
 

@@ -174,7 +174,7 @@ def test_a_run_that_was_killed(copy, capsys):
     assert "The run has not ended" in page
     assert "--resume" in page
     assert "Not there yet: metrics.json, history.csv, volume.nc, reprojection.nc." in page
-    assert "4, of which 1 held out, of 22 × 18 px" in page  # the measurement is still where it was
+    assert "4 (1 withheld), 22 × 18 px" in page  # the measurement is still where it was
     assert main(["figures", str(copy)]) == 2
     assert "nothing to draw" in capsys.readouterr().err
 

@@ -60,8 +60,8 @@ def variables() -> dict[str, tuple[tuple[str, ...], str]]:
     """Return dimensions and unit of every variable that a file may have."""
     maps: dict[str, tuple[tuple[str, ...], str]] = {}
     for kind in TECHNIQUES.values():
-        own = (len(kind.channels), kind.unit)
-        for name, (channels, unit) in {kind.measured: own, kind.sigma: own, **kind.beside}.items():
+        format_of = (len(kind.channels), kind.unit)
+        for name, (channels, unit) in {kind.measured: format_of, kind.sigma: format_of, **kind.beside}.items():
             maps[name] = (PIXELS if channels == 1 else (*PIXELS, _component(channels)), unit)
     return {**maps, **RIG}
 
@@ -162,8 +162,8 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
     faces = dataset.attrs.get("ambient_faces", " ".join(DEFAULT_AMBIENT_FACES))
     if not isinstance(faces, str):
         raise InputError(f"expected a text such as 'x- x+ y- y+', got {faces!r}", field="attribute ambient_faces")
-    own = ("displacement", "sigma", *MASKS)
-    maps = {name: _map(dataset, name) for name in map_names() if name in dataset and name not in own}
+    arguments = ("displacement", "sigma", *MASKS)
+    maps = {name: _map(dataset, name) for name in map_names() if name in dataset and name not in arguments}
     for kind in TECHNIQUES.values():
         if kind.measured in maps:
             maps = kind.completed(maps, dataset.attrs)
@@ -173,7 +173,7 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
         "cameras": _cameras(dataset),
         "box": Box(tuple(lower), tuple(upper)),
         "displacement": None,
-        **{name: _map(dataset, name) for name in own if name in dataset},
+        **{name: _map(dataset, name) for name in arguments if name in dataset},
         "maps": maps,
         "n_ambient": _number(dataset, "n_ambient", "the ambient index, e.g. 1.00027", None if index else 1.0),
         "wavelength_nm": _number(dataset, "wavelength_nm", "nm") if "wavelength_nm" in dataset.attrs else None,

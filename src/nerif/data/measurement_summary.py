@@ -33,11 +33,9 @@ def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]
 
 def _lenses(measurement: Measurement) -> list[tuple[str, str]]:
     diameters = sorted({c.lens.diameter for c in measurement.cameras if c.lens is not None} - {0.0})
-    return (
-        [("Aperture", " to ".join(f"{d:.3g}" for d in diameters[:: max(len(diameters) - 1, 1)]) + " mm")]
-        if diameters
-        else []
-    )
+    if not diameters:
+        return []
+    return [("Aperture", " to ".join(f"{d:.3g}" for d in diameters[:: max(len(diameters) - 1, 1)]) + " mm")]
 
 
 def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str, str]]:

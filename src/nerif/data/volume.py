@@ -96,12 +96,12 @@ class Volume:
         """Return the index excess n - n_ambient of a volume of n, or of the excess over its own ambient index."""
         if self.quantity not in ("index_excess", "n"):
             raise InputError(f"expected index_excess or n, got '{self.quantity}'")
-        own = 0.0 if self.quantity == "n" else self.n_ambient
-        if own is None:
+        ambient = 0.0 if self.quantity == "n" else self.n_ambient
+        if ambient is None:
             raise InputError("expected the attribute n_ambient beside index_excess, got none; add it, or give n")
-        if own == n_ambient:
+        if ambient == n_ambient:
             return self
-        values = (self.values.double() + (own - n_ambient)).float()
+        values = (self.values.double() + (ambient - n_ambient)).float()
         attributes = {**self.attributes, "n_ambient": n_ambient}
         return replace(self, values=values, quantity="index_excess", attributes=attributes)
 

@@ -127,8 +127,8 @@ def _read(path: Path) -> Content:
 
 
 def _volume(quantity: str, values: Tensor, grid: Grid, attributes: Mapping[str, float | str]) -> Volume:
-    own = f"{quantity}."
-    notes = {k.removeprefix(own): v for k, v in attributes.items() if k.startswith(own) and k != f"{own}units"}
+    prefix = f"{quantity}."
+    notes = {k.removeprefix(prefix): v for k, v in attributes.items() if k.startswith(prefix) and k != f"{prefix}units"}
     shared = {k: v for k, v in attributes.items() if "." not in k}
     values = values.double() if quantity == "n" else values.float()
     return Volume(values, grid, quantity, describe(quantity)[0], shared, notes)

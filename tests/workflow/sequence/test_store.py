@@ -82,7 +82,7 @@ def test_a_frame_killed_at_any_of_its_arrays_is_not_written(short, tmp_path, mon
             store.write_frame(1, frame)
         monkeypatch.setattr(zarr.Array, "__setitem__", write)
         assert not store.is_written(1)
-        with pytest.raises(InputError, match="frame 1: nothing was measured then, or not to its end"):
+        with pytest.raises(InputError, match="frame 1: no data, or not written completely"):
             store.frame(1)
         store.write_frame(1, frame)
         assert same(store.frame(1), frame)
