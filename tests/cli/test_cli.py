@@ -20,7 +20,7 @@ import xarray as xr
 
 from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.prediction import reproject
-from nerif.cli.cli import VERBS, main
+from nerif.cli.cli import COMMANDS, main
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.forward.deflection import MODELS
@@ -459,7 +459,7 @@ def test_flags_win_over_the_file(work, tmp_path):
     assert m.displacement.shape == (2, 9, 11, 2)
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", COMMANDS)
 def test_every_verb_takes_a_settings_file(tmp_path, capsys, verb):
     file = tmp_path / "s.toml"
     file.write_text("nothing_of_the_kind = 1\n")
@@ -470,8 +470,8 @@ def test_every_verb_takes_a_settings_file(tmp_path, capsys, verb):
 def test_help_is_quick_and_whole(capsys):
     assert main(["--help"]) == 0
     said = capsys.readouterr().out
-    assert all(verb in said for verb in VERBS)
-    for verb in VERBS:
+    assert all(verb in said for verb in COMMANDS)
+    for verb in COMMANDS:
         assert main([verb, "--help"]) == 0
         assert "TOML file of settings" in " ".join(capsys.readouterr().out.split())
     code = "import sys; from nerif.cli.cli import main; main(['--help']); print('torch' in sys.modules)"
