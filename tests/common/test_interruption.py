@@ -64,10 +64,10 @@ def test_files_that_are_whole_are_named(tmp_path, monkeypatch, capsys):
 
 STAGES = {
     "before the first step": ("_cross_validation", "nothing was saved yet"),
-    "sampling": ("all_quantities", "holds the field, not yet all that is written of it"),
-    "re-projecting": ("reproject", "holds the field, not yet all that is written of it"),
-    "scoring": ("evaluate_views", "holds the field, not yet all that is written of it"),
-    "verdict": ("verdict", "holds the field, not yet all that is written of it"),
+    "sampling": ("all_quantities", "holds the field, but not all other files"),
+    "re-projecting": ("reproject", "holds the field, but not all other files"),
+    "scoring": ("evaluate_views", "holds the field, but not all other files"),
+    "verdict": ("verdict", "holds the field, but not all other files"),
 }
 
 
@@ -101,7 +101,7 @@ def test_a_second_ctrl_c_in_the_training_leads_to_the_checkpoint(measurement, tm
             raise KeyboardInterrupt
 
     run = Run(withhold=("none",), report=False, checkpoint_every=0.0)
-    with pytest.raises(Interrupted, match="holds the last checkpoint; nerif reconstruct --resume"):
+    with pytest.raises(Interrupted, match="holds the last checkpoint; continue with nerif reconstruct --resume"):
         reconstruct_into(tmp_path / "r", measurement, QUICK, run, on_step=stop)
 
 

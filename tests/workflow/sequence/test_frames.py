@@ -34,7 +34,7 @@ def begun(measurement: Path, out: Path, **changes: object) -> SequencePlan:
     plan = SequencePlan(measurement, out, COLD, replace(settings, **changes))
     sequence = MeasurementSequence.read(measurement)
     grid = Grid.of_resolution(sequence.fullest().box, 10)
-    SequenceStore.begin(out, sequence, grid, plan.settings.quantities, COLD.network, plan.kept)
+    SequenceStore.begin(out, sequence, grid, plan.settings.quantities, COLD.network, plan.attributes)
     return plan
 
 

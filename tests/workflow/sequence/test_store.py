@@ -209,7 +209,7 @@ def test_a_store_of_another_technique_says_what_it_holds(tmp_path):
     like = sequence.fullest()
     plan = SequencePlan(film, tmp_path / "r.zarr", COLD, SequenceSettings(voxels=8).for_measurement(like))
     grid = Grid.of_resolution(like.box, 8)
-    kept = {"bounds": [0.0, None], **plan.kept}
+    kept = {"bounds": [0.0, None], **plan.attributes}
     store = SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, COLD.network, kept)
     field = NeuralField(Network(COLD.network, bounds=(0.0, math.inf)), like.box, 0.02)
     for i in range(2):
@@ -245,7 +245,7 @@ def test_views_of_a_combined_film_are_scored_by_every_technique(tmp_path):
     sequence.write_frame(0, like)
     plan = SequencePlan(sequence.path, tmp_path / "r.zarr", COLD, SequenceSettings(voxels=8).for_measurement(like))
     grid = Grid.of_resolution(like.box, 8)
-    store = SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, COLD.network, plan.kept)
+    store = SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, COLD.network, plan.attributes)
     field = NeuralField(Network(COLD.network), like.box, 1e-5)
     store.write_frame(0, finished_frame(plan, field, sequence.frame(0), "cpu"))
     for names, unknown in ((("cc", "rms_px"), 0), (("cc_fringes", "rms_fringes"), 1)):

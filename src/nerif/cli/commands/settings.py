@@ -181,7 +181,7 @@ def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
 
 def _one_line(box: str, prog: str) -> str:
     """Reduce the error box of tyro to its first sentence and the nearest option."""
-    lines = [re.sub(r"[│╭╮╰╯─]+", " ", re.sub(r"\x1b\[[0-9;]*m", "", line)).strip() for line in box.splitlines()]
+    lines = [re.sub(r"[│╭╮╰╯─]+|[-|+]{5,}", " ", re.sub(r"\x1b\[[0-9;]*m", "", line)).strip() for line in box.splitlines()]
     text = " ".join([line for line in lines if line][1:])
     text = re.split(r"\s*(?:For full helptext|Argument helptext)", text)[0]
     text = re.sub(r"\s+", " ", text)
