@@ -83,9 +83,7 @@ def test_field_and_volumes_are_written_before_the_reprojection(measurement, tmp_
 def test_corners_beyond_the_distortion_are_left_out_and_reported(measurement, tmp_path):
     camera = measurement.cameras[0]
     corner = float((torch.tensor(camera.image_size) / 2 / camera.intrinsics.diagonal()[:2]).norm())
-    folding = torch.tensor(
-        [-1 / (3 * (1.35 * corner) ** 2), 0, 0, 0, 0], dtype=torch.float64
-    )
+    folding = torch.tensor([-1 / (3 * (1.35 * corner) ** 2), 0, 0, 0, 0], dtype=torch.float64)
     distorted = replace(camera, distortion=folding)
     whole = replace(measurement, cameras=(distorted, *measurement.cameras[1:]))
     assert 0 < distorted.unseen < 0.1

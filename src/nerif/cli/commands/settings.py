@@ -181,9 +181,11 @@ def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
 
 def _one_line(box: str, prog: str) -> str:
     """Reduce the error box of tyro to its first sentence and the nearest option."""
-    lines = [re.sub(r"[│╭╮╰╯─]+|[-|+]{5,}", " ", re.sub(r"\x1b\[[0-9;]*m", "", line)).strip() for line in box.splitlines()]
+    plain = re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]+|[-|+]{5,}", " ", box)
+    lines = [line.strip() for line in plain.splitlines()]
     text = " ".join([line for line in lines if line][1:])
-    text = re.split(r"\s*(?:For full helptext|Argument helptext)", text)[0]
+    text = re.split(r"\s*(?:For full helptext|Argument helptext)", text)[0].rstrip(". ")
+    text = re.sub(r"^Error parsing [A-Z]\w*: ", "", text)
     text = re.sub(r"\s+", " ", text)
     text = re.sub(r" Perhaps you meant: (--[\w.-]+|-\w, --[\w.-]+).*", r"; did you mean \1?", text)
     return f"{text}; see {prog} --help"
