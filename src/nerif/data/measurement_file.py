@@ -101,7 +101,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     def stack(values: list[Tensor]) -> np.ndarray:
         return torch.stack(values).numpy()
 
-    cameras, known = measurement.cameras, variables()
+    cameras, formats = measurement.cameras, variables()
     data: dict[str, np.ndarray] = {
         "intrinsics": stack([c.intrinsics for c in cameras]),
         "distortion": stack([c.distortion for c in cameras]),
@@ -127,7 +127,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     for name, value in {**measurement.all_maps, **{name: getattr(measurement, name) for name in MASKS}}.items():
         if value is not None:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
-    dataset = xr.Dataset({k: (known[k][0], v, {"units": known[k][1]}) for k, v in data.items()})
+    dataset = xr.Dataset({k: (formats[k][0], v, {"units": formats[k][1]}) for k, v in data.items()})
     scales = {c.projection.unit for c in cameras}
     if len(scales) == 1:
         dataset["intrinsics"].attrs["units"] = _spelling(scales.pop())

@@ -63,7 +63,7 @@ def status_of(out: Path) -> np.ndarray:
 
 
 def wait(out: Path, frames: int, process: subprocess.Popen, seconds: float = 120) -> None:
-    """Wait until so many frames are settled."""
+    """Wait until that number of frames is complete or failed."""
     end = time.monotonic() + seconds
     while (status_of(out) != MISSING).sum() < frames:
         assert process.poll() is None, "the command ended before it was to be killed"
@@ -218,18 +218,20 @@ def test_ctrl_c_keeps_complete_frames_and_tells_how_to_continue(film, tmp_path):
 def test_memory_of_the_command_and_of_each_worker_stays_flat_over_500_frames(tmp_path, capsys):
     film, out = simulated(tmp_path / "long.zarr", 500), tmp_path / "out.zarr"
     process = subprocess.Popen(command(film, out, "--chunk", "25"), stdout=subprocess.DEVNULL)
-    seen: dict[int, list[tuple[int, int]]] = {}
+    memory: dict[int, list[tuple[int, int]]] = {}  # (frames, bytes) by process
     while process.poll() is None:
         with suppress(psutil.NoSuchProcess):
-            done = int((status_of(out) != MISSING).sum())
+            frames = int((status_of(out) != MISSING).sum())
             for each in (psutil.Process(process.pid), *workers_of(process)):
-                seen.setdefault(each.pid, []).append((done, each.memory_info().rss))
+                memory.setdefault(each.pid, []).append((frames, each.memory_info().rss))
         time.sleep(0.1)
     assert process.returncode == 0
     assert (status_of(out) == DONE).all()
-    assert len(seen) == 3
-    for pid, looks in seen.items():
-        early, late = (np.median([rss for done, rss in looks if low <= done < low + 100]) / 2**20 for low in (100, 400))
+    assert len(memory) == 3
+    for pid, samples in memory.items():
+        early, late = (
+            np.median([rss for frames, rss in samples if low <= frames < low + 100]) / 2**20 for low in (100, 400)
+        )
         name = "command" if pid == process.pid else "worker"
         with capsys.disabled():
             print(f"\n{name}: {early:.1f} MiB at frames 100 to 200, {late:.1f} MiB at frames 400 to 500", end="")

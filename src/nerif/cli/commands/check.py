@@ -66,7 +66,7 @@ def run(settings: Check) -> Consistency | RigCheck:
     for finding in result.findings:
         say(f"FOUND: {finding}")
     if isinstance(result, RigCheck) and not result.findings:
-        say("No significant pose error")
+        say("All pose errors are within their uncertainty")
     elif isinstance(result, Consistency) and result.views and not result.findings:
         say("No problems found")
     if settings.out is not None and isinstance(result, Consistency):

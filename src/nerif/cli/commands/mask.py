@@ -29,8 +29,8 @@ class Mask(Settings):
     """Measurement file."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Measurement to write, NAME.nc, with a figure NAME.masks.png."""
-    drawn: Path | None = None
-    """Folder with an image VIEW.png per view (white: flow); views without one use the threshold."""
+    drawings: Path | None = None
+    """Folder (also --drawn) with an image VIEW.png per view (white: flow); views without one use the threshold."""
     sigma: float | None = None
     """Noise of a measurement without sigma, in the unit of its values (px for displacements)."""
     remove: bool = False
@@ -50,7 +50,7 @@ def run(settings: Mask) -> Measurement:
         measurement.write(settings.out)
         say(f"{settings.out}: without flow masks")
         return measurement
-    drawings = {} if settings.drawn is None else drawn_masks(settings.drawn, measurement.names)
+    drawings = {} if settings.drawings is None else drawn_masks(settings.drawings, measurement.names)
     with counting_bar("masking the flow", len(measurement.names)) as bar:
         measurement = with_flow_masks(measurement, settings.masks, settings.sigma, drawings, bar)
     assert measurement.flow_mask is not None

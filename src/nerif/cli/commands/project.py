@@ -24,7 +24,7 @@ __all__ = ["Project", "main", "run"]
 
 @dataclass(frozen=True)
 class Project(Settings):
-    """Predict what cameras would measure of a reconstruction, and write it as a measurement."""
+    """Predict the measurement of a reconstruction by given cameras, and write it."""
 
     result: Annotated[Path, tyro.conf.Positional]
     """Result directory of nerif reconstruct."""

@@ -64,7 +64,7 @@ def _command_of(method: str, kind: type[Reconstructor]) -> type[Reconstruct]:
     namespace = {
         "__module__": __name__,
         "__doc__": f"{inspect.getdoc(Reconstruct)}\n\n{(inspect.getdoc(kind) or '').splitlines()[0]}",
-        "__annotations__": {"method": str, "reconstructor": Annotated[kind, Flat]},
+        "__annotations__": {"method": Reconstruct.__annotations__["method"], "reconstructor": Annotated[kind, Flat]},
         "method": method,
         "reconstructor": field(default_factory=kind),
     }

@@ -44,8 +44,8 @@ T = TypeVar("T")
 
 Flat = tyro.conf.arg(name="")
 """Marks a field whose own fields are options without a prefix."""
-ALIASES = {"from": "source"}
-"""Options that are keywords of Python, and the names of their fields."""
+ALIASES = {"from": "source", "drawn": "drawings"}
+"""Further names of options, and those of their fields."""
 IGNORED_TABLES = ("about",)  # results in run.toml
 
 
