@@ -187,7 +187,7 @@ def test_refusals(tmp_path, capsys, whole):
         (["report", str(tmp_path / "absent")], "no such directory"),
         (["report", str(tmp_path / "empty")], "expected a result of nerif reconstruct"),
         (["report", str(whole), "-o", str(tmp_path / "r.pdf")], ".html"),
-        (["report", str(whole), "-o", str(tmp_path / "no" / "r.html")], "does not exist; make it first"),
+        (["report", str(whole), "-o", str(tmp_path / "no" / "r.html")], "does not exist; create it"),
         (["report", str(whole), "-o", str(there)], "exists already and was left as it is"),
         (["figures", str(whole), "--journal", "lancet"], "elsevier"),
         (["figures", str(whole), "--dpi", "3"], "dpi"),
