@@ -12,7 +12,6 @@ from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.results.directory import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
-from nerif.workflow.checkpointed import INPUTS
 
 
 def put(path: Path, text: str = "mine") -> Path:
@@ -42,7 +41,7 @@ def result(tmp_path, said) -> ResultDirectory:
     found.write_metrics({"seconds": 1})
     written(found.path, REPORT, CALIBRATION)
     for folder in (found.member(1).path, found.member(2).path, found.cross_validation.path):
-        written(folder, INPUTS, "field.safetensors")
+        written(folder, "asked.json", "field.safetensors")
     written(found.path / FIGURES, "views.pdf", "slices.pdf")
     assert not said
     return found
