@@ -190,7 +190,7 @@ def test_the_check_names_a_camera_that_was_knocked(tmp_path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["cameras", "--time-limit", "0"], "time_limit: expected seconds above 0"),
+        (["cameras", "--time-limit", "0"], "time_limit: expected a positive number"),
         (["lens"], "refine: expected some of"),
     ],
 )
