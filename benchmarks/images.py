@@ -30,6 +30,7 @@ from nerif.geometry import Grid, paper_rig
 from nerif.imaging.displacement.displacement import DisplacementSettings, measure
 from nerif.imaging.measuring import Scene, Surroundings, join_views
 from nerif.imaging.patterns import Background
+from nerif.reconstruction.shared_settings import Source
 from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
 
 REFERENCES = 5
@@ -134,7 +135,7 @@ def photographed(case: Case, folder: Path) -> None:
     replace(whole, displacement=None, sigma=None).write(folder / "none.nc")
 
 
-def reconstruct(folder: Path, method: str, flow: str, source: str, seconds: float, seed: int) -> dict[str, Any]:
+def reconstruct(folder: Path, method: str, flow: str, source: Source, seconds: float, seed: int) -> dict[str, Any]:
     """Reconstruct, and compare with the truth."""
     from nerif.analysis.evaluation import evaluate_volume
     from nerif.reconstruction.device import keep_freed_memory

@@ -17,6 +17,7 @@ from typing import Any
 
 import images
 from bench import Table, add_write, alone
+from nerif.reconstruction.shared_settings import Aperture, Source
 
 IMAGES = "images"
 GOALS = {"thin": None, "f16": 0.0045, "f8": 0.0060, "f4": 0.015, "window6": None, IMAGES: 0.012}
@@ -35,9 +36,9 @@ REFINED: dict[str, tuple[tuple[str, ...], float | None, float | None]] = {
 class Way:
     """How a measurement is taken: what its lenses count as, what is refined, what the field is found from."""
 
-    aperture: str = "auto"
+    aperture: Aperture = "auto"
     refine: tuple[str, ...] = ()
-    source: str = "displacements"
+    source: Source = "displacements"
 
 
 def ways(name: str, method: str) -> list[Way]:

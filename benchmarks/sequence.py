@@ -66,7 +66,7 @@ def run(
     )  # fmt: skip
     cold = replace(cold, network=cold.resolved_by(sequence.fullest()).network, wave_pixels=0)
     plan = SequencePlan(film, out, cold, settings)
-    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
+    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.attributes)
     last = range(len(sequence) - compared, len(sequence))
     if first is not None:
         store.write_frame(0, Frame(first.field(0), [first.volume(0, "index_excess")], [], 0.0, 0))
@@ -92,7 +92,7 @@ def first_frame(film: Path, out: Path, cold: NeRIF, voxels: int) -> SequenceStor
     settings = SequenceSettings(chunk=len(sequence), voxels=voxels, quantities=("index_excess",))
     cold = replace(cold, network=cold.resolved_by(sequence.fullest()).network, wave_pixels=0)
     plan = SequencePlan(film, out, cold, settings)
-    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
+    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.attributes)
     reconstruct_frames(plan, 0, 1)
     return store
 

@@ -121,7 +121,7 @@ def test_a_run_that_is_stopped_while_a_half_is_kept_out_shows_that_half(tmp_path
     out, lines = ResultDirectory(tmp_path / "r"), []
 
     def stopped(title: str):
-        return nullcontext(lambda step: "first" in title and step.step == 2)
+        return nullcontext(lambda step: "without" in title and step.step == 2)
 
     settings = Tikhonov(voxels=12, regularisation=0.01, symmetry="axis", device="cpu")
     monitor = Monitor(lines.append, training=stopped)

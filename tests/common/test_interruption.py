@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from nerif.cli.cli import VERBS, main
+from nerif.cli.cli import COMMANDS, main
 from nerif.cli.commands import info, output, simulate
 from nerif.cli.commands.output import MONITOR, counting_bar
 from nerif.common.files import atomic, written
@@ -35,14 +35,14 @@ def test_what_is_nearest_to_the_work_speaks():
         raise ValueError("other")
 
 
-@pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "app"])
+@pytest.mark.parametrize("verb", [verb for verb in COMMANDS if verb != "app"])
 def test_every_command_ends_in_one_line(verb, monkeypatch, capsys):
     module = __import__(f"nerif.cli.commands.{verb}", fromlist=["main"])
     monkeypatch.setattr(module, "main", broken_off)
     written.clear()
     assert main([verb]) == 130
     said = capsys.readouterr()
-    assert said.err == "nerif: interrupted; nothing was written; the same command starts again\n"
+    assert said.err == "nerif: interrupted; nothing was written; run the same command again\n"
     assert said.out == ""
 
 
@@ -59,16 +59,16 @@ def test_files_that_are_whole_are_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(info, "main", half_done)
     assert main(["info"]) == 130
     said = capsys.readouterr().err
-    assert f"{tmp_path / 'f'} and 2 more; the same command with --force" in said
+    assert f"{tmp_path / 'f'} and 2 more; run the same command with --force" in said
     assert "lost" not in said
 
 
 STAGES = {
     "before the first step": ("_cross_validation", "nothing was saved yet"),
-    "sampling": ("all_quantities", "holds the field, not yet all that is written of it"),
-    "re-projecting": ("reproject", "holds the field, not yet all that is written of it"),
-    "scoring": ("evaluate_views", "holds the field, not yet all that is written of it"),
-    "verdict": ("verdict", "holds the field, not yet all that is written of it"),
+    "sampling": ("all_quantities", "holds the field, but not all other files"),
+    "re-projecting": ("reproject", "holds the field, but not all other files"),
+    "scoring": ("evaluate_views", "holds the field, but not all other files"),
+    "verdict": ("verdict", "holds the field, but not all other files"),
 }
 
 
@@ -102,7 +102,7 @@ def test_a_second_ctrl_c_in_the_training_leads_to_the_checkpoint(measurement, tm
             raise KeyboardInterrupt
 
     run = Run(withhold=("none",), report=False, checkpoint_every=0.0)
-    with pytest.raises(Interrupted, match="holds the last checkpoint; nerif reconstruct --resume"):
+    with pytest.raises(Interrupted, match="holds the last checkpoint; continue with nerif reconstruct --resume"):
         reconstruct_into(tmp_path / "r", measurement, QUICK, run, on_step=stop)
 
 
@@ -119,7 +119,7 @@ def test_every_stage_of_a_reconstruction_is_told(measurement, tmp_path):
 
 
 def test_work_without_a_terminal_is_told_in_lines(monkeypatch, capsys):
-    monkeypatch.setattr(output, "SOON", 0.01)
+    monkeypatch.setattr(output, "FIRST_LINE", 0.01)
     deadline, lines = time.monotonic() + 20, ""
     with counting_bar("tracing rays", 9) as bar:
         bar(3)
@@ -156,5 +156,5 @@ def test_a_signal_ends_a_command_without_a_traceback(tmp_path):
 
 def test_a_film_that_is_simulated_says_how_to_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(simulate.Simulation, "over_time", broken_off)
-    with pytest.raises(Interrupted, match="lack frames; the same command with --force starts again"):
+    with pytest.raises(Interrupted, match="lack frames; run the same command with --force to start again"):
         simulate.run(simulate.Simulate(out=tmp_path / "m.zarr", times="0:1e-3:3"))

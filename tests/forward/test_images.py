@@ -403,7 +403,7 @@ def test_what_is_missing_is_told(taken, balls):
     displaced = predict(balls, taken.cameras, BOX, 1.00027)
     with refused("from"):
         NeRIF(source="images")(displaced)
-    with refused("from"):
+    with refused("source"):
         NeRIF(source="image")
     with pytest.raises(InputError, match="technique: images show a pattern, and are made by nerif render"):
         predict(balls, taken.cameras, BOX, 1.00027, technique=Images)

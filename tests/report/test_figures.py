@@ -100,7 +100,7 @@ def test_the_command_writes_pdf_and_png(copy, tmp_path, capsys):
         (copy / name).unlink()
     assert main(["figures", str(copy), "-o", str(tmp_path / "f"), "--journal", "nature", "--dpi", "50"]) == 0
     out = capsys.readouterr().out
-    assert "left out: volume.nc is not there" in out
+    assert "not drawn: volume.nc is not there" in out
     assert sorted(p.name for p in (tmp_path / "f").iterdir()) == [
         *(f"{n}.{e}" for n in ("history", "reliability", "slice_scores", "views") for e in ("pdf", "png")),
         "written.json",

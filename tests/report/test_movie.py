@@ -81,7 +81,7 @@ def _whole(volume: Volume) -> Volume:
 
 def test_only_frames_that_are_there_are_drawn(store, tmp_path):
     assert frames_there(store) == [0, 1, 2]
-    from nerif.data.volume_sequence import add_frames
+    from nerif.data.measurement_sequence import add_frames
 
     path = tmp_path / "v.zarr"
     partial = VolumeSequence.create(path, store.times, store.grid, ("index_excess",), 1.00027)

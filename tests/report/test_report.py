@@ -174,7 +174,7 @@ def test_a_run_that_was_killed(copy, capsys):
     assert "The run has not ended" in page
     assert "--resume" in page
     assert "Not there yet: metrics.json, history.csv, volume.nc, reprojection.nc." in page
-    assert "4, of which 1 held out, of 22 × 18 px" in page  # the measurement is still where it was
+    assert "4 (1 withheld), 22 × 18 px" in page  # the measurement is still where it was
     assert main(["figures", str(copy)]) == 2
     assert "nothing to draw" in capsys.readouterr().err
 
@@ -187,7 +187,7 @@ def test_refusals(tmp_path, capsys, whole):
         (["report", str(tmp_path / "absent")], "no such directory"),
         (["report", str(tmp_path / "empty")], "expected a result of nerif reconstruct"),
         (["report", str(whole), "-o", str(tmp_path / "r.pdf")], ".html"),
-        (["report", str(whole), "-o", str(tmp_path / "no" / "r.html")], "does not exist; make it first"),
+        (["report", str(whole), "-o", str(tmp_path / "no" / "r.html")], "does not exist; create it"),
         (["report", str(whole), "-o", str(there)], "exists already and was left as it is"),
         (["figures", str(whole), "--journal", "lancet"], "elsevier"),
         (["figures", str(whole), "--dpi", "3"], "dpi"),

@@ -13,8 +13,9 @@ pytest.importorskip("zarr", reason="pip install '.[sequence]'")
 
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.measurement_sequence import add_frames
 from nerif.data.volume import Volume
-from nerif.data.volume_sequence import VolumeSequence, add_frames
+from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid

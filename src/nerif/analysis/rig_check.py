@@ -15,6 +15,7 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.rig.parameters import MOVED, moved_lines
 from nerif.reconstruction.rig.posterior import with_posterior
+from nerif.reconstruction.shared_settings import Aperture
 from nerif.reconstruction.sources import of_source
 
 __all__ = ["RigCheck", "check_rig"]
@@ -41,7 +42,7 @@ class RigCheck:
 @on_free_cores
 def check_rig(
     measurement: Measurement, refine: Sequence[str], seconds: float = 30.0, pose_sigma_mm: float | None = None,
-    pose_sigma_deg: float | None = None, monitor: Monitor = QUIET, aperture: str = "auto",
+    pose_sigma_deg: float | None = None, monitor: Monitor = QUIET, aperture: Aperture = "auto",
 ) -> RigCheck:  # fmt: skip
     """Refine a rig with a field that is trained for some seconds, and say which views moved.
 

@@ -1,4 +1,4 @@
-"""From a measurement to a result directory: all that `nerif reconstruct` does, as a Python call."""
+"""From a measurement to a result directory: nerif reconstruct as a Python call."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -17,6 +17,7 @@ from nerif.analysis.prediction import check_sees, reproject
 from nerif.analysis.verdict import verdict
 from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
+from nerif.common.settings import check_settings
 from nerif.data.measurement import Measurement
 from nerif.data.volume import quantities_of
 from nerif.data.volume_sequence import VolumeSequence
@@ -47,7 +48,7 @@ from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.results.directory import CALIBRATION, REPORT, ResultDirectory, versions
 from nerif.results.live import Live
-from nerif.workflow.cross_validation import AUTO, FEWEST, FirstLook, kept_apart
+from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
 from nerif.workflow.repeats import Members, all_quantities
 
 __all__ = ["METHODS", "Run", "reconstruct_into", "write_report", "write_sequence_report"]
@@ -64,24 +65,26 @@ METHODS: dict[str, type[Reconstructor]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """What is asked of a reconstruction into a directory, beside the settings of the method."""
+    """Settings of a reconstruction into a directory, in addition to those of the method."""
 
     withhold: tuple[str, ...] = AUTO
-    """Views kept out of the reconstruction and re-projected from it, or left or right, a half of each image of an
-    axisymmetric flow; auto: one is kept out of a short run first, from which the run with all goes on; none."""
+    """Withheld views for cross-validation: names; left or right (half of each image of an axisymmetric flow); auto (one
+    view, in a short run from which the run with all views starts); or none."""
     start_from: Path | None = None
-    """Result directory of another reconstruction in the same box, of any method, to start from."""
+    """Result directory with the initial field: a reconstruction by any method in the same box."""
     fit_gains: bool = False
-    """Of emission: fit how bright each camera sees, beside the field; views held out are taken as they are."""
-    uncertainty: str = "off"
-    """Reconstruct the field that was found twice (fast) or eight times (full) more, as it would be measured again, for
-    standard deviations of every quantity."""
+    """For emission: fit the intensity gain of each camera (not of withheld views)."""
+    uncertainty: Literal["off", "fast", "full"] = "off"
+    """Standard deviations of every quantity by bootstrap: off, fast (2 trials) or full (8 trials)."""
     report: bool = True
     """Write report.html at the end."""
     checkpoint_every: float = 60.0
-    """Seconds between checkpoints."""
+    """Interval between checkpoints in seconds."""
     gas: GasSettings = field(default_factory=GasSettings)
-    """What the density is computed for."""
+    """Gas for density and temperature."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
 
 def reconstruct_into(
@@ -98,45 +101,40 @@ def reconstruct_into(
     monitor: Monitor = QUIET,
     live: bool = False,
 ) -> Reconstruction:
-    """Reconstruct, and write the result directory that docs/formats.md lists.
+    """Reconstruct, and write the result directory of docs/formats.md.
 
-    Field, history and volumes are written as soon as the method ends, then the re-projection into the views and the
-    report.
+    Field, history and volumes are written first, then the re-projection into the views and the report. An earlier
+    result is left as it is if any input is invalid.
 
     Parameters
     ----------
     directory : of the result
-    measurement : or the file it is in, whose path is kept in run.toml
+    measurement : or its file, whose path is stored in run.toml
     reconstructor : settings of the method
-    run : what else is asked
-    voxels : of the written volume along the longest edge of the box; None for those of the method, else 100
-    resume : go on with the checkpoint in the directory
+    run : further settings
+    voxels : of the written volume along the longest edge of the box (default: those of the method, else 100)
+    resume : continue from the checkpoint in the directory
     force : replace the result in the directory
     keep : further entries of run.toml
-    on_step : told every step of the main reconstruction, and may stop it
-    monitor : told how the work goes
-    live : write live.json and live.npz meanwhile, for whoever looks on (live.py)
-
-    Raises
-    ------
-    InputError
-        If anything asked cannot be; a result that is there stays as it is.
+    on_step : called after each step of the main reconstruction, and may stop it
+    monitor : of the progress
+    live : write live.json and live.npz during the run (results/live.py)
     """
     out, begun = ResultDirectory(directory, monitor.say), [resume]
-    with Cores(torch.device("cpu")), if_interrupted(lambda: _left_behind(out, begun[0])):
+    with Cores(torch.device("cpu")), if_interrupted(lambda: _remedy(out, begun[0])):
         return _reconstruct_into(
             out, measurement, reconstructor, run or Run(), voxels, resume, force, keep, on_step, monitor, live, begun
         )
 
 
-def _left_behind(out: ResultDirectory, begun: bool) -> str:
-    """What an interrupted run has saved, and how to go on; an older result is not its own before it has begun."""
+def _remedy(out: ResultDirectory, begun: bool) -> str:
+    """Return what an interrupted run has saved, and how to continue; `begun`: the directory is that of the run."""
     resume = f"nerif reconstruct --resume --out {out.path}"
     if begun and out.has(FIELD):
-        return f"{out.path} holds the field, not yet all that is written of it; {resume} completes it"
+        return f"{out.path} holds the field, but not all other files; complete it with {resume}"
     if begun and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):
-        return f"{out.path} holds the last checkpoint; {resume} goes on from there"
-    return "nothing was saved yet; the same command starts again"
+        return f"{out.path} holds the last checkpoint; continue with {resume}"
+    return "nothing was saved yet; run the same command again"
 
 
 def _reconstruct_into(
@@ -144,97 +142,88 @@ def _reconstruct_into(
     voxels: int | None, resume: bool, force: bool, keep: Mapping[str, Any] | None, on_step: OnStep | None,
     monitor: Monitor, live: bool, begun: list[bool],
 ) -> Reconstruction:  # fmt: skip
-    """Do it; `begun` becomes [True] when the directory is the run's own."""
+    """Run all steps; `begun` becomes [True] when the directory is that of this run."""
     path = None
     if not isinstance(measurement, Measurement):
         path = Path(measurement)
         measurement = Measurement.read(path)
     measurement = seen_through(measurement, reconstructor.aperture)
-    check_source(reconstructor.source, measurement)  # before any view is kept out
+    check_source(reconstructor.source, measurement)  # before any view is withheld
     if voxels is None:
         voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else 100
     if voxels < 1:
-        raise InputError(f"expected at least 1, got {voxels}", field="voxels")
-    whole = measurement
-    measurement, reconstructor, unseen = kept_apart(run.withhold, whole, reconstructor)
-    training = measurement.without(unseen)
+        raise InputError(f"expected 1 or more, got {voxels}", field="voxels")
+    all_views = measurement
+    measurement, reconstructor, withheld = with_halves(run.withhold, all_views, reconstructor)
+    training = measurement.without(withheld)
     gains = fit_gains(training) if run.fit_gains else {}
     if gains:
         monitor.say("gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in gains.items()))
         measurement, training = with_gains(measurement, gains), with_gains(training, gains)
-    trials = _trials(run)
+    trials = Trials(run.uncertainty)
     run = replace(run, gas=run.gas.for_measurement(measurement))
-    if measurement.bad_pixels:
-        where = "the measurement" if path is None else path
-        seen = " or ".join(o.technique.measured for o in measurement.observations)
-        what = f"pixels left out whose {seen} or sigma is NaN, infinite or impossible"
-        monitor.say(f"{where}: {measurement.bad_pixels} {what}")
-    for camera in measurement.cameras:
-        if camera.unseen:
-            monitor.say(
-                f"view '{camera.name}': {camera.unseen:.1%} of its pixels left out, for which its distortion cannot be "
-                "inverted; calibrate it with images of a target that reaches into its corners"
-            )
+    _report_unusable(measurement, "the measurement" if path is None else path, monitor)
     slow = SlowRun(reconstructor, monitor.say)
-    look = _cross_validation(out, run, reconstructor, training, not resume, monitor.telling(slow))
-    state = out.state() if resume and (look is None or out.has(CHECKPOINT) or not look.begun) else None
-    start = _start(run, measurement) if trials is not None or not resume else None
+    validation = _cross_validation(out, run, reconstructor, training, not resume, monitor.telling(slow))
+    state = out.state() if resume and (validation is None or out.has(CHECKPOINT) or not validation.resumable) else None
+    start = _start(run, measurement) if trials.members or not resume else None
     if not resume:
         out.check_free(force)
     ranks = Ranks.from_environment()
     if ranks.size > 1:
         _check_parallel(run, reconstructor)
-    if not ranks.is_first:  # under torchrun the first process tells, and writes
-        with monitor.training("training") as told:
-            return reconstructor(training, told, state, start if state is None else None)
+    if not ranks.is_first:  # under torchrun only the first process reports and writes
+        with monitor.training("training") as progress:
+            return reconstructor(training, progress, state, start if state is None else None)
     monitor = monitor.telling(slow)
     settings = _settings(run, path, reconstructor, voxels, keep or {})
     if "density" not in quantities_of(measurement.quantity):
         del settings["gas"]
-    run, begin = replace(run, withhold=unseen), _begin(out, settings, resume, begun)
-    data = measurement if look is None else look.data
-    looked = Live(out.path, data, reconstructor, next(iter(unseen), ""), lambda: slow.line) if live else None
-    if looked is not None and look is not None:
-        look = replace(look, monitor=looked.watching(monitor, withheld=True))
-    watched = monitor if looked is None else looked.watching(monitor, withheld=bool(unseen))
-    first, method, origin = look(begin) if look is not None and state is None else None, reconstructor, start
-    if first is not None:
-        origin, method = first.field, reconstructor.in_two()[1]
-    if look is not None and first is not None and first.outcome.reason == "interrupted":
-        result, run, measurement = replace(first, state=None), replace(run, withhold=(look.view,)), look.data
+    run, begin = replace(run, withhold=withheld), _begin(out, settings, resume, begun)
+    data = measurement if validation is None else validation.data
+    view = Live(out.path, data, reconstructor, next(iter(withheld), ""), lambda: slow.line) if live else None
+    if view is not None and validation is not None:
+        validation = replace(validation, monitor=view.watching(monitor, withheld=True))
+    watching = monitor if view is None else view.watching(monitor, withheld=bool(withheld))
+    short = validation(begin) if validation is not None and state is None else None
+    method, initial = (reconstructor, start) if short is None else (reconstructor.in_two()[1], short.field)
+    if validation is not None and short is not None and short.outcome.reason == "interrupted":
+        result, run = replace(short, state=None), replace(run, withhold=(validation.view,))
+        measurement = validation.data
     else:
-        with watched.training("training" if isinstance(reconstructor, NeRIF) else "solving") as told:
-            callbacks = [begin, told, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
-            result = method(training, compose(*callbacks), state, origin if state is None else None)
+        with watching.training("training" if isinstance(reconstructor, NeRIF) else "solving") as progress:
+            callbacks = [begin, progress, checkpoints(out.path, run.checkpoint_every), *([on_step] if on_step else [])]
+            result = method(training, compose(*callbacks), state, initial if state is None else None)
     begin(None)
-    scores = {} if look is None else look.scores()
-    _write(
-        out, measurement, result, run, settings, gains, voxels, monitor, {"cross_validation": scores} if scores else {}
-    )
-    _tell_axis(out, result, whole, monitor)
+    scores = {} if validation is None else validation.scores()
+    metrics = {"cross_validation": scores} if scores else {}
+    _write(out, measurement, result, run, settings, gains, voxels, monitor, metrics)
+    _write_axis(out, result, all_views, monitor)
     try:
-        if trials is not None and result.outcome.failed:
-            monitor.say(f"uncertainty: none of a run that {result.outcome.reason}")
-        elif trials is not None and result.outcome.reason != "interrupted":
-            made_of = {"start_from": str(run.start_from)}
-            known = with_corrections(training, result.rig)  # a refined rig is what there is to repeat
-            watched = monitor if looked is None else looked.watching(monitor, withheld=False, looks=False)
-            members = Members(out, trials, reconstructor, known, start, made_of, run.checkpoint_every, watched)
+        if trials.members and result.outcome.failed:
+            monitor.say(f"uncertainty: skipped: the main run {result.outcome.reason}")
+        elif trials.members and result.outcome.reason != "interrupted":
+            dependencies = {"start_from": str(run.start_from)}
+            corrected = with_corrections(training, result.rig)  # trials do not refine the rig again
+            watching = monitor if view is None else view.watching(monitor, withheld=False, looks=False)
+            members = Members(
+                out, trials, reconstructor, corrected, start, dependencies, run.checkpoint_every, watching
+            )
             members.add_to(result, run.gas, voxels)
-    finally:  # the verdict and the page of the main result, whatever becomes of the members
-        made = out.read()
-        if (meridian := made.meridian) is not None:
+    finally:  # verdict and report of the main result, also after an interruption of the trials
+        written = out.read()
+        if (meridian := written.meridian) is not None:
             out.write_meridian(meridian)
-        judged = verdict(made)
-        out.add_metrics({"verdict": asdict(judged)})
+        assessment = verdict(written)
+        out.add_metrics({"verdict": asdict(assessment)})
         if run.report:
             write_report(out.path, monitor=monitor)
-        monitor.say(judged.sentence)
+        monitor.say(assessment.sentence)
     return result
 
 
 def write_report(directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
-    """Write the page of a result directory, say what could not be shown, and return where it is."""
+    """Write the report of a result directory, and return its path."""
     out = ResultDirectory(directory, monitor.say)
     path = path or out / REPORT
     with monitor.counting("writing the report"):
@@ -243,7 +232,7 @@ def write_report(directory: str | os.PathLike[str], path: Path | None = None, mo
     if path == out / REPORT:
         with out.writing(REPORT):
             html.write(page, path)
-    else:  # a file of its own, wherever it is asked for
+    else:
         html.write(page, path)
     for gap in result.missing:
         monitor.say(f"missing: {gap.sentence}")
@@ -252,7 +241,7 @@ def write_report(directory: str | os.PathLike[str], path: Path | None = None, mo
 
 
 def write_sequence_report(store: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
-    """Write the page of a store of nerif sequence, finished or not, and return where it is."""
+    """Write the report of a store of nerif sequence, complete or not, and return its path."""
     path = path or Path(store).with_suffix(".html")
     html.write(render_sequence(VolumeSequence(store)), path)
     _say_size(path, monitor)
@@ -262,6 +251,19 @@ def write_sequence_report(store: str | os.PathLike[str], path: Path | None = Non
 def _say_size(path: Path, monitor: Monitor) -> None:
     size = path.stat().st_size
     monitor.say(f"{path}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")
+
+
+def _report_unusable(measurement: Measurement, source: str | Path, monitor: Monitor) -> None:
+    if measurement.bad_pixels:
+        names = " or ".join(kind.measured for kind in measurement.techniques)
+        reason = f"pixels left out: {names} or sigma is NaN, infinite or impossible"
+        monitor.say(f"{source}: {measurement.bad_pixels} {reason}")
+    for camera in measurement.cameras:
+        if camera.unseen:
+            monitor.say(
+                f"view '{camera.name}': {camera.unseen:.1%} of the pixels left out, where its distortion is not "
+                "invertible; calibrate it with target images that cover its corners"
+            )
 
 
 def _write(
@@ -275,7 +277,7 @@ def _write(
     monitor: Monitor,
     metrics: dict[str, Any],
 ) -> None:
-    """Write what came out: the field first, it is the costliest; what only looks at it comes last."""
+    """Write the result, the most expensive files first."""
     out.write_field(result)
     out.write_history(result.history)
     monitor.say(f"{result.outcome.reason}: {result.outcome.message}")
@@ -298,23 +300,9 @@ def _write(
     out.write_metrics(metrics)
     about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
     out.write_settings(settings, about | ({"gains": gains} if gains else {}))
-    calibrated, held = measurement, []
     if result.rig:
-        with monitor.counting("how well the rig is known") as bar:
-            training = measurement.without(run.withhold)
-            rig = with_posterior(result.rig, training, result.field, result.settings, bar)
-        measurement = with_corrections(measurement, rig)
-        metrics["rig"] = rig
-        with out.writing(CALIBRATION) as written:
-            write_cameras(written, [CalibratedCamera.from_camera(c) for c in measurement.cameras])
-        for line in moved_lines(rig):
-            monitor.say(line)
-        if run.withhold:
-            unseen = calibrated.select(run.withhold)
-            with monitor.counting("refining the views held out"):
-                held = refit(result.field, unseen, result.settings, result.device)
-                mended = reproject(result.field, with_corrections(unseen, held), run.withhold, result.device)
-            metrics |= {"rig_withheld": held, "views_refitted": evaluate_views(mended) if held else []}
+        measurement, entries = _write_rig(out, measurement, result, run, monitor)
+        metrics |= entries
     with monitor.counting("re-projecting") as bar:
         reprojection = reproject(result.field, measurement, run.withhold, result.device, bar, result.model)
     with monitor.counting("scoring the views"):
@@ -332,42 +320,57 @@ def _write(
     )
 
 
-def _tell_axis(out: ResultDirectory, result: Reconstruction, whole: Measurement, monitor: Monitor) -> None:
-    """Keep and say where the axis of a symmetric flow was found, and how far the measurement departs from it."""
+def _write_rig(
+    out: ResultDirectory, measurement: Measurement, result: Reconstruction, run: Run, monitor: Monitor
+) -> tuple[Measurement, dict[str, Any]]:
+    """Write the refined calibration; return the measurement with the corrections, and the entries of metrics.json."""
+    with monitor.counting("uncertainty of the rig") as bar:
+        training = measurement.without(run.withhold)
+        rig = with_posterior(result.rig, training, result.field, result.settings, bar)
+    corrected, entries = with_corrections(measurement, rig), {"rig": rig}
+    with out.writing(CALIBRATION) as path:
+        write_cameras(path, [CalibratedCamera.from_camera(c) for c in corrected.cameras])
+    for line in moved_lines(rig):
+        monitor.say(line)
+    if run.withhold:
+        withheld = measurement.select(run.withhold)
+        with monitor.counting("refining the withheld views"):
+            table = refit(result.field, withheld, result.settings, result.device)
+            refitted = reproject(result.field, with_corrections(withheld, table), run.withhold, result.device)
+        entries |= {"rig_withheld": table, "views_refitted": evaluate_views(refitted) if table else []}
+    return corrected, entries
+
+
+def _write_axis(out: ResultDirectory, result: Reconstruction, measurement: Measurement, monitor: Monitor) -> None:
+    """Write and report the axis of a symmetric flow, and the asymmetry of the measurement."""
     if result.axis is None:
         return
-    apart = asymmetry(whole, result.axis.symmetry) if result.axis.symmetry.axial else []
-    out.add_metrics({"axis": result.axis.record, "asymmetry": apart})
-    for line in (*result.axis.sentences, *(asymmetry_sentence(d) for d in apart)):
+    departures = asymmetry(measurement, result.axis.symmetry) if result.axis.symmetry.axial else []
+    out.add_metrics({"axis": result.axis.record, "asymmetry": departures})
+    for line in (*result.axis.sentences, *(asymmetry_sentence(d) for d in departures)):
         monitor.say(line)
 
 
-def _trials(run: Run) -> Trials | None:
-    """The trials of the bootstrap, if any; a kind that does not exist is refused before the work."""
-    trials = Trials(run.uncertainty)
-    return trials if trials.members else None
-
-
 def _cross_validation(
-    out: ResultDirectory, run: Run, reconstructor: Reconstructor, training: Measurement, afresh: bool,
+    out: ResultDirectory, run: Run, reconstructor: Reconstructor, training: Measurement, restart: bool,
     monitor: Monitor,
-) -> FirstLook | None:  # fmt: skip
-    """The short run without a view, unless the field to start from has seen all views."""
+) -> CrossValidation | None:  # fmt: skip
+    """Return the cross-validation, if possible: not with an initial field, which may depend on all views."""
     if run.withhold != AUTO or AUTO[0] in training.names or run.start_from is not None:
         return None
     if Ranks.from_environment().size > 1:
         return None
-    if len(training.cameras) < FEWEST:
+    if len(training.cameras) < MIN_VIEWS:
         axis = axis_of(reconstructor, training) if isinstance(reconstructor, SharedSettings) else None
         if axis is None or not axis.symmetry.axial:
             return None
         assert isinstance(reconstructor, SharedSettings)
         reconstructor, training = with_axis(reconstructor, axis.symmetry), halved(training, axis.symmetry)
-    return FirstLook(out, reconstructor, training, run.checkpoint_every, monitor, afresh)
+    return CrossValidation(out, reconstructor, training, run.checkpoint_every, monitor, restart)
 
 
 def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:
-    """Refuse what does not split its rays over the processes of torchrun."""
+    """Check that the run can be distributed by torchrun."""
     if not isinstance(reconstructor, NeRIF):
         method = _method(reconstructor)
         raise InputError(f"expected nerif under torchrun, got '{method}', which runs in one process", field="method")
@@ -376,7 +379,7 @@ def _check_parallel(run: Run, reconstructor: Reconstructor) -> None:
 
 
 def _start(run: Run, measurement: Measurement) -> Field | None:
-    """The field to start from, if one is named."""
+    """Return the initial field, if any."""
     if run.start_from is None:
         return None
     directory = ResultDirectory(run.start_from)
@@ -398,24 +401,24 @@ def _method(reconstructor: Reconstructor) -> str:
 def _settings(
     run: Run, path: Path | None, reconstructor: Reconstructor, voxels: int, keep: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Settings that repeat the run, under the names of the flags."""
-    asked: dict[str, Any] = {**keep, **asdict(run), **asdict(reconstructor)}  # type: ignore[call-overload]
+    """Return the settings that repeat the run, by the names of the options."""
+    settings: dict[str, Any] = {**keep, **asdict(run), **asdict(reconstructor)}  # type: ignore[call-overload]
     if run.start_from is not None:
-        asked["start_from"] = run.start_from.resolve()
-    found = None if path is None else str(path.resolve())
-    return {"measurement": found, "method": _method(reconstructor), "voxels": voxels, **asked}
+        settings["start_from"] = run.start_from.resolve()
+    measurement = None if path is None else str(path.resolve())
+    return {"measurement": measurement, "method": _method(reconstructor), "voxels": voxels, **settings}
 
 
 def _begin(
     out: ResultDirectory, settings: Mapping[str, Any], resume: bool, begun: list[bool]
 ) -> Callable[[Step | None], None]:
-    """Make the directory ready once the first step is done: input that is refused before leaves an old result alone."""
-    done: list[bool] = []
+    """Return a callback that prepares the directory at the first step: invalid input leaves an old result alone."""
+    pending = True
 
     def prepare(step: Step | None) -> None:
-        if not done:
+        nonlocal pending
+        if pending:
             out.begin(settings, resume)
-            done.append(True)
-            begun[0] = True
+            pending, begun[0] = False, True
 
     return prepare
