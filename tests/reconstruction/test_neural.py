@@ -148,7 +148,7 @@ def test_a_learning_rate_far_too_high_is_lowered(measurement):
 def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
     """Weights set to 0 in the middle of a good run."""
     monkeypatch.setattr(training, "SAVE_EVERY", 40)
-    run, steps = training.Training(replace(SMALL, max_steps=200), TrainingData(SMALL, measurement)), []
+    run, steps = trainer.Trainer(replace(SMALL, max_steps=200), TrainingData(SMALL, measurement)), []
 
     def sabotage(step: Step) -> None:
         if step.step == 100 and 100 not in steps:
