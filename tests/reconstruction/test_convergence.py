@@ -90,7 +90,7 @@ def test_a_run_that_had_a_limit_continues_with_a_cycle(measurement):
 @pytest.fixture
 def _worse_after_the_first_cycle(monkeypatch):
     errors = itertools.chain([2.0], itertools.repeat(3.0))
-    monkeypatch.setattr(objective.Objective, "withheld_residual", lambda self: next(errors))
+    monkeypatch.setattr(objective.Objective, "withheld_residual", lambda self, density: next(errors))
 
 
 @pytest.mark.slow
