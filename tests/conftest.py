@@ -36,7 +36,7 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
 from nerif.reconstruction.neural import schedule
-from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.simulation.simulate import simulate
 
@@ -98,7 +98,7 @@ def checked_steps() -> Iterator[None]:
         return run_checked_once
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Training, "run", checked_once(Training.run))
+        patch.setattr(Trainer, "run", checked_once(Trainer.run))
         patch.setattr(VoxelReconstructor, "__call__", checked_once(VoxelReconstructor.__call__))
         yield
 

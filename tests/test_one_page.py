@@ -11,8 +11,8 @@ import xarray
 
 from nerif.geometry import Ring
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.objective import Piece
-from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.sampling import Batch, Piece
+from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.simulation.simulate import simulate
 
@@ -34,7 +34,7 @@ def test_one_page_has_the_loss_and_gradient_of_the_package(tmp_path, ball, box) 
     settings = NeRIF(
         wave_pixels=0.0, sampling="random", optimiser="adam", compile="off", precision="float32", device="cpu"
     )
-    training = Training(settings, TrainingData(settings, measurement, coarsest=1))
+    training = Trainer(settings, TrainingData(settings, measurement, coarsest=1))
     theirs, network = training.field, page.Network()
     network.load_state_dict({k: v for k, v in theirs.network.state_dict().items() if k in network.state_dict()})
     field = page.Field(network, torch.tensor(box.centre).float(), theirs.half_edge, theirs.scale, 1.00027)
@@ -45,16 +45,14 @@ def test_one_page_has_the_loss_and_gradient_of_the_package(tmp_path, ball, box) 
     s, interval = page.sample(batch, 16, generator)
     (part,) = training.data.batch(index)
     assert torch.allclose(part.rays.direction, batch.direction, atol=1e-6)
-    ambient = training.data.ambient_points(256, training.generator)
+    ambient = training.data.ambient.sample(256, torch.Generator().manual_seed(2))
     size = float(rays.displacement.square().mean().sqrt())
     ours = page.loss(field, batch, s, interval, ambient, size)
     ours.backward()
 
-    training.generator.manual_seed(settings.seed)
     piece = Piece(part, part.rays, s, interval, part.measured.numel())
-    training.objective.at_ambient = lambda count, _: theirs.network(theirs.normalise(ambient))  # the same points
-    terms = training.objective.terms([piece])
-    loss = sum(terms.values())
+    training.objective.ambient_values = lambda count, _: theirs.network(theirs.normalise(ambient))  # the same points
+    loss, _ = training.objective(Batch([piece], piece.numbers))
     loss.backward()
     assert ours.item() == pytest.approx(loss.item(), rel=1e-4)
     gradients = dict(theirs.network.named_parameters())

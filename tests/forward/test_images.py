@@ -26,7 +26,7 @@ from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Target
@@ -263,7 +263,7 @@ def test_a_run_tells_where_images_take_over_and_its_pace_goes_on(balls, taken):
     flow[:, ::2] = torch.nan
     both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05), maps={**taken.maps, "flow": flow})
     settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
-    Training(settings, TrainingData(settings, both)).run(steps.append)
+    Trainer(settings, TrainingData(settings, both)).run(steps.append)
     assert [(s.step, s.note) for s in steps if s.note] == [
         (5, "the loss changes from displacements to images and jumps")
     ]
@@ -313,8 +313,8 @@ def test_a_run_from_images_resumes_bit_for_bit(taken):
             states.append(step.capture())
         return False
 
-    once = Training(whole, TrainingData(whole, taken)).run(keep)
-    again = Training(whole, TrainingData(whole, taken), states[0]).run()
+    once = Trainer(whole, TrainingData(whole, taken)).run(keep)
+    again = Trainer(whole, TrainingData(whole, taken), states[0]).run()
     a, b = (dict(r.field.network.state_dict()) for r in (once, again))
     assert all(torch.equal(a[name], b[name]) for name in a)
 

@@ -34,7 +34,7 @@ from nerif.reconstruction.base import Reconstructor, State
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.neural.losses import LossWeights, loss_terms
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
@@ -349,7 +349,7 @@ def test_a_run_that_began_from_another_scale_goes_on_as_if_it_had_not_stopped(me
     assert torch.equal(again.field(points), whole.field(points))
     with refused("resume"):
         replace(settings, upper=0.4)(m, resume=half.state)
-    training = Training(settings, TrainingData(settings, m), None, start)
+    training = Trainer(settings, TrainingData(settings, m), None, start)
     bounds = training.field.bounds
     training._begin(None)
     training.load_state_dict(training.first_state)

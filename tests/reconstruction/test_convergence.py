@@ -95,7 +95,7 @@ def test_a_run_that_had_a_limit_continues_with_a_cycle(measurement):
 def test_the_result_is_that_of_the_best_cycle(measurement, monkeypatch, first, refine, interrupted):
     """Here of the first cycle."""
     errors, states = itertools.chain([2.0], itertools.repeat(3.0)), []
-    monkeypatch.setattr(objective.Objective, "withheld_residual", lambda self: next(errors))
+    monkeypatch.setattr(objective.Objective, "withheld_residual", lambda self, density: next(errors))
     monkeypatch.setattr("nerif.reconstruction.rig.refinement.SIGN", -1.0)  # the rig counts as off
     settings = replace(ENDLESS, first_cycle=first, refine=refine)
 

@@ -17,8 +17,9 @@ from nerif.fields.network import NetworkShape
 from nerif.reconstruction.files import read_field
 from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.objective import Draw, Objective
+from nerif.reconstruction.neural.objective import Objective
 from nerif.reconstruction.neural.parallel import Ranks
+from nerif.reconstruction.neural.sampling import Draw, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
 
 SMALL = [
@@ -80,14 +81,17 @@ def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_with_weight_0
     network = MixedPrecision(field.network, data.device, settings.precision, settings.compile)
 
     def of(ranks: Ranks) -> tuple[dict[str, float], set[str], float]:
-        objective = Objective(settings, data, field, network, torch.Generator().manual_seed(1), ranks)
-        pieces, total = objective.batch(torch.tensor([0, len(data) - 1]), Draw(1, 8))
-        terms = objective.terms(pieces)
+        generator = torch.Generator().manual_seed(1)
+        batch = Sampler(settings, data, field, network, generator, ranks).of(
+            torch.tensor([0, len(data) - 1]), Draw(1, 8)
+        )
+        objective = Objective(settings, data, field, network, generator)
+        terms = objective.terms(batch)
         field.network.zero_grad()
         sum(terms.values()).backward()
         names = {name for name, p in field.network.named_parameters() if p.grad is not None}
-        share = sum(piece.numbers for piece in pieces) / total
-        assert share or float(objective.ambient_term([p.part for p in pieces], [p.numbers for p in pieces])) == 0
+        share = batch.own_numbers / batch.numbers
+        assert share or float(objective.ambient_term(batch)) == 0
         return {name: share * float(term.detach()) for name, term in terms.items()}, names, share
 
     alone, names, _ = of(Ranks())

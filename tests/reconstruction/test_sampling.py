@@ -7,7 +7,7 @@ import torch
 
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.geometry import Box, Rays
-from nerif.reconstruction.neural.objective import DENSITY_BINS, EVEN_SHARE, SamplingDensity, sample_count, sample_rays
+from nerif.reconstruction.neural.sampling import DENSITY_BINS, EVEN_SHARE, SamplingDensity, sample_count, sample_rays
 from nerif.reconstruction.neural.training_data import shuffled
 
 BOX = Box((-10.0, -10.0, -10.0), (10.0, 10.0, 10.0))

@@ -12,21 +12,12 @@ import torch
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural import schedule as module
-from nerif.reconstruction.neural import training
+from nerif.reconstruction.neural import trainer
+from nerif.reconstruction.neural.callbacks import EMPTY_RATE, EMPTY_STEPS, MIN_STEPS, FitMonitor
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.presets import preset
-from nerif.reconstruction.neural.schedule import (
-    EMPTY_RATE,
-    EMPTY_STEPS,
-    MIN_STEPS,
-    PACE_STEPS,
-    Budget,
-    Cycles,
-    FitMonitor,
-    SlowRun,
-    duration,
-)  # fmt: skip
+from nerif.reconstruction.neural.schedule import PACE_STEPS, Cycles, Schedule, SlowRun, duration
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.live import read_live
@@ -36,33 +27,33 @@ SMALL = NeRIF(network=NetworkShape(depth=1, width=8, octaves=1), points_per_batc
 
 
 def test_the_time_limit_excludes_imports(measurement, monkeypatch):
-    class Slow(training.NetworkOptimiser):
+    class Slow(trainer.NetworkOptimiser):
         def __init__(self, *arguments):
             time.sleep(0.6)
             super().__init__(*arguments)
 
     replace(SMALL, max_steps=1)(measurement)
-    monkeypatch.setattr(training, "NetworkOptimiser", Slow)
+    monkeypatch.setattr(trainer, "NetworkOptimiser", Slow)
     assert replace(SMALL, time_limit=0.5, max_steps=1)(measurement).history
 
 
 def test_pace_is_measured_from_the_last_change_of_the_rays(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
-    budget = Budget(NeRIF(max_steps=10, device="cpu"), 1000, Ranks(), torch.device("cpu"))
-    budget.count(600)
+    schedule = Schedule(NeRIF(max_steps=10, device="cpu"), 1000, Ranks(), torch.device("cpu"))
+    schedule.count(600)
     clock[0] = 2.0
-    assert budget.rays_per_second == pytest.approx(300.0)
-    state = budget.state_dict()
-    budget.set_rays(100)  # 0.6 epochs are 60 of these
-    assert budget.rays_done == 60
-    budget.count(50)
+    assert schedule.rays_per_second == pytest.approx(300.0)
+    state = schedule.state_dict()
+    schedule.set_rays(100)  # 0.6 epochs are 60 of these
+    assert schedule.rays_done == 60
+    schedule.count(50)
     clock[0] = 3.0
-    assert budget.rays_per_second == pytest.approx(50.0)
-    budget.load_state_dict({**state, "rays_done": 0})
-    budget.count(20)
+    assert schedule.rays_per_second == pytest.approx(50.0)
+    schedule.load_state_dict({**state, "rays_done": 0})
+    schedule.count(20)
     clock[0] = 5.0
-    assert budget.rays_per_second == pytest.approx(10.0)
+    assert schedule.rays_per_second == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize(("seconds", "steps"), [(0.5, 19), (1e-4, 41)])

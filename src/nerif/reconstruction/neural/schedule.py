@@ -28,7 +28,7 @@ from nerif.reconstruction.base import Outcome, Reconstructor, Step
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.settings import TrainingSettings
 
-__all__ = ["Budget", "Cycles", "FitMonitor", "SlowRun", "duration"]
+__all__ = ["Cycles", "Schedule", "SlowRun", "duration"]
 
 
 class Resumable:
@@ -104,19 +104,27 @@ class Cycles(Resumable):
         return self.errors[-1] <= min(self.errors)
 
 
-class Budget:
-    """Steps, rays and seconds of a run, earlier parts of a resumed run included.
+class Schedule:
+    """Steps, rays, seconds and learning rate of a run, earlier parts of a resumed run included.
 
     Parameters
     ----------
     settings : epochs, max_steps and time_limit are the limits; without one the run consists of Cycles
     rays : per epoch
     ranks : all processes follow the clock of the first
+
+    Attributes
+    ----------
+    outcome : why the run is over; None before
+    rate_factor : of the learning rate, below 1 after a fit to a start and after rolling back
+    ray_count : rays of all batches, in bins of any size
     """
+
+    outcome: Outcome | None = None
 
     def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
         self.settings, self.rays, self.ranks, self.device = settings, rays, ranks, device
-        self.step, self.rays_done = 0, 0
+        self.step, self.rays_done, self.ray_count, self.rate_factor = 0, 0, 0, 1.0
         self.cycles = None if settings.limited else Cycles(settings.first_cycle, settings.longest)
         self._before, self._start, self._synchronised = 0.0, time.perf_counter(), 0.0
         self.restart_pace()
@@ -133,6 +141,25 @@ class Budget:
 
     def _clock(self) -> float:
         return self._before + time.perf_counter() - self._start
+
+    @property
+    def done(self) -> bool:
+        """Whether the run is over."""
+        return self.outcome is not None
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rates of the next step, by optimiser."""
+        settings, rate = self.settings, self.rate_factor * self.settings.learning_rate
+        if settings.schedule == "cosine":
+            warm_up = min(settings.warm_up, settings.max_steps / 6 or math.inf)
+            rate *= min(1.0, (self.step + 1) / warm_up)
+            rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(self.progress, 1.0)))
+        return {"adam": rate, "muon": rate * settings.matrix_rate}
+
+    def advance(self) -> None:
+        """Count a step."""
+        self.step += 1
 
     @property
     def epoch(self) -> float:
@@ -161,6 +188,7 @@ class Budget:
     def count(self, rays: int) -> None:
         """Count the rays of a step."""
         self.rays_done += rays
+        self.ray_count += rays
         self._pace_rays += rays
 
     def restart_pace(self) -> None:
@@ -172,12 +200,13 @@ class Budget:
         """Pace since `restart_pace`, 1/s."""
         return self._pace_rays / max(time.perf_counter() - self._pace_start, 1e-9)
 
-    def remaining(self, rays: int) -> float:
-        """Return for how many more rays there is time, after `rays` so far; inf without a limit of steps or time."""
+    @property
+    def remaining(self) -> float:
+        """Rays for which there is still time; inf without a limit of steps or time."""
         share = max(self._shares() if self.cycles is None else [*self._shares(), self.share], default=0.0)
-        return rays * (1 - share) / share if share else math.inf
+        return self.ray_count * (1 - share) / share if share else math.inf
 
-    def exhausted(self) -> Outcome | None:
+    def limit(self) -> Outcome | None:
         """Return the limit that is reached, if any."""
         settings = self.settings
         if settings.epochs and self.epoch >= settings.epochs:
@@ -200,95 +229,17 @@ class Budget:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a checkpoint stores."""
-        state = {"step": self.step, "rays_done": self.rays_done, "seconds": self.seconds}
+        state = {name: getattr(self, name) for name in ("step", "rays_done", "ray_count", "rate_factor", "seconds")}
         return state if self.cycles is None else {**state, "cycles": self.cycles.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from the state of a checkpoint; a run that had a limit begins a cycle there."""
-        self.step, self.rays_done = int(state["step"]), int(state["rays_done"])
+        self.step, self.rays_done, self.ray_count = (int(state[name]) for name in ("step", "rays_done", "ray_count"))
+        self.rate_factor = float(state["rate_factor"])
         self._before, self._start = float(state["seconds"]), time.perf_counter()
         self.restart_pace()
         if self.cycles is not None:
             self.cycles.load_state_dict(state.get("cycles", {"step": self.step, "seconds": self._before}))
-
-
-EMPTY = 0.9  # unexplained share of the signal from which no field counts as found
-HALF, LOSS = 0.5, 0.1
-HIGH_RESIDUAL = 1.5  # sigma
-EMPTY_STEPS, MIN_STEPS = 200, 50  # steps in which the loss must have fallen; steps before any verdict
-EMPTY_RATE = 1.5e-2  # learning rate of EMPTY_STEPS: at a smaller one the weights need more steps to move as far
-MEMORY = 0.95  # of the running mean, per step
-
-
-class FitMonitor(Resumable):
-    """Unexplained share of the signal, q without the noise.
-
-    Parameters
-    ----------
-    noise : q of the noise alone; 0 if unknown
-    rate : learning rate of the run
-    """
-
-    STATE = ("residual", "empty", "lowest", "step", "since")
-
-    def __init__(self, noise: float, rate: float = EMPTY_RATE) -> None:
-        self.noise, self.patience = noise, round(EMPTY_STEPS * max(1.0, EMPTY_RATE / rate))
-        self.residual, self.empty = 0.0, 0.0  # running mean squares, of the field and of the ambient field
-        self.lowest, self.step, self.since = 1.0, 0, 0
-
-    def update(self, residual: float, empty: float, step: int) -> None:
-        """Add the mean squares of a step; a step without signal (empty = 0) does not count."""
-        steps = max(1, step - self.step)
-        self.step = step
-        if empty > 0:
-            memory = MEMORY**steps
-            self.residual = memory * self.residual + (1 - memory) * residual
-            self.empty = memory * self.empty + (1 - memory) * empty
-            self.since += steps
-            if self.since >= MIN_STEPS:
-                self.lowest = min(self.lowest, self.unexplained)
-
-    @property
-    def unexplained(self) -> float:
-        """Share of the squared signal that is neither explained nor noise; 0 without a signal."""
-        if not self.empty or self.noise >= EMPTY:
-            return 0.0
-        return max(0.0, (self.residual / self.empty - self.noise) / (1 - self.noise))
-
-    @property
-    def healthy(self) -> bool:
-        """Whether the fit is nearly as good as it has been."""
-        return self.since < MIN_STEPS or self.unexplained < self.lowest + LOSS
-
-    @property
-    def has_fitted(self) -> bool:
-        """Whether the field has ever explained most of the signal."""
-        return self.lowest < HALF / 2
-
-    def collapsed(self, final: bool) -> bool:
-        """Return whether the field has stayed or become ambient; at the end (`final`) fewer steps are enough."""
-        if self.has_fitted:
-            return self.since >= MIN_STEPS and self.unexplained > HALF
-        return self.since >= (MIN_STEPS if final else self.patience) and self.unexplained > EMPTY
-
-    @property
-    def remark(self) -> str:
-        """Remark on a poor fit at the end of a run, or nothing."""
-        if self.since < MIN_STEPS:
-            return ""
-        if self.unexplained > HALF:
-            return f"; {self.unexplained:.0%} of the squared signal without noise is not explained yet"
-        if self.sigmas > HIGH_RESIDUAL:
-            return (
-                f"; the residual is {self.sigmas:.1f} sigma: more time or a larger --network.width lowers it, "
-                "more views the error, unless cameras or sigma are wrong (nerif check)"
-            )
-        return ""
-
-    @property
-    def sigmas(self) -> float:
-        """Residual, rms over sigma; 0 if sigma is unknown."""
-        return math.sqrt(self.residual / self.empty / self.noise) if self.noise and self.empty else 0.0
 
 
 MIN_RUN = 100  # steps without which no field is found
