@@ -58,7 +58,8 @@ def _reconstructed(number: int) -> dict[str, float | str]:
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.uncertainty.bootstrap import VOXELS, Found, Trials
-    from nerif.workflow.pipeline import Run, reconstruct_into
+    from nerif.workflow.job import Run
+    from nerif.workflow.pipeline import reconstruct_into
 
     torch.set_num_threads(1)
     keep_freed_memory()

@@ -24,7 +24,8 @@ def run(path: Path, truth: Path, method: str, limit: float, withhold: str) -> tu
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.voxels.total_variation import TotalVariation
     from nerif.results.directory import ResultDirectory
-    from nerif.workflow.pipeline import Run, reconstruct_into
+    from nerif.workflow.job import Run
+    from nerif.workflow.pipeline import reconstruct_into
 
     keep_freed_memory()
     settings: Reconstructor = TotalVariation(voxels=48, device="cpu")

@@ -30,8 +30,8 @@ from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.warm_start import fit_network
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.pipeline import write_report
 from nerif.workflow.repeats import all_quantities
+from nerif.workflow.reports import write_report
 
 BOX, N_AMBIENT, NOISE = Box.cube(50.0), 1.00027, 0.05
 COLUMNS = ("stage", "seconds", "of CPU", "peak [GiB]", "")

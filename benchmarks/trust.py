@@ -26,7 +26,7 @@ from nerif.common.conventions import InputError
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.workflow.pipeline import Run
+from nerif.workflow.job import Run
 
 PHANTOMS = ("gaussians", "flame", "octahedron", "fire")
 COLUMNS = ("L2 of variation", "in 1 std", "in 2 std", "Spearman, all", "Spearman, averaged", "std / error", "cost")

@@ -81,7 +81,8 @@ def _reconstructed(number: int, method: str, steps: int, pixels: int) -> dict[st
     from nerif.reconstruction.neural.neural import NeRIF
     from nerif.reconstruction.voxels.total_variation import TotalVariation
     from nerif.results.directory import ResultDirectory
-    from nerif.workflow.pipeline import Run, reconstruct_into
+    from nerif.workflow.job import Run
+    from nerif.workflow.pipeline import reconstruct_into
 
     keep_freed_memory()
     drawn = case(number, pixels)

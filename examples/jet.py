@@ -29,7 +29,8 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.report.meridian_figure import draw_centre_line, draw_section
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 
 HARMONICS = 3  # of a cell
 DRAWS = 200  # of the bootstrap

@@ -17,7 +17,8 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import headline
 from nerif.results.directory import Missing, Result, ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 
 WHITE = {"grain": 1.0, "white": True, "cause": "", "share": 0.0, "row": 4.0, "column": 4.0, "alike": 0.0}
 

@@ -18,8 +18,9 @@ from nerif.reconstruction.base import Step
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
-from nerif.workflow import pipeline as workflow
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow import job, steps
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")
 
@@ -64,7 +65,7 @@ def test_files_that_are_whole_are_named(tmp_path, monkeypatch, capsys):
 
 
 STAGES = {
-    "before the first step": ("_cross_validation", "nothing was saved yet"),
+    "before the first step": ("with_halves", "nothing was saved yet"),
     "sampling": ("all_quantities", "holds the field, but not all other files"),
     "re-projecting": ("reproject", "holds the field, but not all other files"),
     "scoring": ("evaluate_views", "holds the field, but not all other files"),
@@ -79,7 +80,7 @@ def test_a_reconstruction_says_what_is_saved_and_goes_on(stage, measurement, tmp
     measurement.write(path)
     run = Run(withhold=("none",), report=False)
     with monkeypatch.context() as patch:
-        patch.setattr(workflow, name, broken_off)
+        patch.setattr(job if hasattr(job, name) else steps, name, broken_off)
         with pytest.raises(Interrupted, match=words) as stop:
             reconstruct_into(out, path, QUICK, run, voxels=8)
     if words.startswith("holds"):
@@ -91,7 +92,7 @@ def test_a_reconstruction_says_what_is_saved_and_goes_on(stage, measurement, tmp
 def test_a_result_that_was_there_is_not_taken_for_the_run_s_own(measurement, tmp_path, monkeypatch):
     run = Run(withhold=("none",), report=False)
     reconstruct_into(tmp_path / "r", measurement, QUICK, run, voxels=8)
-    monkeypatch.setattr(workflow, "_cross_validation", broken_off)
+    monkeypatch.setattr(job, "with_halves", broken_off)
     with pytest.raises(Interrupted, match="nothing was saved yet"):
         reconstruct_into(tmp_path / "r", measurement, QUICK, run, voxels=8, force=True)
 

@@ -15,7 +15,8 @@ from nerif.reconstruction.progress import QUIET
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.live import Live, read_live, read_look
 from nerif.simulation.simulate import Simulation
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(12, 18), pixel_pitch=0.22)
 

@@ -21,7 +21,8 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import trust, trust_figures
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.cross_validation import MIN_VIEWS, withheld_views
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 
 VOXELS = Tikhonov(voxels=16, basis="linear", iterations=8, regularisation=0.1, device="cpu")
 SHAPE = NetworkShape(depth=2, width=24, octaves=2)

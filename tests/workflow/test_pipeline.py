@@ -18,8 +18,9 @@ from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import image_corners
 from nerif.results.directory import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
-from nerif.workflow import pipeline
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow import steps
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 from refusals import refused
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")
@@ -71,7 +72,7 @@ def test_field_and_volumes_are_written_before_the_reprojection(measurement, tmp_
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "reproject", interrupt)
+    monkeypatch.setattr(steps, "reproject", interrupt)
     out = ResultDirectory(tmp_path / "r")
     with pytest.raises(KeyboardInterrupt):
         reconstruct_into(out.path, measurement, QUICK)

@@ -18,7 +18,8 @@ from nerif.geometry import Ring
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import Simulation
-from nerif.workflow.pipeline import Run, write_report
+from nerif.workflow.job import Run
+from nerif.workflow.reports import write_report
 
 __all__ = ["Demo", "main", "run"]
 

@@ -16,10 +16,12 @@ from nerif.cli.commands.settings import Flat, Settings, flag_value, read_setting
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step
+from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import preset
 from nerif.results.directory import RUN
-from nerif.workflow.pipeline import METHODS, Run, reconstruct_into
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 
 __all__ = ["COMMANDS", "Reconstruct", "ReconstructNeRIF", "main", "run"]
 

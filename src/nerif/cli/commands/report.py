@@ -12,7 +12,7 @@ from nerif.cli.commands.output import MONITOR, check_output
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.results.directory import REPORT
-from nerif.workflow.pipeline import write_report, write_sequence_report
+from nerif.workflow.reports import write_report, write_sequence_report
 
 __all__ = ["Report", "main", "run"]
 
