@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from nerif.cli.commands.help import grouped_help
 from nerif.cli.commands.output import MONITOR
 from nerif.cli.commands.settings import Flat, Settings, flag_value, read_settings, setting_of
 from nerif.common.conventions import InputError
@@ -128,5 +129,11 @@ def main(arguments: list[str]) -> None:
     if method == "nerif":
         name = setting_of("preset", arguments, "auto", file)
         defaults |= {"preset": name, "reconstructor": preset(name)}
+    if arguments[-2:] == ["--help", "all"]:
+        arguments = arguments[:-1]
+    elif {"-h", "--help"} & set(arguments):
+        default = COMMANDS[method](**defaults)
+        print(grouped_help(default, "nerif reconstruct", inspect.getdoc(type(default)) or ""), end="")
+        return
     if run(read_settings(COMMANDS[method](**defaults), arguments, "reconstruct", file)).outcome.failed:
         raise SystemExit(1)

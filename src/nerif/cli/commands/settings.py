@@ -16,7 +16,7 @@ import json
 import re
 import textwrap
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -166,6 +166,7 @@ def flag_value(arguments: list[str], *flags: str) -> str | None:
 
 def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
     """Parse the arguments of a command; an InputError has the error of tyro in one line."""
+    arguments = [word for pair in _with_set(arguments) for word in pair]
     arguments = [
         re.sub(r"^--([\w.-]+)", lambda m: f"--{ALIASES.get(m[1], m[1].replace('_', '-'))}", a) for a in arguments
     ]
@@ -177,6 +178,19 @@ def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
         if not stop.code:
             raise
         raise InputError(_one_line(error.getvalue(), prog)) from None
+
+
+def _with_set(arguments: list[str]) -> Iterator[list[str]]:
+    """Turn --set NAME=VALUE into --NAME VALUE."""
+    words = iter(arguments)
+    for word in words:
+        if word != "--set":
+            yield [word]
+            continue
+        name, _, value = next(words, "").partition("=")
+        if not name or not value:
+            raise InputError(f"expected NAME=VALUE, such as network.width=128, got '{name}'", field="set")
+        yield [f"--{name}", *value.split()]
 
 
 def _one_line(box: str, prog: str) -> str:
