@@ -162,7 +162,7 @@ def test_empty_masks_and_boxes_out_of_view_or_of_another_result(work, tmp_path, 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_help_lists_the_options_of_the_method(capsys, method):
-    assert run("reconstruct", "--method", method, "--help") == 0
+    assert run("reconstruct", "--method", method, "--help", "all") == 0
     text = capsys.readouterr().out
     assert "--start-from" in text
     assert ("--learning-rate" in text) is (method == "nerif")

@@ -351,8 +351,9 @@ def test_a_run_that_began_from_another_scale_goes_on_as_if_it_had_not_stopped(me
         replace(settings, upper=0.4)(m, resume=half.state)
     training = Trainer(settings, TrainingData(settings, m), None, start)
     bounds = training.field.bounds
-    training._begin(None)
-    training.load_state_dict(training.first_state)
+    for callback in training.callbacks:  # the fit to the start among them
+        callback.on_start(training)
+    training.load_state_dict(training.states.first)
     assert training.field.bounds == bounds
 
 
