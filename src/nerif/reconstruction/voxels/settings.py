@@ -1,6 +1,6 @@
-"""The settings that the classical methods share; a method is a generator of iterates (tikhonov.py, landweber.py, ...).
+"""The settings shared by the voxel methods; a method is a generator of iterates (tikhonov.py, landweber.py, ...).
 
-The way from coarse to fine, and the loop that watches over the iterations, are in descent.py.
+descent.py has the levels from coarse to fine and the loop over iterations.
 """
 
 from __future__ import annotations
@@ -25,44 +25,44 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.voxels import kernels_torch
 from nerif.reconstruction.voxels.descent import Descent
-from nerif.reconstruction.voxels.levels import bins_at_last
+from nerif.reconstruction.voxels.levels import FINE_BIN, bins_of
 from nerif.reconstruction.voxels.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 
-VOLUMES = 22  # arrays the size of the grid that the hungriest method holds at once (tests/reconstruction)
-FIRST, COARSEST = 0.2, 8  # of a first run of two: the share of the time limit, and the fewest voxels
-DATA = 8  # arrays the size of the data
-COMPILER_BYTES = 1 << 28  # of Numba, whatever the grid (benchmarks/results/voxel-cost-cpu.md)
+GRID_ARRAYS = 22  # arrays of the size of the grid that a method holds at once, at most (tests/reconstruction)
+DATA_ARRAYS = 8  # of the size of the data
+FIRST_RUN, MIN_FIRST_VOXELS = 0.2, 8  # share of the time limit, and voxels, of the first run of two
+COMPILER_BYTES = 1 << 28  # of Numba, for any grid (benchmarks/results/voxel-cost-cpu.md)
 
 
 @dataclass(frozen=True)
 class VoxelReconstructor(SharedSettings):
-    """Settings of every classical method."""
+    """Settings of every voxel method."""
 
     voxels: int = 64
     """Voxels along the longest edge of the box, of the reconstruction and of the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
-    """Between voxel centres: cubic B-splines, or trilinear (less accurate, little faster)."""
+    """Interpolation between voxel centres: cubic B-splines, or trilinear (less accurate, hardly faster)."""
     model: str = AUTO
-    """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
+    """Linear forward model; for displacements lever_arm (auto) or paraxial."""
     source: str = "auto"
-    """What to go by (also --from): displacements, images (each pixel, linear around the displacements), both, or
-    auto: displacements where there are some."""
+    """Data to fit (also --from): displacements, images (each pixel, linearised about the displacements), both, or auto:
+    displacements if there are any."""
     step: float | None = None
-    """Longest distance between the planes on which rays are sampled, in voxels: at most, and by default, 1 (cubic) or
-    0.5 (linear)."""
+    """Distance between the planes on which rays are sampled, in voxels; at most, and by default, 1 (cubic) or 0.5
+    (linear)."""
     coarse_to_fine: bool = True
     """Start on a coarse grid and halve the voxels from solution to solution."""
     tolerance: float = 1e-4
-    """Converged when the objective falls by less than this share an iteration, on the mean of a few."""
+    """Converged when the objective falls by less than this fraction per iteration, averaged over a few."""
     hull: bool = True
-    """Pin voxels outside the visual hull to the ambient index, where the measurement has flow masks."""
+    """Fix voxels outside the visual hull at the ambient index, if the measurement has flow masks."""
     precision: Literal["float32", "float64"] = "float32"
-    """Of voxels and data."""
+    """Floating-point precision of voxels and data."""
     iterations: int = 50
-    """Most iterations on each grid and with each weight."""
+    """Maximum iterations on each grid and with each weight."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,25 +80,25 @@ class VoxelReconstructor(SharedSettings):
         check_source(self.source)
 
     def in_two(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
-        voxels = max(min(COARSEST, self.voxels), self.voxels // 2)
-        return replace(self, voxels=voxels, time_limit=FIRST * self.time_limit), self
+        voxels = max(min(MIN_FIRST_VOXELS, self.voxels), self.voxels // 2)
+        return replace(self, voxels=voxels, time_limit=FIRST_RUN * self.time_limit), self
 
     @property
     def weight(self) -> float | None:
-        """Weight of the penalty, or None where it is to be chosen."""
+        """Weight of the penalty, or None if it is chosen automatically."""
         return 0.0
 
     @property
     def patience(self) -> int:
-        """Iterations over which the fall of the objective is averaged."""
+        """Iterations over which the decrease of the objective is averaged."""
         return 3
 
     @abstractmethod
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
-        """Yield one iterate after another, from x, without end."""
+        """Yield iterates, starting from x, without end."""
 
     def begin(self, problem: Problem, x: Tensor) -> Tensor:
-        """Return what to iterate from, given a field to start from: that field within the bounds."""
+        """Return the start of the iterations: x within the bounds."""
         return problem.clip(x)
 
     @property
@@ -107,22 +107,21 @@ class VoxelReconstructor(SharedSettings):
         return 4 if self.precision == "float32" else 8
 
     def operator_bytes(self, measurement: Measurement, grid: Grid) -> int:
-        """Return what the operators of all techniques hold."""
+        """Return the memory of the operators of all techniques."""
         dtype, each = getattr(torch, self.precision), _lens_rays(measurement, grid)
         return sum(
             VoxelOperator.memory_bytes(each * rays, grid, self.basis, dtype, channels, self.step)
-            for rays, channels in _seen(measurement, grid)
+            for rays, channels in _counts(measurement, grid)
         )
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
-        """Return what a run will need at most, beside what the process holds already."""
-        seen = _seen(measurement, grid)
-        rays, numbers = sum(n for n, _ in seen), sum(n * channels for n, channels in seen)
-        volumes, data = VOLUMES * math.prod(grid.shape) * self.itemsize, DATA * numbers * self.itemsize
-        each = _lens_rays(measurement, grid)
-        preparing = 40 * 8 * rays * each  # rays in double precision, while the operator is made
-        around = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
-        return self.operator_bytes(measurement, grid) + volumes + data + preparing + around
+        """Return the memory that a run needs at most, beyond that of the process."""
+        counts = _counts(measurement, grid)
+        rays, values = sum(n for n, _ in counts), sum(n * channels for n, channels in counts)
+        arrays = (GRID_ARRAYS * math.prod(grid.shape) + DATA_ARRAYS * values) * self.itemsize
+        preparing = 40 * 8 * rays * _lens_rays(measurement, grid)  # rays in double precision, for the operator
+        kernels = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
+        return self.operator_bytes(measurement, grid) + arrays + preparing + kernels
 
     def __call__(
         self,
@@ -136,10 +135,10 @@ class VoxelReconstructor(SharedSettings):
 
 @dataclass(frozen=True)
 class WeightedVoxelReconstructor(VoxelReconstructor):
-    """Settings of a method with a penalty."""
+    """Settings of the methods with a penalty."""
 
     regularisation: Literal["auto"] | float = "auto"
-    """Weight of the penalty, or auto: by the discrepancy principle where sigma is known, else by the L-curve."""
+    """Weight of the penalty, or auto: discrepancy principle if sigma is known, else L-curve."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -155,20 +154,20 @@ class WeightedVoxelReconstructor(VoxelReconstructor):
         return None if self.regularisation == "auto" else float(self.regularisation)
 
 
-def _seen(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
-    """Rays, those of bins, and channels of each technique."""
-    pixels, seen = bins_at_last(measurement, grid) ** 2, []
+def _counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
+    """Rays (of bins) and channels of each technique."""
+    pixels, counts = bins_of(measurement, grid, FINE_BIN) ** 2, []
     for o in measurement.observations:
         count = int(measurement.usable_for(o).sum()) // (pixels if o.technique.averaged else 1)
-        seen.append((count + 1, len(o.technique.channels)))
-    return seen
+        counts.append((count + 1, len(o.technique.channels)))
+    return counts
 
 
 def _lens_rays(measurement: Measurement, grid: Grid) -> int:
-    """The most rays that a pixel has, as some pixels of each image tell."""
-    most = 1
+    """The largest number of rays per pixel, from a sample of pixels of each image."""
+    largest = 1
     for camera in measurement.cameras:
-        some = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
-        rays = camera.rays(torch.cartesian_prod(*some).reshape(-1, 2)).clip(measurement.box)
-        most = max(most, rays_through(rays, min(grid.spacing)))
-    return most
+        lines = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
+        rays = camera.rays(torch.cartesian_prod(*lines).reshape(-1, 2)).clip(measurement.box)
+        largest = max(largest, rays_through(rays, min(grid.spacing)))
+    return largest
