@@ -15,7 +15,7 @@ from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.uncertainty.bootstrap import Deviations, Found, Maps, Trials, certainty
+from nerif.reconstruction.uncertainty.bootstrap import Deviations, Maps, Original, Trials, certainty
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.checkpointed import KeptRun
 
@@ -59,18 +59,18 @@ class Members:
         done so far. One that diverges is left out, and told.
         """
         say, started, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
-        found = Found(main, self.reconstructor, self.training, lambda f: self._seen(f, main))
+        original = Original(main, self.reconstructor, self.training, lambda f: self._seen(f, main))
         with self.monitor.counting("sampling the field"):
             quantities = all_quantities(main, gas, voxels)
-        taken = Deviations(quantities[0], gas.for_field(quantities[0]), found)
+        taken = Deviations(quantities[0], gas.for_field(quantities[0]), original)
         diverged = []
         for number in range(1, count + 1):
-            member = self.trials.member(number, found)
+            member = self.trials.member(number, original)
             kept = KeptRun(
                 self.out.member(number), member.reconstructor, member.measurement, self.start, self.made_of,
                 self.checkpoint_every, self.monitor,
             )  # fmt: skip
-            result = kept(f"trial {number} of {count}{member.about}")
+            result = kept(f"trial {number} of {count}")
             if result.outcome.reason == "interrupted":
                 say(f"{word}: interrupted after {number - 1} of {count} trials; --resume goes on")
                 break
