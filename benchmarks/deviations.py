@@ -57,7 +57,7 @@ def _reconstructed(number: int) -> dict[str, float | str]:
     from nerif.physics.quantities import GasSettings
     from nerif.reconstruction.device import keep_freed_memory
     from nerif.reconstruction.neural.neural import NeRIF
-    from nerif.reconstruction.uncertainty.bootstrap import VOXELS, Found, Trials
+    from nerif.reconstruction.uncertainty.bootstrap import VOXELS, Original, Trials
     from nerif.workflow.job import Run
     from nerif.workflow.pipeline import reconstruct_into
 
@@ -73,13 +73,13 @@ def _reconstructed(number: int) -> dict[str, float | str]:
         reconstruct_into(out, measurement, method, run, voxels=VOXELS)
         result = ResultDirectory(out)
         main = _read(result)
-        found = Found(main, method, measurement, lambda field: reproject(field, measurement).maps)
-        deviations = Deviations(found.sampled, GasSettings(), found)
+        original = Original(main, method, measurement, lambda field: reproject(field, measurement).maps)
+        deviations = Deviations(original.volume, GasSettings(), original)
         trials = Trials("fast")
         for trial in range(1, trials.members + 1):
-            deviations.add(trials.member(trial, found), _read(result.member(trial)))
+            deviations.add(trials.member(trial, original), _read(result.member(trial)))
     flow = truth.abs() > FLOW * truth.abs().max()
-    error = found.sampled.values.double() - truth
+    error = original.volume.values.double() - truth
     size = (error.abs() / deviations.local())[flow].numpy()
     return {
         "flow": "cloud" if case.cloudy else "front",

@@ -21,8 +21,8 @@ from nerif.reconstruction.uncertainty.bootstrap import (
     VOXELS,
     WIDTH,
     Deviations,
-    Found,
     Member,
+    Original,
     Trials,
     best_covered,
 )
@@ -49,75 +49,75 @@ def result_of(field: VoxelField, box: Box) -> Reconstruction:
 
 
 @pytest.fixture
-def found(measurement) -> Found:
+def original(measurement) -> Original:
     result = result_of(hot(measurement.box), measurement.box)
-    return Found(result, NeRIF(seed=3), measurement, lambda field: reproject(field, measurement).maps)
+    return Original(result, NeRIF(seed=3), measurement, lambda field: reproject(field, measurement).maps)
 
 
-def test_trials_are_of_the_field_found_with_what_was_left_unexplained_in_blocks_of_either_sign(found):
-    member = Trials("fast").member(1, found)
-    grid = Grid.of_resolution(found.result.box, 16)
-    torch.testing.assert_close(member.expected.values, found.result.volume(grid).values)
+def test_trials_are_of_the_field_found_with_what_was_left_unexplained_in_blocks_of_either_sign(original):
+    member = Trials("fast").member(1, original)
+    grid = Grid.of_resolution(original.result.box, 16)
+    torch.testing.assert_close(member.truth.values, original.result.volume(grid).values)
     assert member.reconstructor.seed == 4
 
-    seen = found.seen(VoxelField.through(member.expected.values.double(), grid))["deflection"]
+    seen = original.project(VoxelField.through(member.truth.values.double(), grid))["deflection"]
     left = member.measurement.displacement - seen
-    original = found.measurement.displacement - found.seen(found.result.field)["deflection"]
-    sign = (left / original).nan_to_num(1.0)
+    before = original.measurement.displacement - original.project(original.result.field)["deflection"]
+    sign = (left / before).nan_to_num(1.0)
     torch.testing.assert_close(sign.abs(), torch.ones_like(sign), rtol=0, atol=0.05)
     block = sign[:, :BLOCK, :BLOCK]
     assert bool((block.sign() == block[:, :1, :1].sign()).all())
     assert 0.2 < float((sign > 0).float().mean()) < 0.8
-    again = Trials("full").member(1, found)
+    again = Trials("full").member(1, original)
     assert torch.equal(again.measurement.displacement, member.measurement.displacement)
-    assert not torch.equal(Trials("fast").member(2, found).measurement.displacement, left + seen)
+    assert not torch.equal(Trials("fast").member(2, original).measurement.displacement, left + seen)
 
 
-def test_pixels_that_were_not_measured_stay_so(found):
-    values = found.measurement.displacements.clone()
+def test_pixels_that_were_not_measured_stay_so(original):
+    values = original.measurement.displacements.clone()
     values[1, 2:5, 3:7] = float("nan")
-    holes = replace(found, measurement=replace(found.measurement, displacement=values))
+    holes = replace(original, measurement=replace(original.measurement, displacement=values))
     data = Trials("fast").member(1, holes).measurement
     assert torch.equal(data.usable, holes.measurement.usable)
-    assert int(holes.measurement.usable.sum()) < int(found.measurement.usable.sum())
+    assert int(holes.measurement.usable.sum()) < int(original.measurement.usable.sum())
 
 
-def test_what_trials_lose_of_the_detail_tells_what_was_lost_before(found):
+def test_what_trials_lose_of_the_detail_tells_what_was_lost_before(original):
     """Deviations grow with the share of detail that trials do not keep, and stay where they have more of it."""
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 24)
     bare = Volume.of(hot(box, 0.1).sample(grid), grid, "index_excess", AMBIENT)
     for kept in (1.02, 0.98, 0.9):
-        deviations = Deviations(bare, GasSettings(), found)
+        deviations = Deviations(bare, GasSettings(), original)
         for _ in range(2):
             trial = result_of(VoxelField.through(kept * bare.values.double(), grid), box)
-            deviations.add(Member(NeRIF(), found.measurement, bare), trial)
+            deviations.add(Member(NeRIF(), original.measurement, bare), trial)
         assert deviations.lost == pytest.approx(max(1 - kept**2, 0), abs=1e-4)
         ratio = float(deviations.std().values.norm() / (abs(1 - kept) * bare.values.norm()))
         assert ratio == pytest.approx(deviations.better * math.exp(LOST * deviations.lost**0.5), rel=0.02)
 
 
 @pytest.mark.parametrize("worse", [1.0, 2.0, 0.0])
-def test_errors_are_as_much_smaller_as_the_data_are_met_better_than_by_trials(found, worse):
-    trial = found.result
-    seen = found.seen(trial.field)["deflection"].to(found.measurement.displacement)
-    left = found.measurement.displacement - seen
-    known = found.result.volume(Grid.of_resolution(found.result.box, 16))
-    deviations = Deviations(known, GasSettings(), found)
+def test_errors_are_as_much_smaller_as_the_data_are_met_better_than_by_trials(original, worse):
+    trial = original.result
+    seen = original.project(trial.field)["deflection"].to(original.measurement.displacement)
+    left = original.measurement.displacement - seen
+    known = original.result.volume(Grid.of_resolution(original.result.box, 16))
+    deviations = Deviations(known, GasSettings(), original)
     assert deviations.better == 1.0  # of no trial
     for share in (worse, worse):
-        data = replace(found.measurement, displacement=seen + share * left)
+        data = replace(original.measurement, displacement=seen + share * left)
         deviations.add(Member(NeRIF(), data, known), trial)
     assert deviations.better == pytest.approx(1 / worse if worse else 1.0, rel=1e-3)
 
 
-def test_a_field_without_detail_has_lost_none(found):
+def test_a_field_without_detail_has_lost_none(original):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 16)
     main = Volume.of(torch.full(grid.shape, -1e-4, dtype=torch.float64), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings(), found)
+    deviations = Deviations(main, GasSettings(), original)
     flat = result_of(VoxelField.through(torch.full(grid.shape, -1.05e-4).double(), grid), box)
-    deviations.add(Member(NeRIF(), found.measurement, main), flat)
+    deviations.add(Member(NeRIF(), original.measurement, main), flat)
     std = deviations.std().values
     torch.testing.assert_close(std, torch.full_like(std, deviations.better * 5e-6), rtol=1e-3, atol=0)
 
@@ -129,18 +129,18 @@ def test_views_are_covered_by_those_beside_them_and_opposite():
     assert order[-1] == "110deg"
 
 
-def test_standard_deviations_average_the_squares_of_known_errors_around_each_voxel(found):
+def test_standard_deviations_average_the_squares_of_known_errors_around_each_voxel(original):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 32)
     main = Volume.of(torch.full(grid.shape, -1e-4), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings(), found)
+    deviations = Deviations(main, GasSettings(), original)
     drawn = torch.Generator().manual_seed(0)
     coarse = Grid.of_resolution(box, 16)
     for size in (3e-6, 4e-6):
         error = size * torch.randn(coarse.shape, generator=drawn, dtype=torch.float64)
         expected = Volume.of(torch.full(coarse.shape, -1e-4).double(), coarse, "index_excess", AMBIENT)
         plain = result_of(VoxelField.through(expected.values + error, coarse), box)
-        deviations.add(Member(NeRIF(), found.measurement, expected), plain)
+        deviations.add(Member(NeRIF(), original.measurement, expected), plain)
     told = {v.quantity: v for v in deviations.volumes()}
     assert deviations.count == 2
     std = told["index_excess_std"].values
@@ -160,14 +160,14 @@ def test_standard_deviations_average_the_squares_of_known_errors_around_each_vox
     assert told["temperature_p95"].unit == "K"
 
 
-def test_temperatures_beyond_the_relation_are_masked_and_counted(found):
+def test_temperatures_beyond_the_relation_are_masked_and_counted(original):
     box = Box.cube(40.0)
     grid = Grid.of_resolution(box, 8)
     main = Volume.of(torch.full(grid.shape, -2.6e-4), grid, "index_excess", AMBIENT)
-    deviations = Deviations(main, GasSettings(), found)
+    deviations = Deviations(main, GasSettings(), original)
     plain = result_of(VoxelField.through(torch.full(grid.shape, -2.6e-4).double(), grid), box)
     expected = Volume.of(torch.full(grid.shape, -2.3e-4), grid, "index_excess", AMBIENT)
-    deviations.add(Member(NeRIF(), found.measurement, expected), plain)
+    deviations.add(Member(NeRIF(), original.measurement, expected), plain)
     told = {v.quantity: v for v in deviations.volumes()}
     assert told["temperature_p95"].notes["masked_voxels"] == grid.shape[0] ** 3
     k = told["density_std"].attributes["gladstone_dale_m3_kg-1"]

@@ -101,7 +101,7 @@ def test_pixels_judge_also_where_the_last_bins_are_larger():
     seen = replace(clean, displacement=clean.displacement + noise, sigma=torch.full_like(d, sigma))
     found = Tikhonov(voxels=8, device="cpu")(seen)
     assert found.history[-1]["bin_edge"] > 1
-    assert "residual is the noise (discrepancy principle)" in found.outcome.message
+    assert "the residual equals the noise (discrepancy principle)" in found.outcome.message
 
 
 def test_a_run_stopped_on_a_grid_with_bins_goes_on_from_there(flame):
@@ -143,7 +143,7 @@ def solver(floor: float):
 def test_a_weight_is_mended_about_that_of_a_coarser_grid():
     solve, asked = solver(0.0)
     choice = choose_weight(solve, torch.zeros(1), noise=2e-3, guess=3e-3)
-    assert choice.reason == "residual is the noise (discrepancy principle)"
+    assert choice.reason == "the residual equals the noise (discrepancy principle)"
     assert choice.weight == pytest.approx(2e-3, rel=0.02)
     assert len(asked) == 2
     solve, asked = solver(0.0)
@@ -156,5 +156,5 @@ def test_a_grid_too_coarse_for_the_noise_keeps_the_weight_and_says_so():
     choice = choose_weight(solve, torch.zeros(1), noise=2e-3, guess=1e-3)
     assert choice.weight == 1e-3
     assert float(choice.x) == pytest.approx(1e-3)
-    assert choice.reason.startswith("that of a coarser grid (the residual stays at 2.2")
+    assert choice.reason.startswith("weight of the coarser grid (the residual remains at 2.2")
     assert len(asked) == 2

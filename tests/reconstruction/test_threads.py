@@ -25,7 +25,9 @@ import torch
 torch.set_num_threads(1)
 from nerif.reconstruction.neural import fused
 from nerif.reconstruction.voxels import operator
-operator._compiled()
+from nerif.reconstruction.device import share_threads
+from nerif.reconstruction.voxels import kernels_numba
+share_threads()
 print(torch.get_num_threads())
 """
 

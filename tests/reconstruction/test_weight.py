@@ -47,7 +47,7 @@ def test_discrepancy_goes_up_where_the_noise_is_all_there_is():
     assert choice.weight > HIGHEST
     assert solve(choice.weight, choice.x).residual == pytest.approx(0.9 * most, rel=0.1)
     hopeless = choose_weight(solve, torch.zeros(200), 1.1 * most)
-    assert "no more than the noise" in hopeless.reason
+    assert "does not exceed the noise" in hopeless.reason
 
 
 @pytest.mark.parametrize("sigma", [0.003, 0.01])

@@ -26,7 +26,7 @@ from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, f
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.voxels.operator import rays_through
-from nerif.reconstruction.voxels.symmetric_operator import seen_of
+from nerif.reconstruction.voxels.symmetric_operator import project_spline
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame
@@ -84,7 +84,7 @@ def _through_voxels(
         pause()
         part = rays[index]
         if bool(part.crosses.any()):
-            seen.append(seen_of(field, part, model, step, device).cpu())
+            seen.append(project_spline(field, part, model, step, device).cpu())
         else:
             seen.append(torch.zeros(len(part), len(model.channels)))
     return torch.cat(seen)
@@ -275,7 +275,7 @@ class SampledViews:
         return self.projector.model.linear_twin
 
     def _straight(self, rays: Rays) -> Float[Tensor, "n c"]:
-        return seen_of(self.voxels, rays, self._straight_model)
+        return project_spline(self.voxels, rays, self._straight_model)
 
     def _bending(self, rays: Rays) -> Float[Tensor, "n c"]:
         """What bent rays see more than straight ones."""

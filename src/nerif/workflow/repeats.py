@@ -15,7 +15,7 @@ from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.uncertainty.bootstrap import Deviations, Found, Maps, Trials, certainty
+from nerif.reconstruction.uncertainty.bootstrap import Deviations, Maps, Original, Trials, certainty
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.checkpointed import CheckpointedRun
 
@@ -58,7 +58,7 @@ class Members:
         Complete trials of an interrupted run are read; a diverged one is excluded.
         """
         say, start, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
-        base = Found(main, self.reconstructor, self.training, lambda f: self._projections(f, main))
+        base = Original(main, self.reconstructor, self.training, lambda f: self._projections(f, main))
         with self.monitor.counting("sampling the field"):
             quantities = all_quantities(main, gas, voxels)
         deviations = Deviations(quantities[0], gas.for_field(quantities[0]), base)
@@ -69,7 +69,7 @@ class Members:
                 self.out.member(number), member.reconstructor, member.measurement, self.start, self.dependencies,
                 self.checkpoint_every, self.monitor,
             )  # fmt: skip
-            result = run(f"trial {number} of {count}{member.about}")
+            result = run(f"trial {number} of {count}")
             if result.outcome.reason == "interrupted":
                 say(f"{word}: interrupted after {number - 1} of {count} trials; continue with --resume")
                 break

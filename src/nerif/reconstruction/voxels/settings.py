@@ -24,7 +24,7 @@ from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 from nerif.reconstruction.voxels import kernels_torch
 from nerif.reconstruction.voxels.descent import Descent
-from nerif.reconstruction.voxels.levels import bins_at_last
+from nerif.reconstruction.voxels.levels import FINE_BIN, bins_of
 from nerif.reconstruction.voxels.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 
@@ -125,7 +125,7 @@ class VoxelReconstructor(SharedSettings):
 
 @dataclass(frozen=True)
 class WeightedVoxelReconstructor(VoxelReconstructor):
-    """Settings of a method with a penalty."""
+    """Settings of the methods with a penalty."""
 
     regularisation: Literal["auto"] | Annotated[float, Ge(0), Lt(math.inf)] = "auto"
     """Regularisation weight, or auto (discrepancy principle where sigma is known, else L-curve)."""
@@ -137,7 +137,7 @@ class WeightedVoxelReconstructor(VoxelReconstructor):
 
 def _ray_counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
     """Return the numbers of rays, of bins where pixels are averaged, and of channels of each technique."""
-    pixels, counts = bins_at_last(measurement, grid) ** 2, []
+    pixels, counts = bins_of(measurement, grid, FINE_BIN) ** 2, []
     for o in measurement.observations:
         rays = int(measurement.usable_for(o).sum()) // (pixels if o.technique.averaged else 1)
         counts.append((rays + 1, len(o.technique.channels)))
