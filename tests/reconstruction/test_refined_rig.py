@@ -26,7 +26,7 @@ from nerif.reconstruction.rig.refinement import Refinement
 from nerif.reconstruction.rig.refit import refit
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.report.moves_figure import draw_moves
+from nerif.report.figures import draw_corrections
 from nerif.simulation.simulate import simulate
 from refusals import refused
 
@@ -229,9 +229,9 @@ def test_a_result_tells_how_well_its_rig_is_known_and_how_a_view_not_seen_fits_b
     assert after["name"] == held
     assert after["rms"] < before["rms"]
     page = (out / "report.html").read_text()
-    assert "How far the cameras were moved" in page
+    assert "Corrections of the cameras" in page
     assert f"{held}, camera refined" in page
-    drawn = draw_moves(Figure().subplots(), metrics["rig"])
+    drawn = draw_corrections(Figure().subplots(), metrics["rig"])
     assert [text.get_text() for text in drawn.get_legend().get_texts()] == [row["name"] for row in metrics["rig"]]
 
 

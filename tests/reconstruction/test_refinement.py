@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.analysis.alignment import Moved, aligned
+from nerif.analysis.alignment import MovedField, aligned
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
@@ -334,7 +334,7 @@ def test_the_command_line_refines_writes_and_evaluates(measured, tmp_path, capsy
 def test_a_field_is_moved_to_where_it_is_closest():
     grid = Grid.of_resolution(BOX, 32)
     turn, shift = torch.tensor([0.01, -0.02, 0.03]).double(), torch.tensor([0.4, -0.3, 0.2]).double()
-    truth = Volume.of(Moved(BALLS, turn, shift).sample(grid), grid, "index_excess", 1.00027)
+    truth = Volume.of(MovedField(BALLS, turn, shift).sample(grid), grid, "index_excess", 1.00027)
     found = aligned(BALLS, truth)
     assert torch.allclose(found.turn, turn, atol=2e-4)
     assert torch.allclose(found.shift, shift, atol=2e-3)

@@ -133,10 +133,10 @@ def test_images_of_views_share_their_scales(whole):
     assert [v.withheld for v in views] == [False, False, False, True]
     measured = reprojection.measurement.displacement[reprojection.measurement.usable].abs()
     assert (scale.measured, scale.unit) == ("displacement", "px")
-    for low, high in (scale.limits, scale.apart):
+    for low, high in (scale.limits, scale.difference_limits):
         assert low == -high
     assert 0 < scale.limits[1] <= float(measured.max())
-    assert scale.apart[1] < scale.limits[1]
+    assert scale.difference_limits[1] < scale.limits[1]
     assert all(address.startswith("data:image/png") for v in views for row in v.rows.values() for address in row)
 
 
@@ -339,9 +339,9 @@ def test_of_many_pixels_a_regular_lattice_is_taken(measurement):
 
 def test_the_images_of_many_views_stay_small(measurement, monkeypatch):
     nothing = Reprojection(measurement, {"deflection": torch.zeros_like(measurement.displacement)})
-    assert {v.shrunk for v in view_images(nothing, [])[0]} == {(1, 1)}
+    assert {v.bin_size for v in view_images(nothing, [])[0]} == {(1, 1)}
     monkeypatch.setattr("nerif.report.view_images.ALL_IMAGES", 6 * 5 * 13**2)
-    assert {v.shrunk for v in view_images(nothing, [])[0]} == {(2, 2)}
+    assert {v.bin_size for v in view_images(nothing, [])[0]} == {(2, 2)}
 
 
 def test_images_of_narrow_and_large_views():

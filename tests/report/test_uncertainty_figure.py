@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from nerif.report.uncertainty_figure import WIDE, banded, draw_bands, draw_reliability
 
 from nerif.analysis.metrics import LEVELS, coverage
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
-from nerif.report.uncertainty_figure import WIDE, banded, draw_bands, draw_reliability
 
 GRID = Grid(Box((-4.0, -3.0, -2.0), (4.0, 3.0, 2.0)), (4, 6, 8))
 

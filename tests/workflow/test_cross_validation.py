@@ -18,7 +18,7 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.report.summary import trust, trust_figures
+from nerif.report.summary import accuracy_rows, statements
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.cross_validation import FEWEST, kept_out
 from nerif.workflow.pipeline import Run, reconstruct_into
@@ -51,9 +51,9 @@ def test_one_view_is_predicted_before_it_is_used(measurement, tmp_path, method):
     assert set(seen) == set(measurement.names)
     assert not any(v["withheld"] for v in seen.values())
     assert seen[name]["rms"] < unseen["rms"]
-    figures = dict(trust_figures(result))
-    assert {f"View {name}, while it was kept out", f"View {name}, in the end"} <= set(figures)
-    assert any("A first, short run predicts" in s.text for s in trust(result))
+    figures = dict(accuracy_rows(result))
+    assert {f"View {name}, withheld from the first run", f"View {name}, after the whole run"} <= set(figures)
+    assert any("Cross-validation: a short run" in s.text for s in statements(result))
     assert result.settings["withhold"] == ["auto"]
 
 

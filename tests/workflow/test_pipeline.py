@@ -46,7 +46,7 @@ def test_python_writes_the_whole_directory(made, measurement, capsys):
     assert (box, n_ambient) == (measurement.box, measurement.n_ambient)
     points = torch.rand(20, 3)
     torch.testing.assert_close(field(points), result.field(points))
-    with pytest.raises(InputError, match="was left as it is"):
+    with pytest.raises(InputError, match="exists already"):
         reconstruct_into(out.path, measurement, QUICK)
 
 
