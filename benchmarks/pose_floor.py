@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from bench import Table, add_write, alone
-from nerif.analysis.alignment import Moved
+from nerif.analysis.alignment import MovedField
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
@@ -99,7 +99,7 @@ def main() -> None:
         measurement = Measurement.read(path)
         true = fitted(measurement, truth)
         b = untold(measurement, true)
-        moved = Moved(field, torch.zeros(3, dtype=torch.float64), -b)
+        moved = MovedField(field, torch.zeros(3, dtype=torch.float64), -b)
         l2 = evaluate_volume(moved, truth, measurement.n_ambient)["l2"]
         by = "({:.2f}, {:.2f}, {:.2f})".format(*b.tolist())
         table.row([name, f"truth, moved by {by} mm", f"{l2:.3%}", ""])

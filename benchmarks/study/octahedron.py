@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerif.analysis.resolution import MTF
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Camera
+from study.mtf import MTF
 from study.resolution import Resolution
 
 __all__ = ["from_plain", "pixels_per_unit", "to_plain"]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from nerif.plotting.drawing import COLOURS
-from nerif.report.resolution_figure import draw_mtf
 from study.cases import METHODS, NOISES, PHANTOMS, SECTIONS
 from study.figures import (
     Line,
@@ -20,6 +19,7 @@ from study.figures import (
     look,
     variety,
 )
+from study.mtf import draw_mtf
 from study.octahedron import from_plain
 from study.octahedron_figures import draw_distribution, draw_edge_spread
 from study.paper import COLUMNS, CORRELATION, L2, MEMORY_GB, MINUTES, paper_value

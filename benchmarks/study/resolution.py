@@ -5,7 +5,7 @@ along N and g the true step sqrt(3) amplitude / unit,
 
     ESF(t) = N . grad n(t) / g
 
-and the resolution is that of its modulation transfer function (nerif.analysis.resolution). How the profiles are taken:
+and the resolution is that of its modulation transfer function (mtf.py). How the profiles are taken:
 
 - All have one half length L, so that places can be compared. They stand on the part of a face where they end a margin
   (0.05 units) before the planes x, y, z = 0, beyond which the gradient steps again: |x|, |y|, |z| >= L / sqrt(3) +
@@ -27,10 +27,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.analysis.resolution import COARSEST, MTF
 from nerif.common.conventions import InputError
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.phantoms import Octahedron
+from study.mtf import COARSEST, MTF
 
 __all__ = ["SIZE", "Resolution", "measure_resolution"]
 

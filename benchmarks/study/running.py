@@ -44,7 +44,7 @@ SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 PRELOADED = [
     # of the study's own modules forkserver knows no path before Python 3.12.8; they are small
-    *("nerif.analysis.evaluation", "nerif.analysis.resolution", "nerif.simulation.simulate"),
+    *("nerif.analysis.evaluation", "nerif.simulation.simulate"),
     *(f"nerif.reconstruction.voxels.{name}" for name in ("landweber", "tikhonov", "total_variation")),
     "nerif.reconstruction.neural.neural",
     *("xarray", "h5netcdf", "dask.array", "skimage.metrics", "nerif.reconstruction.voxels.kernels_numba"),

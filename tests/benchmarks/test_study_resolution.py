@@ -16,7 +16,7 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Box, Grid
-from nerif.report.resolution_figure import draw_mtf
+from study.mtf import draw_mtf
 from study.octahedron_figures import draw_distribution, draw_edge_spread
 from study.resolution import Resolution, measure_resolution
 

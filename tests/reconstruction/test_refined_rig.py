@@ -24,7 +24,7 @@ from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refinement import Refinement, refit
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.report.moves_figure import draw_moves
+from nerif.report.figures import draw_corrections
 from nerif.simulation.simulate import simulate
 from refusals import refused
 
@@ -199,10 +199,10 @@ def test_a_result_has_the_posterior_and_the_withheld_view_with_both_cameras(meas
     assert after["name"] == withheld
     assert after["rms"] < before["rms"]
     page = (out / "report.html").read_text()
-    assert "How far the cameras were moved" in page
+    assert "Corrections of the cameras" in page
     assert f"{withheld}, camera refined" in page
-    legend = draw_moves(Figure().subplots(), metrics["rig"]).get_legend()
-    assert [text.get_text() for text in legend.get_texts()] == [row["name"] for row in metrics["rig"]]
+    axes = draw_corrections(Figure().subplots(), metrics["rig"])
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [row["name"] for row in metrics["rig"]]
 
 
 @pytest.mark.parametrize("table", [[{"name": "a"}], [{"name": "a", "values": {"lens": 1.0}}], [None]])

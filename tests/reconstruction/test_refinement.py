@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.analysis.alignment import Moved, aligned
+from nerif.analysis.alignment import MovedField, aligned
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
@@ -313,7 +313,7 @@ def test_the_command_line_refines_writes_and_evaluates(wrong, tmp_path, capsys, 
 def test_a_field_is_aligned_with_the_truth():
     grid = Grid.of_resolution(BOX, 32)
     turn, shift = torch.tensor([0.01, -0.02, 0.03]).double(), torch.tensor([0.4, -0.3, 0.2]).double()
-    truth = Volume.of(Moved(BALLS, turn, shift).sample(grid), grid, "index_excess", 1.00027)
+    truth = Volume.of(MovedField(BALLS, turn, shift).sample(grid), grid, "index_excess", 1.00027)
     field = aligned(BALLS, truth)
     assert torch.allclose(field.turn, turn, atol=2e-4)
     assert torch.allclose(field.shift, shift, atol=2e-3)

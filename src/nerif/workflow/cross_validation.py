@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerif.analysis.asymmetry import HALVES, kept_half
+from nerif.analysis.asymmetry import HALVES, withhold_half
 from nerif.analysis.evaluation import evaluate_views, rms_text
 from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
@@ -52,7 +52,7 @@ def with_halves(
         check_views(reconstructor, measurement)
         if tuple(withhold) in [(half,) for half in HALVES]:
             axis = axis_of(reconstructor, measurement)  # from both halves: one does not determine it
-    parts, names = kept_half(measurement, withhold, None if axis is None else axis.symmetry)
+    parts, names = withhold_half(measurement, withhold, None if axis is None else axis.symmetry)
     if axis is not None and parts is not measurement:
         assert isinstance(reconstructor, SharedSettings)
         reconstructor = with_axis(reconstructor, axis.symmetry)

@@ -31,7 +31,7 @@ from nerif.reconstruction.device import Cores, available_memory, peak_memory, re
 from nerif.reconstruction.files import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import ambient_faces, check_gauge
 from nerif.reconstruction.neural.bins import pixel_subset
-from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, random_pixels, rig_state
+from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Target

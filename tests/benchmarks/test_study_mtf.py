@@ -9,8 +9,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from nerif.analysis.resolution import COARSEST, MTF
-from nerif.report.resolution_figure import draw_mtf
+from study.mtf import COARSEST, MTF, draw_mtf
 
 STEP, HALF = 0.01, 1.2
 
