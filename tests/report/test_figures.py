@@ -99,7 +99,7 @@ def test_the_command_writes_pdf_and_png(copy, tmp_path, capsys):
     for name in ("volume.nc", "reprojection.nc"):  # few figures are quicker
         (copy / name).unlink()
     assert main(["figures", str(copy), "-o", str(tmp_path / "f"), "--journal", "nature", "--dpi", "50"]) == 0
-    assert "left out: volume.nc is missing" in capsys.readouterr().out
+    assert "not drawn: volume.nc is missing" in capsys.readouterr().out
     names = [f"{n}.{e}" for n in ("history", "reliability", "slice_scores", "views") for e in ("pdf", "png")]
     assert sorted(p.name for p in (tmp_path / "f").iterdir()) == [*names, "written.json"]
     assert (tmp_path / "f" / "views.pdf").read_bytes().startswith(b"%PDF")
