@@ -1,25 +1,36 @@
-"""What the paper claims, what came out here, and whether that bears it out: computed from the records alone."""
+"""Claims of the paper with its numbers, ours, and a verdict computed from the records alone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from statistics import median
+from typing import Literal
 
-from study.cases import NOISES, PHANTOMS
-from study.claim import Claim, Question, Verdict
-from study.claims_of_method import CLAIMS_OF_METHOD
-from study.paper import CORRELATION, L2, paper_value
-from study.results import NoResult, Record, Results, finite, score
-from study.words import cc, listed, share
+from benchmarks.study.claims_of_method import CLAIMS_OF_METHOD, Question
+from benchmarks.study.paper import CORRELATION, L2, paper_value
+from benchmarks.study.plan import NOISES, PHANTOMS
+from benchmarks.study.results import NoResult, Record, Results, finite, score
+from benchmarks.study.words import cc, listed, share
 
-__all__ = ["DIGITS", "Claim", "Verdict", "claims", "worse_than_paper"]
+Verdict = Literal["reproduced", "not reproduced", "not tested"]
 
 VOXEL_METHODS = ("Tikhonov", "Landweber")  # the paper's
 DIGITS = {"cc": 4, "l2": 5}
-"""Of the paper's tables, after the point; what is compared with them is rounded alike."""
+"""Digits of the paper's tables after the point, to which values are rounded before a comparison."""
 
 WHY = "; why: see √(1 − CC²) below the tables, which no ambient flatters"
-AROUND, NEAR_1 = (0.85, 0.95), 0.95  # what "around 0.9" and "approaching 1" are taken for
+AROUND, NEAR_1 = (0.85, 0.95), 0.95  # "around 0.9" and "approaching 1"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim, the paper's numbers, ours (or why there are none), and the verdict."""
+
+    text: str
+    paper: str
+    here: str
+    verdict: Verdict
 
 
 def claims(results: Results) -> list[Claim]:
@@ -42,21 +53,18 @@ def _judge(question: Question, results: Results) -> Claim:
     return Claim(question.text, question.paper, here, verdict)
 
 
-# -- tables ----------------------------------------------------------------------------------------------------------
-
-
 def _correlation(results: Results) -> tuple[str, bool]:
-    found = {cell: score(record, "cc") for cell, record in results.cells(["NeRIF"]).items()}
-    worst = min(found, key=lambda cell: found[cell])
-    least = f"{cc(found[worst])} (Phantom {worst[0]}, noise {worst[1]:g})"
-    above = sum(value > 0.99 for value in found.values())
-    return f"{least} to {cc(max(found.values()))}; above 0.99 in {above} of {len(found)}", above == len(found)
+    scores = {cell: score(record, "cc") for cell, record in results.cells(["NeRIF"]).items()}
+    worst = min(scores, key=lambda cell: scores[cell])
+    least = f"{cc(scores[worst])} (Phantom {worst[0]}, noise {worst[1]:g})"
+    above = sum(value > 0.99 for value in scores.values())
+    return f"{least} to {cc(max(scores.values()))}; above 0.99 in {above} of {len(scores)}", above == len(scores)
 
 
 def _l2(results: Results) -> tuple[str, bool]:
-    found = [score(record, "l2") for record in results.cells(["NeRIF"]).values()]
-    below = sum(value < 0.01 for value in found)
-    return f"below 1% in {below} of {len(found)}; {share(min(found))} to {share(max(found))}", below >= L2_BELOW
+    errors = [score(record, "l2") for record in results.cells(["NeRIF"]).values()]
+    below = sum(value < 0.01 for value in errors)
+    return f"below 1% in {below} of {len(errors)}; {share(min(errors))} to {share(max(errors))}", below >= L2_BELOW
 
 
 def _beats(noise: float, rivals: tuple[str, ...]) -> Callable[[Results], tuple[str, bool]]:
@@ -87,9 +95,6 @@ def _robust(results: Results) -> tuple[str, bool]:
     return f"the better voxel method has {spread}{but}", not bad
 
 
-# -- slices ----------------------------------------------------------------------------------------------------------
-
-
 def _of_slices(records: list[Record], name: str) -> list[float]:
     slices = (s for record in records for s in record["metrics"].get("slices") or [])
     values = [value for value in (finite(s.get(name)) for s in slices) if value is not None]
@@ -100,10 +105,10 @@ def _of_slices(records: list[Record], name: str) -> list[float]:
 
 def _voxel_slices(results: Results) -> tuple[str, bool]:
     records = list(results.cells(VOXEL_METHODS, [0.0]).values())
-    middle, similar = median(_of_slices(records, "cc")), _of_slices(records, "ssim")
+    centre, similar = median(_of_slices(records, "cc")), _of_slices(records, "ssim")
     below = sum(value < 0.9 for value in similar) / len(similar)
-    text = f"median CC {cc(middle)}; SSIM below 0.9 in {below:.0%} of the slices, median {cc(median(similar))}"
-    return text, AROUND[0] <= middle <= AROUND[1] and below > 0.5
+    text = f"median CC {cc(centre)}; SSIM below 0.9 in {below:.0%} of the slices, median {cc(median(similar))}"
+    return text, AROUND[0] <= centre <= AROUND[1] and below > 0.5
 
 
 def _nerif_slices(results: Results) -> tuple[str, bool]:
@@ -114,9 +119,6 @@ def _nerif_slices(results: Results) -> tuple[str, bool]:
         lowest = min(lowest, *middles)
         parts.append(f"noise {noise:g}: {cc(middles[0])} and {cc(middles[1])}")
     return f"medians of CC and SSIM: {'; '.join(parts)}", lowest >= NEAR_1
-
-
-# -- our own ---------------------------------------------------------------------------------------------------------
 
 
 def _as_the_paper(results: Results) -> tuple[str, bool]:
@@ -158,7 +160,7 @@ ACCURACY = (
         _correlation,
     ),
     Question(
-        "L2 of NeRIF is predominantly below 1% (taken as: in at least as many cells as in the paper)",
+        "L2 of NeRIF is predominantly below 1% (here: in at least as many cells as in the paper)",
         f"in {L2_BELOW} of {len(NERIF_L2)}; {share(min(NERIF_L2))} to {share(max(NERIF_L2))}",
         _l2,
     ),
@@ -173,22 +175,20 @@ ACCURACY = (
         _robust,
     ),
     Question(
-        f"Slices of the voxel methods: CC around 0.9 (taken as: median {AROUND[0]} to {AROUND[1]}), "
-        "SSIM generally below 0.9 (taken as: in more than half)",
+        f"Slices of the voxel methods: CC around 0.9 (here: median {AROUND[0]} to {AROUND[1]}), "
+        "SSIM generally below 0.9 (here: in more than half)",
         "CC around 0.9, SSIM below 0.9",
         _voxel_slices,
     ),
     Question(
-        f"Slices of NeRIF: CC and SSIM approach 1 (taken as: medians of at least {NEAR_1} at every noise)",
+        f"Slices of NeRIF: CC and SSIM approach 1 (here: medians of at least {NEAR_1} at every noise)",
         "approaching 1",
         _nerif_slices,
     ),
 )
-"""Of the tables and the slices."""
-
 OURS = (
     Question(
-        "Asked of nerif itself: on every phantom and noise level NeRIF is at least as accurate as in the paper's "
+        "Goal of nerif: on every phantom and noise level NeRIF is at least as accurate as in the paper's "
         "tables, in L2 and in CC",
         "the tables",
         _as_the_paper,
@@ -204,4 +204,3 @@ OURS = (
         _beats(0.1, (*VOXEL_METHODS, "TV")),
     ),
 )
-"""What the project asks of itself, and what the paper did not ask."""

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from study.cases import NOISES, PHANTOMS
-from study.claim import Question
-from study.paper import L2, MEMORY_GB, MINUTES, NETWORK_LOSS, RESOLUTION, paper_value
-from study.results import NoResult, Record, Results, finite, first_at, score, typical
-from study.words import duration, factor, listed, memory, share
-
-__all__ = ["CLAIMS_OF_METHOD", "EPOCHS", "MARGIN", "resolution_of", "to_paper_error"]
+from benchmarks.study.paper import L2, MEMORY_GB, MINUTES, NETWORK_LOSS, RESOLUTION, paper_value
+from benchmarks.study.plan import NOISES, PHANTOMS
+from benchmarks.study.results import NoResult, Record, Results, finite, first_at, score, typical
+from benchmarks.study.words import duration, factor, listed, memory, share
 
 EPOCHS = 50  # "approximately 50"
 JUST_OVER = 1.1  # "just over 20 minutes"
-MARGIN = 0.05  # a difference of errors below this is not counted: runs differ by as much
+MARGIN = 0.05  # relative difference of errors between equal runs
 
 
-# -- convergence, time and memory ------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Question:
+    """A claim, the paper's numbers, and a function for ours and whether they confirm it (None: cannot be tested)."""
+
+    text: str
+    paper: str
+    answer: Callable[[Results], tuple[str, bool | None]]
 
 
 def to_paper_error(record: Record) -> dict[str, float] | None:
@@ -40,7 +44,7 @@ def _epochs(results: Results) -> tuple[str, bool | None]:
             parts.append(f"noise {noise:g}: still {share(score(record, 'l2'))} at the end, {ran:.3g} epochs")
             verdicts.append(False if ran >= EPOCHS else None)
     holds = False if False in verdicts else None if None in verdicts else True
-    short = f"; too short a run to tell, which takes {EPOCHS} epochs" if holds is None else ""
+    short = f"; the run is too short: less than {EPOCHS} epochs" if holds is None else ""
     return "; ".join(parts) + short, holds
 
 
@@ -51,7 +55,7 @@ def _time(results: Results) -> tuple[str, bool | None]:
     if point is not None:
         where = f"at the paper's L2 of Phantom 2 after {duration(point['seconds'])} ({record['device']})"
         return f"{where}; the whole run took {duration(total)}, a limit set by the study", point["seconds"] <= allowed
-    text = f"not at the paper's L2 of Phantom 2 within the {duration(total)} that the study allows"
+    text = f"not at the paper's L2 of Phantom 2 within {duration(total)}, the limit of the study"
     return f"{text}: still {share(score(record, 'l2'))}", False if total >= allowed else None
 
 
@@ -60,9 +64,9 @@ def _speedup(results: Results) -> tuple[str, bool]:
     ratios, parts = [], []
     for method in ("Tikhonov", "Landweber"):
         rival = results.one("2", 0.0, method)
-        taken = typical(results.cells([method], [0.0]).values(), "seconds") or rival["seconds"]
+        time = typical(results.cells([method], [0.0]).values(), "seconds") or rival["seconds"]
         point = first_at(record, "l2", score(rival, "l2"))
-        here = f"{method} {duration(taken)} ({rival['device']})"
+        here = f"{method} {duration(time)} ({rival['device']})"
         if point is None:
             parts.append(f"{here}, whose error NeRIF does not reach on Phantom 2")
             ratios.append(0.0)
@@ -89,9 +93,6 @@ def _memory(methods: tuple[str, ...], holds: Callable[[float], bool]) -> Callabl
     return answer
 
 
-# -- network, encoding, sampling -------------------------------------------------------------------------------------
-
-
 def _compare(name: str, better: Record, worse: Record, words: tuple[str, str]) -> tuple[str, bool]:
     errors = [score(record, "l2_variation") for record in (better, worse)]
     text = ", ".join(f"{word} {share(error)}" for word, error in zip(words, errors, strict=True))
@@ -99,9 +100,8 @@ def _compare(name: str, better: Record, worse: Record, words: tuple[str, str]) -
 
 
 def _network(results: Results) -> tuple[str, bool]:
-    found = results.labelled("network")
-    plain = _starting(found, "plain")
-    multi = _starting(found, "multi-head, with gradient head")
+    plain = _labelled(results, "network", "plain")
+    multi = _labelled(results, "network", "multi-head, with gradient head")
     text, holds = _compare("error of the variation", multi, plain, ("multi-head", "plain"))
     losses = [finite(record.get("loss")) for record in (multi, plain)]
     if None not in losses:
@@ -110,72 +110,65 @@ def _network(results: Results) -> tuple[str, bool]:
 
 
 def _octaves(results: Results) -> dict[int, Record]:
-    found = {}
-    for label, record in results.labelled("encoding").items():
-        digits = "".join(c for c in label if c.isdigit())
-        found[int(digits) if digits else 0] = record
-    return dict(sorted(found.items()))
+    digits = {label: "".join(c for c in label if c.isdigit()) for label in results.labelled("encoding")}
+    return dict(sorted((int(digits[label] or 0), record) for label, record in results.labelled("encoding").items()))
 
 
 def _encoding(results: Results) -> tuple[str, bool]:
-    found = _octaves(results)
-    none = found.pop(0, None)
+    runs = _octaves(results)
+    none = runs.pop(0, None)
     if none is None:
         raise NoResult("no run without encoding")
-    best = min(found, key=lambda n: score(found[n], "l2_variation"))
-    return _compare("error of the variation at the end", found[best], none, (f"N = {best}", "no encoding"))
+    best = min(runs, key=lambda n: score(runs[n], "l2_variation"))
+    return _compare("error of the variation at the end", runs[best], none, (f"N = {best}", "no encoding"))
 
 
 def _too_many(results: Results) -> tuple[str, bool]:
-    found = _octaves(results)
-    best = min(found, key=lambda n: score(found[n], "l2_variation"))
-    most = max(found)
+    runs = _octaves(results)
+    best = min(runs, key=lambda n: score(runs[n], "l2_variation"))
+    most = max(runs)
     if best == most:
-        return f"the most octaves, N = {most}, are the best: {share(score(found[most], 'l2_variation'))}", False
-    text, holds = _compare("error of the variation", found[best], found[most], (f"N = {best}", f"N = {most}"))
-    losses = [finite(found[n].get("loss")) for n in (best, most)]
+        return f"the most octaves, N = {most}, are the best: {share(score(runs[most], 'l2_variation'))}", False
+    text, holds = _compare("error of the variation", runs[best], runs[most], (f"N = {best}", f"N = {most}"))
+    losses = [finite(runs[n].get("loss")) for n in (best, most)]
     if losses[0] is None or losses[1] is None:
         return text, holds
     return f"{text}; loss {losses[0]:.3g} and {losses[1]:.3g}", holds and losses[1] <= losses[0]
 
 
 def _sampling(results: Results) -> tuple[str, bool]:
-    found = results.labelled("sampling")
-    random, regular = _starting(found, "random"), _starting(found, "regular")
+    random, regular = (_labelled(results, "sampling", name) for name in ("random", "regular"))
     return _compare("error of the variation", random, regular, ("random", "regular"))
 
 
-def _starting(found: dict[str, Record], start: str) -> Record:
-    for label, record in found.items():
+def _labelled(results: Results, section: str, start: str) -> Record:
+    for label, record in results.labelled(section).items():
         if label.startswith(start):
             return record
     raise NoResult(f"no run is called {start}")
 
 
-# -- resolution ------------------------------------------------------------------------------------------------------
-
-
 def resolution_of(record: Record) -> tuple[float | None, str]:
-    """Return line pairs per unit, and in words; None where it is finer than the profiles can tell."""
+    """Return line pairs per unit, and as text; None where it is finer than the profiles resolve."""
     plain = record.get("resolution")
     if plain is None:
         raise NoResult(f"the resolution of {record['key']} was not measured")
     value = finite(plain.get("lp_per_unit"))
     if value is None:
         return None, f"finer than {plain['finest_lp_per_unit']:.4g} lp/unit"
-    return value, f"{value:.2f} lp/unit" if value > 0 else "no edge found"
+    return value, f"{value:.2f} lp/unit" if value > 0 else "no edge"
 
 
 def _resolution(results: Results) -> tuple[str, bool]:
-    found = results.labelled("resolution")
-    value, words = resolution_of(found["NeRIF"])
-    pixels = finite(found["NeRIF"].get("pixels_per_unit"))
+    records = results.labelled("resolution")
+    value, words = resolution_of(records["NeRIF"])
+    pixels = finite(records["NeRIF"].get("pixels_per_unit"))
     limit = ""
     if pixels:
         times = f"the paper's is {2 * RESOLUTION / pixels:.2g} times that"
         limit = f"; the pixels sample {pixels / 2:.2f} lp/unit (Nyquist): {times}"
-    others = "".join(f"; {name} {resolution_of(record)[1]}" for name, record in found.items() if name != "NeRIF")
-    finest = finite(found["NeRIF"]["resolution"].get("finest_lp_per_unit")) or 0.0
+    others = "".join(f"; {name} {resolution_of(record)[1]}" for name, record in records.items() if name != "NeRIF")
+    finest = finite(records["NeRIF"]["resolution"].get("finest_lp_per_unit")) or 0.0
     return f"{words}{limit}{others}", (finest if value is None else value) >= RESOLUTION
 
 
@@ -183,25 +176,25 @@ TIME_RATIO = MINUTES["Tikhonov"] / MINUTES["NeRIF"]
 
 CLAIMS_OF_METHOD = (
     Question(
-        f"NeRIF converges to an acceptable error within about {EPOCHS} epochs (acceptable taken as: the paper's own "
+        f"NeRIF converges to an acceptable error within about {EPOCHS} epochs (acceptable here: the paper's own "
         "final L2 of that case; Phantom 2)",
         f"L2 {listed(share(paper_value(L2, '2', 'NeRIF', noise)) for noise in NOISES)} at noise "
         f"{listed(f'{noise:g}' for noise in NOISES)}",
         _epochs,
     ),
     Question(
-        "NeRIF needs just over 20 minutes (taken as: at most 22, to the paper's L2 of Phantom 2 without noise)",
+        "NeRIF needs just over 20 minutes (here: at most 22, to the paper's L2 of Phantom 2 without noise)",
         f"{MINUTES['NeRIF']} min, RTX 4090",
         _time,
     ),
     Question(
-        f"The voxel methods need over 10 hours, {TIME_RATIO:g} times as long (taken as: as NeRIF to the same error or "
+        f"The voxel methods need over 10 hours, {TIME_RATIO:g} times as long (here: as NeRIF to the same error or "
         "a lower one)",
         f"{MINUTES['Tikhonov'] / 60:g} h, 64 cores",
         _speedup,
     ),
     Question(
-        "NeRIF runs in about 10 GB of memory (taken as: at most 11)",
+        "NeRIF runs in about 10 GB of memory (here: at most 11)",
         f"{MEMORY_GB['NeRIF']} GB",
         _memory(("NeRIF",), lambda gigabytes: gigabytes <= 1.1 * MEMORY_GB["NeRIF"]),
     ),
@@ -216,12 +209,11 @@ CLAIMS_OF_METHOD = (
         _network,
     ),
     Question(
-        "Positional encoding speeds up convergence (taken as: a lower error at the end of equally long runs)",
+        "Positional encoding speeds up convergence (here: a lower error at the end of equally long runs)",
         "a figure",
         _encoding,
     ),
-    Question("Too many octaves overfit (taken as: a higher error at a loss that is no higher)", "a remark", _too_many),
+    Question("Too many octaves overfit (here: a higher error at a loss that is no higher)", "a remark", _too_many),
     Question("Random sampling along the rays is more accurate than regular sampling", "a remark", _sampling),
     Question("The spatial resolution, at an MTF of 10%, is 61.58 lp/unit", f"{RESOLUTION} lp/unit", _resolution),
 )
-"""In the paper's order, but for the sampling."""

@@ -9,7 +9,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from study.mtf import COARSEST, MTF, draw_mtf
+from benchmarks.study.mtf import COARSEST, MTF, draw_mtf
 
 STEP, HALF = 0.01, 1.2
 

@@ -1,4 +1,4 @@
-"""What the study reconstructs: one Case a reconstruction, and the sections of the page that show it."""
+"""Cases of the study: one per reconstruction, with the sections of the page that show it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from benchmarks.runner import N_AMBIENT
 from nerif import __version__
-from nerif.common.conventions import InputError
 from nerif.forward.deflection import MODELS
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.base import Reconstructor
@@ -21,22 +21,6 @@ from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-
-__all__ = [
-    "BOX",
-    "FULL",
-    "METHODS",
-    "NOISES",
-    "NOISE_SEED",
-    "N_AMBIENT",
-    "PHANTOMS",
-    "QUICK",
-    "SECTIONS",
-    "Case",
-    "Scale",
-    "cases",
-    "check_sections",
-]
 
 SECTIONS = {
     "tables": "Correlation and L2 of seven phantoms at three noise levels",
@@ -57,28 +41,24 @@ SECTIONS = {
 PHANTOMS = ("1", "2", "3", "4", "5", "6", "7")
 NOISES = (0.0, 0.1, 0.15)
 METHODS = ("NeRIF", "Tikhonov", "Landweber", "TV")
-N_AMBIENT = 1.00027
 BOX = Box.cube(50.0)
 NOISE_SEED = 1
-EQUAL = ((24, 48), 10)  # samples and their jitter where intervals are equal
+EQUAL = ((24, 48), 10)  # samples and their jitter in equal intervals
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How large the study is.
+    """Size of the study.
 
     Parameters
     ----------
-    name : quick or full
     pixels : of an edge of each view (paper: 200)
-    truth_voxels : of the grid that errors are taken on
-    seconds : of training of each NeRIF reconstruction, at most
-    steps, points : of training, and sample points of each; 0 for no such limit, and for as many as the preset has
+    truth_voxels : of the grid of the errors
+    seconds : time limit of each NeRIF reconstruction
+    steps, points : of training, and sample points of each; 0: no limit, and those of the preset
     voxels : of the grid of Tikhonov and Landweber (paper: 40)
-    tv_voxels, tv_basis : of total variation, the best of the classical methods here
-    octaves, views : values that the sections of those names compare
-    preset : settings that NeRIF starts from, see reconstruction/presets.py
-    device : where to compute
+    tv_voxels, tv_basis : of total variation, the most accurate classical method here
+    octaves, views : values compared by the sections of those names
     """
 
     name: str
@@ -106,15 +86,10 @@ class Case:
 
     Parameters
     ----------
-    key : its name, and that of its file
-    labels : what it is called in the sections that show it
-    phantom : see fields/phantoms.py
+    labels : its name in each section that shows it
     noise : as a share of the rms displacement
-    method : one of METHODS
-    reconstructor : with its settings
-    ring : the cameras
-    truth_voxels : of the grid the error is taken on
-    snapshots : whether the error is followed through the run
+    truth_voxels : of the grid of the error
+    snapshots : whether the error is recorded during the run
     """
 
     key: str
@@ -129,43 +104,39 @@ class Case:
 
     @property
     def data_key(self) -> str:
-        """Name of the simulated measurement without noise, with a hash of all that it depends on."""
+        """Name of the simulated measurement without noise, with a hash of all that determines it."""
         ring = dataclasses.asdict(self.ring)
-        told = json.dumps([self.phantom, ring, dataclasses.asdict(BOX), N_AMBIENT, __version__])
-        return f"phantom{self.phantom}-{self.ring.views}views-{hashlib.sha256(told.encode()).hexdigest()[:12]}"
+        return f"phantom{self.phantom}-{self.ring.views}views-" + _hash(
+            [self.phantom, ring, dataclasses.asdict(BOX), N_AMBIENT, __version__]
+        )
 
-    def request(self) -> dict[str, Any]:
-        """All that is asked for, as it reads back from JSON."""
-        plain = dataclasses.asdict(self) | {"box": dataclasses.asdict(BOX), "n_ambient": N_AMBIENT, "seed": NOISE_SEED}
-        del plain["labels"], plain["key"]
-        return dict(json.loads(json.dumps(plain)))
-
-
-def check_sections(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the sections asked for, all of them where none is named; an unknown one is an error."""
-    for name in names:
-        if name not in SECTIONS:
-            raise InputError(f"only: expected sections out of {', '.join(SECTIONS)}, got '{name}'")
-    return names or tuple(SECTIONS)
+    @property
+    def digest(self) -> str:
+        """Hash of all inputs of the reconstruction."""
+        inputs = dataclasses.asdict(self) | {"box": dataclasses.asdict(BOX), "n_ambient": N_AMBIENT, "seed": NOISE_SEED}
+        del inputs["labels"], inputs["key"]
+        return _hash(inputs)
 
 
-def cases(scale: Scale, only: tuple[str, ...] = ()) -> list[Case]:
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
+
+
+def study_cases(scale: Scale) -> list[Case]:
     """Return the reconstructions that the sections need, each once."""
-    wanted = set(check_sections(only))
-    found: dict[str, Case] = {}
+    cases: dict[str, Case] = {}
     for case in _all(scale):
-        if case.key in found:
-            case = replace(found[case.key], labels={**found[case.key].labels, **case.labels})
-        found[case.key] = case
-    return [case for case in found.values() if wanted.intersection(case.labels)]
+        if case.key in cases:
+            case = replace(cases[case.key], labels={**cases[case.key].labels, **case.labels})
+        cases[case.key] = case
+    return list(cases.values())
 
 
-def nerif(scale: Scale, **changes: Any) -> NeRIF:
-    """NeRIF as the study runs it: a preset, so many seconds, and what a section changes."""
+def nerif(scale: Scale) -> NeRIF:
+    """Return NeRIF with the limits of the study."""
     base = preset(scale.preset)
-    limits = {"time_limit": scale.seconds, "max_steps": scale.steps, "epochs": 0}
-    points = scale.points or base.points_per_batch
-    return replace(base, **{**limits, "points_per_batch": points, "device": scale.device, **changes})
+    limits: dict[str, Any] = {"time_limit": scale.seconds, "max_steps": scale.steps, "epochs": 0}
+    return replace(base, **limits, points_per_batch=scale.points or base.points_per_batch, device=scale.device)
 
 
 def _all(scale: Scale) -> Iterator[Case]:
@@ -176,27 +147,27 @@ def _all(scale: Scale) -> Iterator[Case]:
         values = {"phantom": "2", "noise": 0.1, "method": "NeRIF", "ring": ring, "truth_voxels": scale.truth_voxels}
         return Case(key=key, labels=labels, reconstructor=reconstructor, **{**values, **more})
 
+    tikhonov = Tikhonov(voxels=scale.voxels, basis="linear", device=scale.device)
     for name, method in {
         "NeRIF": base,
-        "Tikhonov": Tikhonov(voxels=scale.voxels, basis="linear", device=scale.device),
+        "Tikhonov": tikhonov,
         "Landweber": Landweber(voxels=scale.voxels, basis="linear", device=scale.device),
         "TV": TotalVariation(voxels=scale.tv_voxels, basis=scale.tv_basis, device=scale.device),  # type: ignore[arg-type]
     }.items():
         for phantom in PHANTOMS:
             for noise in NOISES:
-                shown = ("tables", "slices", "cost", *(("curves",) if phantom == "2" else ()))
-                follow = phantom == "2" and name == "NeRIF"
+                sections = ("tables", "slices", "cost", *(("curves",) if phantom == "2" else ()))
                 yield case(
-                    f"{phantom}-{noise:g}-{name.lower()}", dict.fromkeys(shown, name), method,
-                    phantom=phantom, noise=noise, method=name, snapshots=follow,
+                    f"{phantom}-{noise:g}-{name.lower()}", dict.fromkeys(sections, name), method, phantom=phantom,
+                    noise=noise, method=name, snapshots=phantom == "2" and name == "NeRIF",
                 )  # fmt: skip
 
     # each section below changes one thing of NeRIF as it stands in the tables; most of them on Phantom 2 at noise 0.1
     as_is = "2-0.1-nerif"
-    exact, differences = "exact gradient (automatic)", "central differences (numerical)"
-    yield case(as_is, {"differentiation": exact}, base)
+    yield case(as_is, {"differentiation": "exact gradient (automatic)"}, base)
     numerical = LossWeights(numerical=1, automatic=0)
-    yield case("numerical", {"differentiation": differences}, replace(base, weights=numerical))
+    central = replace(base, weights=numerical)
+    yield case("numerical", {"differentiation": "central differences (numerical)"}, central)
     plain, heads = replace(base.network, head_width=0, gradient_head=False), replace(base.network, head_width=64)
     key = as_is if plain == base.network else "plain"
     yield case(key, {"network": "plain"}, replace(base, network=plain))
@@ -218,10 +189,9 @@ def _all(scale: Scale) -> Iterator[Case]:
         key, changed = (f"model-{model}", replace(base, model=model)) if i else ("2-0-nerif", base)
         yield case(key, {"model": model}, changed, noise=0.0)
 
-    tikhonov = Tikhonov(voxels=scale.voxels, basis="linear", device=scale.device)
-    for name, method in {"NeRIF": base, "Tikhonov": tikhonov}.items():
+    for name, reconstructor in {"NeRIF": base, "Tikhonov": tikhonov}.items():
         octahedron = {"phantom": "octahedron", "noise": 0.0, "method": name}
-        yield case(f"octahedron-{name.lower()}", {"resolution": name}, method, **octahedron)
+        yield case(f"octahedron-{name.lower()}", {"resolution": name}, reconstructor, **octahedron)
 
     for views in scale.views:
         half_circle = replace(ring, views=views, arc=(0.0, 180.0 - 180.0 / views))
@@ -233,8 +203,8 @@ def _all(scale: Scale) -> Iterator[Case]:
 
 
 def variants(base: NeRIF, gpu: bool) -> dict[str, NeRIF]:
-    """What the speed is compared of: as it is, one choice taken back, and on a GPU the presets (a step of the larger
-    ones takes a CPU ten seconds and more).
+    """Return the settings whose speed is compared: one choice reversed each, and on a GPU the presets (a step of the
+    larger ones takes a CPU ten seconds and more).
     """
 
     def limited(settings: NeRIF) -> NeRIF:

@@ -1,4 +1,4 @@
-"""Inverse Abel transforms of a displacement map: without noise and with rays nearly parallel they find the field."""
+"""Inverse Abel transforms of a displacement map: without noise and with nearly parallel rays they return the field."""
 
 from __future__ import annotations
 
@@ -8,21 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from abel_peers import PEERS, HalfView, ParallelView, Revolution, attempts, pyabel, quadrature
-from bench import N_AMBIENT
+from benchmarks.abel_peers import PEERS, HalfView, ParallelView, Revolution, attempts, pyabel, quadrature
+from benchmarks.one_camera import BOX, EVALUATED, camera_of
+from benchmarks.runner import N_AMBIENT, Unavailable
 from nerif.analysis.metrics import volume_errors
-from nerif.common.conventions import InputError
 from nerif.fields.jets import GaussianJet
 from nerif.geometry import Box, Grid, Ring
 from nerif.simulation.simulate import simulate
-from one_camera import BOX, EVALUATED, camera_of
 
 JET = GaussianJet(BOX)
 
 
 @pytest.fixture(scope="module")
-def seen():
-    """What a camera far away sees of a jet, as arrays."""
+def jet():
+    """Displacement of a jet in a distant camera, and its view."""
     camera = camera_of(1.0, 80)
     measurement = simulate(JET, [camera], BOX, N_AMBIENT, steps=60)
     return measurement.displacement[0].numpy(), ParallelView.of(camera, BOX.centre)
@@ -46,9 +45,9 @@ def test_lengths_of_a_perspective_view_are_those_of_its_depths():
     assert view.heights(60)[0] == pytest.approx(29.5 * 800 / scale)
 
 
-def test_the_projection_is_the_integral_along_rays(seen):
+def test_the_projection_is_the_integral_along_rays(jet):
     """Of a Gaussian of width w it is sqrt(2 pi) w times the Gaussian."""
-    displacement, view = seen
+    displacement, view = jet
     half = HalfView(displacement, view, N_AMBIENT)
     row = 40
     height = torch.tensor([[0.0, 0.0, view.heights(80)[row]]], dtype=torch.float64)
@@ -59,33 +58,33 @@ def test_the_projection_is_the_integral_along_rays(seen):
 
 
 @pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.title)
-def test_every_peer_finds_the_jet(peer, seen):
+def test_every_peer_reconstructs_the_jet(peer, jet):
     if peer.name != "quadrature":
         pytest.importorskip("abel", reason="pip install '.[benchmarks]'")
-    displacement, view = seen
+    displacement, view = jet
     grid = Grid.of_resolution(EVALUATED, 50)
     truth = JET.sample(grid).numpy()
     errors = []
-    for _, found in attempts(peer, displacement, view, N_AMBIENT):
-        turned = Revolution(view, found.shape, grid, order=3)
-        errors.append(volume_errors(truth, turned(found), N_AMBIENT)["l2_variation"])
+    for _, index_map in attempts(peer, displacement, view, N_AMBIENT):
+        turned = Revolution(view, index_map.shape, grid, order=3)
+        errors.append(volume_errors(truth, turned(index_map), N_AMBIENT)["l2_variation"])
     assert min(errors) < 0.02
     assert max(errors) > min(errors)
 
 
-def test_an_axis_beside_the_middle_of_the_image_is_found():
+def test_an_axis_beside_the_middle_of_the_image():
     box = Box((-25.0, -20.0, -25.0), (25.0, 30.0, 25.0))
     field, camera = GaussianJet(box), camera_of(1.0, 80)
     measurement = simulate(field, [camera], box, N_AMBIENT, steps=60)
     view = ParallelView.of(camera, box.centre)
     assert view.axis == pytest.approx(39.5 + 5 / view.pixel)
-    found = quadrature(HalfView(measurement.displacement[0].numpy(), view, N_AMBIENT), 0.0)
+    index_map = quadrature(HalfView(measurement.displacement[0].numpy(), view, N_AMBIENT), 0.0)
     grid = Grid.of_resolution(Box((-15.0, -10.0, -20.0), (15.0, 20.0, 20.0)), 40)
-    volume = Revolution(view, found.shape, grid, order=3)(found)
+    volume = Revolution(view, index_map.shape, grid, order=3)(index_map)
     assert volume_errors(field.sample(grid).numpy(), volume, N_AMBIENT)["l2_variation"] < 0.02
 
 
-def test_one_line_tells_what_to_install(monkeypatch):
+def test_an_absent_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "abel", None)
-    with pytest.raises(InputError, match=r"PyAbel is not installed; pip install"):
+    with pytest.raises(Unavailable, match="PyAbel not installed"):
         pyabel()
