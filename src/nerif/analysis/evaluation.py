@@ -87,9 +87,9 @@ def evaluate(
         metrics["quantity"] = quantity
         metrics["truth"] = str(Path(truth).resolve())
     if data is not None:
-        settings, known = directory.settings(), directory.metrics() if directory.has(METRICS) else {}
+        settings, stored = directory.settings(), directory.metrics() if directory.has(METRICS) else {}
         data, names = withhold_half(
-            data, settings.get("withhold", ()) if withhold is None else withhold, known.get("axis")
+            data, settings.get("withhold", ()) if withhold is None else withhold, stored.get("axis")
         )
         unknown = [name for name in names if name not in data.names]
         if unknown and withhold is not None:
@@ -97,7 +97,7 @@ def evaluate(
         withheld = tuple(name for name in names if name in data.names)
         aperture = "off" if settings.get("aperture", "off") == "off" else "auto"
         data = with_gains(seen_through(data, aperture), gains_of(settings))
-        data = with_corrections(data, known.get("rig", []))
+        data = with_corrections(data, stored.get("rig", []))
         views = reproject(field, data, withheld, on_view=on_view, model=str(settings.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
         metrics["measurement"] = str(Path(str(measurement)).resolve())
