@@ -125,7 +125,7 @@ def test_a_run_that_found_no_field_says_so_in_its_report_and_exits_with_1(work, 
     assert metrics["outcome"] == "collapsed"
     assert "try a smaller --learning-rate" in metrics["message"]
     assert "taken_back" in (tmp_path / "r/history.csv").read_text().splitlines()[0]
-    assert "The run found no field. no field was found" in (tmp_path / "r/report.html").read_text()
+    assert "The field collapsed to the ambient. " in (tmp_path / "r/report.html").read_text()
     assert bool(torch.isfinite(read_volume(tmp_path / "r/volume.nc").values).all())
 
 

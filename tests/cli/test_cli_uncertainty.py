@@ -94,7 +94,7 @@ def test_the_truth_is_compared_with_them(result):
     assert "truth within 2 standard deviations" in said
     assert main(["report", str(out)]) == 0
     page = (out / "report.html").read_text()
-    told = ("Standard deviation", "Density with bands that hold 90 %", "Are the bands right?", "Error bars by 2 trials")
+    told = ("Standard deviation", "Density with bands of 90 %", "Reliability of the bands", "bootstrap of 2")
     for words in told:
         assert words in page
 
@@ -137,7 +137,7 @@ def test_a_trial_that_diverged_is_named(measured, tmp_path, capsys, monkeypatch)
     assert "trial 2 diverged" in capsys.readouterr().out
     about = json.loads((tmp_path / "r/metrics.json").read_text())["uncertainty"]
     assert (about["members"], about["diverged"]) == (1, [2])
-    assert "Trials 2 diverged" in (tmp_path / "r/report.html").read_text()
+    assert "trials 2 diverged" in (tmp_path / "r/report.html").read_text()
 
 
 def test_coverage_counts_the_voxels_of_the_truth(result, tmp_path):
