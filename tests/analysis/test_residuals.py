@@ -49,7 +49,7 @@ def test_noise_of_any_size_is_white():
         rng = np.random.default_rng(100 + seed)
         mask = rng.random(SHAPE) > 0.2
         test = whiteness(rng.exponential() * rng.standard_normal((*SHAPE, 2)), flow(rng), mask)
-        assert (test.white, test.cause, test.alike) == (True, "", 0)
+        assert (test.white, test.cause, test.correlated) == (True, "", 0)
         assert test.grain == pytest.approx(1, abs=0.25)
 
 
@@ -61,7 +61,7 @@ def test_position_and_size():
     assert not test.white
     assert max(abs(test.row - 28), abs(test.column - 44)) <= COARSE / 2
     everywhere = whiteness(rng.standard_normal((*SHAPE, 2)) + 0.5, None, ALL)
-    assert everywhere.alike == pytest.approx(0.5 / np.sqrt(1.25), rel=0.1)
+    assert everywhere.correlated == pytest.approx(0.5 / np.sqrt(1.25), rel=0.1)
 
 
 def test_few_pixels_and_exact_fits_are_not_tested():

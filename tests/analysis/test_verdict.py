@@ -20,14 +20,14 @@ from nerif.simulation.simulate import simulate
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
 
-WHITE = {"grain": 1.0, "white": True, "cause": "", "share": 0.0, "row": 4.0, "column": 4.0, "alike": 0.0}
-CORRELATED = {"grain": 3.0, "white": False, "alike": 0.36}
+WHITE = {"grain": 1.0, "white": True, "cause": "", "share": 0.0, "row": 4.0, "column": 4.0, "correlated": 0.0}
+CORRELATED = {"grain": 3.0, "white": False, "correlated": 0.36}
 NOISE = {"rms_measured": 1.0, "rms_white": 0.02, "rms_sigma": 0.02, "pixels": 1000}
 
 
 def view(name: str, rms: float = 0.05, withheld: bool = False, **test: Any) -> dict[str, Any]:
     """A view with a signal of 1 px rms."""
-    row = {"name": name, "withheld": withheld, "rms": rms, "rms_predicted": 1.0, "leftover": {**WHITE, **test}}
+    row = {"name": name, "withheld": withheld, "rms": rms, "rms_predicted": 1.0, "residual_test": {**WHITE, **test}}
     return {**row, "measured": "displacement", "unit": "px"}
 
 

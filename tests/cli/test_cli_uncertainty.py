@@ -94,9 +94,7 @@ def test_coverage_is_evaluated_and_reported(result, tmp_path):
     assert "truth within 2 standard deviations" in lines
     assert run("report", out) == 0
     page = (out / "report.html").read_text()
-    assert all(
-        words in page for words in ("Standard deviation", "Density with bands that hold 90 %", "Error bars by 2")
-    )
+    assert all(words in page for words in ("Standard deviation", "Density with bands of 90 %", "bootstrap of 2"))
     # a truth in half of the box, one and three standard deviations off in alternate columns
     out = Path(shutil.copytree(out, tmp_path / "r"))
     volumes = read_volumes(out / "volume.nc")

@@ -193,9 +193,9 @@ def view(withheld: bool, cc: float, noise: float | None, **more) -> dict:
     return row if noise is None else {**row, "rms_over_sigma": noise}
 
 
-TEST = {"grain": 3.0, "white": False, "share": 0.5, "row": 20.0, "column": 36.0, "alike": 0.3}
-SHIFTED = view(False, 0.99, 1.0, rms_predicted=1.0, leftover={**TEST, "cause": "calibration"})
-PLAIN = view(False, 0.99, 1.0, rms_predicted=20.0, leftover={**TEST, "cause": ""})
+TEST = {"grain": 3.0, "white": False, "share": 0.5, "row": 20.0, "column": 36.0, "correlated": 0.3}
+SHIFTED = view(False, 0.99, 1.0, rms_predicted=1.0, residual_test={**TEST, "cause": "calibration"})
+PLAIN = view(False, 0.99, 1.0, rms_predicted=20.0, residual_test={**TEST, "cause": ""})
 FIT, GOOD = view(False, 0.99, 1.0), view(True, 0.99, 1.0)
 
 

@@ -193,12 +193,12 @@ def _check_technique(
     extreme = max(range(len(names)), key=lambda i: abs(math.log(max(compared[i][1], 1e-6))))  # it affects the others
     views = []
     for i, (agreement, gain) in enumerate(compared):
-        own = [c for c in corrections if i in c.views and len(c.views) < len(names)]
-        verdict, code = "; ".join(c.words for c in own), ""
-        if not own and agreement < DISAGREES * median and median > 0.3 and len(names) > 4:
+        mistakes = [c for c in corrections if i in c.views and len(c.views) < len(names)]
+        verdict, code = "; ".join(c.words for c in mistakes), ""
+        if not mistakes and agreement < DISAGREES * median and median > 0.3 and len(names) > 4:
             verdict = "does not agree with the other views: wrong calibration, other flow, or other time?"
             code = "unlike"
-        elif not own and i == extreme and not 1 / WRONG_GAIN < gain < WRONG_GAIN and agreement > 0.5:
+        elif not mistakes and i == extreme and not 1 / WRONG_GAIN < gain < WRONG_GAIN and agreement > 0.5:
             verdict = f"{kind.measured} {gain:.2g} times that predicted by the other views: {kind.misscaled}?"
             code = "misscaled"
         if code:
@@ -546,7 +546,7 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
         step(2 * len(views))
     shortlist += [c for c in _exchanges(small.cameras) if _exchanged(predictions, small, c) < MAX_EXCHANGED]
     _, uncorrected = fit(small, voxels, 1e-4)
-    if not uncorrected > 0:  # no signal
+    if not uncorrected > 0:
         return None
     results = []
     for correction in [*shortlist, *of_all]:
@@ -651,11 +651,11 @@ def open_faces(field: Field, small: Measurement) -> list[Finding]:
         closed &= ~through[face]
     findings = {}
     for face in sorted(suspect_faces, key=lambda face: -_unexplained(squares[through[face]])):
-        own, others = squares[through[face] & rest], squares[closed if ambient else ~through[face] & rest]
-        if len(own) < MIN_RAYS or len(others) < MIN_RAYS:
+        inside, others = squares[through[face] & rest], squares[closed if ambient else ~through[face] & rest]
+        if len(inside) < MIN_RAYS or len(others) < MIN_RAYS:
             continue
-        share, share_others = _unexplained(own), _unexplained(others)
-        size = float((own[:, 0].mean() / (others if ambient else squares[rest])[:, 1].mean()).sqrt())
+        share, share_others = _unexplained(inside), _unexplained(others)
+        size = float((inside[:, 0].mean() / (others if ambient else squares[rest])[:, 1].mean()).sqrt())
         if size > OPEN_FACE[0] and share > OPEN_FACE[1] * share_others:
             rest &= ~through[face]
             findings[face] = Finding(

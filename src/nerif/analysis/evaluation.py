@@ -87,9 +87,9 @@ def evaluate(
         metrics["quantity"] = quantity
         metrics["truth"] = str(Path(truth).resolve())
     if data is not None:
-        settings, known = directory.settings(), directory.metrics() if directory.has(METRICS) else {}
+        settings, stored = directory.settings(), directory.metrics() if directory.has(METRICS) else {}
         data, names = withhold_half(
-            data, settings.get("withhold", ()) if withhold is None else withhold, known.get("axis")
+            data, settings.get("withhold", ()) if withhold is None else withhold, stored.get("axis")
         )
         unknown = [name for name in names if name not in data.names]
         if unknown and withhold is not None:
@@ -97,7 +97,7 @@ def evaluate(
         withheld = tuple(name for name in names if name in data.names)
         aperture = "off" if settings.get("aperture", "off") == "off" else "auto"
         data = with_gains(seen_through(data, aperture), gains_of(settings))
-        data = with_corrections(data, known.get("rig", []))
+        data = with_corrections(data, stored.get("rig", []))
         views = reproject(field, data, withheld, on_view=on_view, model=str(settings.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
         metrics["measurement"] = str(Path(str(measurement)).resolve())
@@ -112,7 +112,7 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     cc, ssim, psnr and rms (of images: of their change by the flow), the rms in the unit of the technique, also
     rms_UNIT; pixels: their number. rms_measured, rms_predicted and rms_sigma are those of the measurement, the
     prediction and sigma, rms_white that of the pixel-to-pixel noise. With sigma, rms_over_sigma is 1 where the
-    residual is noise; leftover is the test of its whiteness (residuals.py), given enough pixels.
+    residual is noise; residual_test is the test of its whiteness (residuals.py), given enough pixels.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -145,7 +145,7 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
             row["rms_over_sigma"] = _rms(residual[mask])
         patterns = None if kind.derived else predicted.numpy()
         test = whiteness(residual.nan_to_num(0.0, 0.0, 0.0).numpy(), patterns, mask.numpy())
-        return row if test is None else {**row, "leftover": {**asdict(test), "alike": test.alike}}
+        return row if test is None else {**row, "residual_test": {**asdict(test), "correlated": test.correlated}}
 
     views: list[dict[str, Any]] = []
     threads = int(min(torch.get_num_threads(), PARALLEL_PIXELS // sees_box[0].numel()))

@@ -60,7 +60,7 @@ class Whiteness:
     column: float
 
     @property
-    def alike(self) -> float:
+    def correlated(self) -> float:
         """The rms of the correlated part over that of the residual: sqrt((grain^2 - 1) / n)."""
         return 0.0 if self.white else math.sqrt(max(self.grain**2 - 1, 0.0)) / COARSE
 

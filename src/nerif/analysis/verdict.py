@@ -199,10 +199,10 @@ def _noise(fitted: Sequence[View]) -> dict[str, float]:
     """
     noise = {}
     for name in dict.fromkeys(v["measured"] for v in fitted):
-        own = [v for v in fitted if v["measured"] == name]
-        residual = statistics.median(v["rms"] for v in own)
-        white = statistics.median(v.get("rms_white", residual) for v in own)
-        stated = statistics.median(v.get("rms_sigma", white) for v in own)
+        group = [v for v in fitted if v["measured"] == name]
+        residual = statistics.median(v["rms"] for v in group)
+        white = statistics.median(v.get("rms_white", residual) for v in group)
+        stated = statistics.median(v.get("rms_sigma", white) for v in group)
         noise[name] = max(white, min(stated, residual))
     return noise
 
@@ -251,7 +251,7 @@ def _from_views(
         noisy = white * math.sqrt(N0_PIXELS / pixels) if pixels else white
         error = math.hypot(factor * largest, B_MISFIT * misfit, C_NOISE * noisy)
         if not math.isfinite(error):
-            return None, "a view shows no signal above the noise"
+            return None, "the signal of a view is below the noise"
         return Estimate.within(error, VIEWS_FACTOR, basis), ""
     return None, ""
 
@@ -289,11 +289,11 @@ def _misfit(fitted: Sequence[View], noise: dict[str, float]) -> tuple[float, flo
     """f, s and N of the measured quantity with the largest misfit."""
     misfits = []
     for name in _quantities(fitted):
-        own = [v for v in fitted if v["measured"] == name and name in noise]
-        if own:
-            squares = [_squares(v, noise[name]) for v in own]
+        group = [v for v in fitted if v["measured"] == name and name in noise]
+        if group:
+            squares = [_squares(v, noise[name]) for v in group]
             residual, signal = (statistics.fmean(column) for column in zip(*squares, strict=True))
-            pixels = sum(v.get("pixels") or 0 for v in own)
+            pixels = sum(v.get("pixels") or 0 for v in group)
             misfits.append((_ratio(residual, signal), _ratio(noise[name] ** 2, signal), pixels))
     return max(misfits)
 
@@ -316,10 +316,10 @@ def _contradiction(fitted: Sequence[View]) -> tuple[str, bool]:
     Correlated noise, as of interrogation windows, is in every view; a contradiction is an outlier, or has a pattern.
     """
     for name in dict.fromkeys(v["measured"] for v in fitted):
-        own = [v for v in fitted if v["measured"] == name]
-        parts = {v["name"]: correlated_share(v) for v in own}
+        group = [v for v in fitted if v["measured"] == name]
+        parts = {v["name"]: correlated_share(v) for v in group}
         median, worst = statistics.median(parts.values()), max(parts, key=lambda k: parts[k])
-        tests = {v["name"]: v.get("leftover") or {"grain": 1.0, "cause": ""} for v in own}
+        tests = {v["name"]: v.get("residual_test") or {"grain": 1.0, "cause": ""} for v in group}
         doubtful = [
             view for view, test in tests.items()
             if test["grain"] > DOUBTFUL[0] and parts[view] > DOUBTFUL[1]
@@ -332,7 +332,7 @@ def _contradiction(fitted: Sequence[View]) -> tuple[str, bool]:
             text = f"{views} spatially correlated ({worst}: {parts[worst]:.1%} of the signal)"
             text += f", as with {CAUSES[cause]}" if cause else "; nerif check compares the views with one another"
             return text, grain > SEVERE[0] and parts[worst] > SEVERE[1] and parts[worst] > OUTLIER * median
-        shares = {v["name"]: v["rms"] / v["rms_predicted"] for v in own}
+        shares = {v["name"]: v["rms"] / v["rms_predicted"] for v in group}
         worst, median = max(shares, key=lambda k: shares[k]), statistics.median(shares.values())
         if median > 0 and shares[worst] > UNEVEN * median:
             return f"view {worst}: residual {shares[worst] / median:.1f} × the median of all views", False
@@ -350,5 +350,5 @@ def _asymmetry(asymmetry: Sequence[dict[str, Any]]) -> tuple[str, bool]:
 
 def correlated_share(view: View) -> float:
     """Return the spatially correlated part of the residual of a view, relative to the rms prediction."""
-    test = view.get("leftover")
-    return float(test["alike"] * view["rms"] / (view.get("rms_predicted") or math.inf)) if test else 0.0
+    test = view.get("residual_test")
+    return float(test["correlated"] * view["rms"] / (view.get("rms_predicted") or math.inf)) if test else 0.0

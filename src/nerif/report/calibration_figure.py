@@ -22,9 +22,9 @@ def draw_errors(axes: Axes, calibration: Calibration) -> Axes:
     """Draw the rms reprojection error (px) of every image by camera; rejected images are hatched."""
     position, ticks = 0, []
     for k, name in enumerate(calibration.names):
-        own = [e for e in calibration.errors if e.camera == name]
-        at = position + np.arange(len(own))
-        for x, e in zip(at, own, strict=True):
+        errors = [e for e in calibration.errors if e.camera == name]
+        at = position + np.arange(len(errors))
+        for x, e in zip(at, errors, strict=True):
             colour = REJECTED if not e.used else (ON_BACKGROUND if e.background else FREE)
             axes.bar(x, e.rms, color=colour, hatch="" if e.used else "//", width=0.9)
         axes.plot([at[0] - 0.5, at[-1] + 0.5], [calibration.rms(name)] * 2, color="black", linewidth=1)

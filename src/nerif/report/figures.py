@@ -43,7 +43,7 @@ def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Ax
     """Draw the convergence: terms of the loss, or residual and penalty, over time; logarithmic."""
     names = dict.fromkeys(name for record in history for name in record)
     across = "seconds" if "seconds" in names else "step"
-    colours, drawn = [*COLOURS.values()], 0
+    colours, curves = [*COLOURS.values()], 0
     for name in (n for n in names if n not in NOT_DRAWN):
         points = [(r[across], r[name]) for r in history if r.get(name, 0) > 0 and np.isfinite(r.get(name, np.nan))]
         if len(points) < 2:
@@ -52,14 +52,14 @@ def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Ax
         total = name == "loss"  # drawn below its terms, one of which may be nearly all of it
         axes.plot(
             x, y, label=TERMS.get(name, name.replace("_", " ")), linewidth=3 if total else 1, zorder=1 if total else 2,
-            color="0.75" if total else colours[drawn % len(colours)],
-            linestyle=("-", "--", ":", "-.")[drawn // len(colours) % 4],
+            color="0.75" if total else colours[curves % len(colours)],
+            linestyle=("-", "--", ":", "-.")[curves // len(colours) % 4],
         )  # fmt: skip
-        drawn += 1
+        curves += 1
     axes.set(yscale="log", xlabel="time [s]" if across == "seconds" else "step")
     axes.set_ylabel("loss [1]" if method == "nerif" else "scaled residual, penalty [1]")
     axes.grid(**GRID)
-    if drawn:
+    if curves:
         axes.legend(frameon=False)
     return axes
 

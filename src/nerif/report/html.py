@@ -17,27 +17,10 @@ from nerif.data.volume import name_of
 from nerif.forward.registry import technique_of
 from nerif.plotting.drawing import drawn_of, map_colours
 from nerif.plotting.notebook import image, number
-from nerif.report.figures import (
-    banded,
-    draw_bands,
-    draw_corrections,
-    draw_history,
-    draw_refined_rig,
-    draw_reliability,
-    draw_residuals,
-    draw_slice_scores,
-)
+from nerif.report import figures, summary
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
-from nerif.report.summary import (
-    accuracy_rows,
-    cross_validated,
-    field_rows,
-    headline,
-    measurement_rows,
-    statements,
-)
 from nerif.report.view_images import colour_table, view_images
 from nerif.results.directory import Result
 
@@ -73,12 +56,12 @@ def render(result: Result) -> str:
         title=result.directory.resolve().name,
         source=Path(str(measurement)).name if measurement else "",
         finished=result.about.get("finished", ""),
-        headline=headline(result),
-        statements=statements(result),
+        headline=summary.headline(result),
+        statements=summary.statements(result),
         cards=(
-            ("Measurement", measurement_rows(result)),
-            ("Reconstruction", field_rows(result)),
-            ("Accuracy", accuracy_rows(result)),
+            ("Measurement", summary.measurement_rows(result)),
+            ("Reconstruction", summary.field_rows(result)),
+            ("Accuracy", summary.accuracy_rows(result)),
         ),
         scene=scene,
         arrays=arrays,
@@ -86,7 +69,7 @@ def render(result: Result) -> str:
         first_view=next((v.name for v in views if v.withheld), views[0].name if views else ""),
         scales=scales,
         scores=scores,
-        first_run=cross_validated(result),
+        first_run=summary.cross_validated(result),
         plane=_plane(meridian),
         plane_title="Around the axis" if meridian is None or meridian.axial else "In the plane of the flow",
         curves=_curves(result),
@@ -151,21 +134,21 @@ def _curves(result: Result) -> list[tuple[str, str]]:
         curves.append((title, svg(lambda axes: draw(axes, *data))))
 
     if result.history:
-        add("Convergence", draw_history, result.history, str(result.settings.get("method", "nerif")))
+        add("Convergence", figures.draw_history, result.history, str(result.settings.get("method", "nerif")))
     if result.reprojection is not None:
         several = len(result.reprojection.measurement.observations) > 1
         for name, residuals in residuals_over_sigma(result.reprojection).items():
-            add(f"Residuals{f' of {name}' if several else ''} over the noise", draw_residuals, residuals)
+            add(f"Residuals{f' of {name}' if several else ''} over the noise", figures.draw_residuals, residuals)
     if rig := metrics.get("rig"):
-        add("Corrections of the cameras", draw_corrections, rig)
+        add("Corrections of the cameras", figures.draw_corrections, rig)
         if result.reprojection is not None:
-            add("Refined camera positions", draw_refined_rig, result.reprojection.measurement.cameras, rig)
-    for quantity in banded(result.volumes):
-        add(f"{name_of(quantity).capitalize()} with bands of 90 %", draw_bands, result.volumes, quantity)
+            add("Refined camera positions", figures.draw_refined_rig, result.reprojection.measurement.cameras, rig)
+    for quantity in figures.banded(result.volumes):
+        add(f"{name_of(quantity).capitalize()} with bands of 90 %", figures.draw_bands, result.volumes, quantity)
     if "reliability" in (metrics.get("coverage") or {}):
-        add("Reliability of the bands, against the truth", draw_reliability, metrics["coverage"])
+        add("Reliability of the bands, against the truth", figures.draw_reliability, metrics["coverage"])
     if metrics.get("slices"):
-        add("Against the truth, slice by slice", draw_slice_scores, metrics["slices"])
+        add("Against the truth, slice by slice", figures.draw_slice_scores, metrics["slices"])
     return curves
 
 

@@ -27,11 +27,11 @@ def _shown(meridian: Meridian, quantity: str) -> np.ndarray:
 
 def _banded(meridian: Meridian, quantity: str) -> Meridian:
     """The quantity as `line` and, where it has standard deviations, its band of 90 % as `low` and `high`."""
-    known, std = meridian.quantities, meridian.quantities.get(f"{quantity}_std")
+    std = meridian.quantities.get(f"{quantity}_std")
     curves = {"line": _shown(meridian, quantity)}
     if std is not None:
         for name, (percentile, deviations) in zip(("low", "high"), TAILS.items(), strict=True):
-            end = known.get(f"{quantity}_{percentile}")
+            end = meridian.quantities.get(f"{quantity}_{percentile}")
             curves[name] = curves["line"] + deviations * std if end is None else end
     return replace(meridian, quantities=curves)
 

@@ -18,29 +18,9 @@ from nerif.common.written_files import OwnFiles
 from nerif.data.measurement import Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
-from nerif.plotting.drawing import (
-    DIVERGING,
-    add_colour_bar,
-    colour_range,
-    draw_map,
-    draw_slices,
-    drawn_of,
-    label_of,
-    map_range,
-    shown,
-    style,
-)
-from nerif.report.figures import (
-    banded,
-    draw_bands,
-    draw_corrections,
-    draw_history,
-    draw_line,
-    draw_reliability,
-    draw_residuals,
-    draw_slice_scores,
-    draw_view_scores,
-)
+from nerif.plotting import drawing
+from nerif.plotting.drawing import add_colour_bar, colour_range, draw_map, drawn_of, label_of, map_range, shown
+from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.view_images import lattice_step
@@ -69,7 +49,7 @@ def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi
     Foreign or edited files of these names are renamed (OwnFiles).
     """
     paths, files = [], OwnFiles(directory)
-    with style():
+    with drawing.style():
         for name, figure in figures_of(result, *JOURNALS[journal]):
             for ending in ("pdf", "png"):
                 paths.append(directory / f"{name}.{ending}")
@@ -109,21 +89,21 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
             yield f"view_{plain}", view(result.reprojection, i, double)
         several = len(result.reprojection.measurement.observations) > 1
         for measured, residuals in residuals_over_sigma(result.reprojection).items():
-            yield f"residuals_{measured}" if several else "residuals", plot(0.7, draw_residuals, residuals)
+            yield f"residuals_{measured}" if several else "residuals", plot(0.7, figures.draw_residuals, residuals)
         yield "rig", rig(result.reprojection, double)
     if metrics.get("rig"):
-        yield "moves", plot(0.8, draw_corrections, metrics["rig"])
+        yield "moves", plot(0.8, figures.draw_corrections, metrics["rig"])
     if metrics.get("views"):
-        yield "views", plot(0.8, draw_view_scores, metrics["views"])
-    for quantity in banded(result.volumes):
-        yield f"bands_{quantity}", plot(0.7, draw_bands, result.volumes, quantity)
+        yield "views", plot(0.8, figures.draw_view_scores, metrics["views"])
+    for quantity in figures.banded(result.volumes):
+        yield f"bands_{quantity}", plot(0.7, figures.draw_bands, result.volumes, quantity)
     if "reliability" in (metrics.get("coverage") or {}):
-        yield "reliability", plot(0.9, draw_reliability, metrics["coverage"])
+        yield "reliability", plot(0.9, figures.draw_reliability, metrics["coverage"])
     if result.history:
         method = str(result.settings.get("method", "nerif"))
-        yield "history", plot(0.7, draw_history, result.history, method)
+        yield "history", plot(0.7, figures.draw_history, result.history, method)
     if metrics.get("slices"):
-        yield "slice_scores", plot(0.7, draw_slice_scores, metrics["slices"])
+        yield "slice_scores", plot(0.7, figures.draw_slice_scores, metrics["slices"])
 
 
 def _page(width: float, height_over_width: float, layout: str = "constrained") -> Figure:
@@ -142,7 +122,7 @@ def slices(volume: Volume, width: float, std: Volume | None = None) -> Figure:
     row = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
     low, high = limits = colour_range(shown(volume))
     doubtful = None if std is None else std.values.double().numpy() > HATCHED_STD * (high - low)
-    draw_slices(row, volume, limits, doubtful=doubtful)
+    drawing.draw_slices(row, volume, limits, doubtful=doubtful)
     add_colour_bar(row, label_of(volume.quantity))
     return figure
 
@@ -210,7 +190,7 @@ def _lines(maps: list[Maps], width: float) -> Figure:
     for (k, c, (o, measured, predicted, sigma)), above, below in zip(panels, grid[::2], grid[1::2], strict=True):
         line = (slice(None), k, c) if upright else (k, slice(None), c)
         deviation, label = None if sigma is None else sigma[line], f"{o.components[c]} [{o.technique.unit}]"
-        draw_line((above, below), measured[line], predicted[line], deviation, label)
+        figures.draw_line((above, below), measured[line], predicted[line], deviation, label)
         above.set_title(f"{across} {k}" if count > 1 else "")
     grid[-1].set_xlabel(f"{along} [px]")
     figure.align_ylabels(grid)
@@ -260,7 +240,7 @@ def comparison(field: Volume, error: Volume, width: float) -> Figure:
     error_label = "error of n [1]" if field.quantity == INDEX else f"error of {label}"
     volumes = (("reconstruction", field, limits), ("truth", truth, limits), ("error", error, (-largest, largest)))
     for (name, volume, ends), row in zip(volumes, grid, strict=True):
-        draw_slices(row, volume, ends, DIVERGING if name == "error" else None, name)
+        drawing.draw_slices(row, volume, ends, drawing.DIVERGING if name == "error" else None, name)
         add_colour_bar(list(row), error_label if name == "error" else label)
     return figure
 

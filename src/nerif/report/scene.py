@@ -52,9 +52,9 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
         variants["std"] = "Standard deviation"
     if "error" in sources:
         variants |= {"truth": "Truth", "error": "Error"}
-    drawn = {q: _quantity(q, result.volumes[q], default_level(result.volumes[q])) for q in quantities}
+    entries = {q: _quantity(q, result.volumes[q], default_level(result.volumes[q])) for q in quantities}
     scene = {
-        **_scene(small.grid, field.grid, drawn, variants, (DIVERGING, "cividis")),
+        **_scene(small.grid, field.grid, entries, variants, (DIVERGING, "cividis")),
         "arrays": {name: {"low": p["low"], "step": p["step"]} for name, p in packed.items()},
         "cameras": _cameras(result),
         "backgrounds": result.measurement is not None and any(c.background for c in result.measurement.cameras),

@@ -38,8 +38,8 @@ def render_sequence(store: VolumeSequence) -> str:
             f"expected index_excess among its quantities, got {', '.join(store.quantities)}", field=store.path
         )
     places = np.linspace(0, len(frames) - 1, min(len(frames), MAX_FRAMES)).round().astype(int)
-    drawn = [frames[i] for i in np.unique(places)]
-    scene, arrays = scene_over_time(store, drawn)
+    sample = [frames[i] for i in np.unique(places)]
+    scene, arrays = scene_over_time(store, sample)
     about = store.attributes
     measurement = about.get("measurement")
     kinds = [technique(name) for name in about.get("techniques", ())] or [technique_of(field)]
@@ -58,7 +58,7 @@ def render_sequence(store: VolumeSequence) -> str:
         curves=_curves(store, frames),
         settings=flat({k: v for k, v in about.items() if k not in ("settings", "network", "references")})
         + flat(about.get("settings", {})),
-        shown_of=(len(drawn), len(frames)),
+        shown_of=(len(sample), len(frames)),
     )
 
 
@@ -66,17 +66,17 @@ def _statements(store: VolumeSequence) -> list[Statement]:
     if "status" not in store.group:
         return [Statement("note", "These volumes were simulated or imported, not reconstructed.")]
     status = np.asarray(store.array("status")[:])
-    found = []
+    remarks = []
     missing, failed = int((status == 0).sum()), np.flatnonzero(status == 2)
     if missing:
         text = f"{missing} of {len(status)} frames are missing; the same command again reconstructs them."
-        found.append(Statement("warning", text))
+        remarks.append(Statement("warning", text))
     if len(failed):
         first = f"frame {failed[0]}: {store.array('reason')[:][failed[0]]}"
-        found.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
+        remarks.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
     if not store.attributes.get("withhold", ()):
-        found.append(Statement("note", "No view was withheld, so the fields are not validated on independent data."))
-    return found
+        remarks.append(Statement("note", "No view was withheld, so the fields are not validated on independent data."))
+    return remarks
 
 
 def _frame_rows(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:

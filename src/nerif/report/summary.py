@@ -99,10 +99,10 @@ def accuracy_rows(result: Result) -> Rows:
     for title, views in (("Withheld view", withheld), ("Training views", training)):
         quantities = dict.fromkeys(v["measured"] for v in views)
         for measured in quantities:
-            own = [v for v in views if v["measured"] == measured]
-            plural = "s" if views is withheld and len(own) > 1 else ""
+            group = [v for v in views if v["measured"] == measured]
+            plural = "s" if views is withheld and len(group) > 1 else ""
             name = f"{title}{plural}{f', {measured}' if len(quantities) > 1 else ''}"
-            rows.append((name, _scores(own)))
+            rows.append((name, _scores(group)))
         if not views and not (views is withheld and first_run):
             rows.append((title, "none" if training else "unknown"))
     for view in first_run:
@@ -182,13 +182,13 @@ def headline(result: Result) -> Statement:
 
 def statements(result: Result) -> list[Statement]:
     """Return what limits the accuracy of a result, and what supports it, most severe first."""
-    found = [Statement("bad" if gap.name in VITAL else "note", gap.sentence) for gap in result.missing]
+    remarks = [Statement("bad" if gap.name in VITAL else "note", gap.sentence) for gap in result.missing]
     for part in (
         _of_outcome, _of_withheld_views, _of_residuals, _of_correlated_residuals, _of_truth, _of_gas, _of_masks,
         _of_bootstrap, _of_rig,
     ):  # fmt: skip
-        found += part(result)
-    return sorted(found, key=lambda s: -LEVELS.index(s.level))
+        remarks += part(result)
+    return sorted(remarks, key=lambda s: -LEVELS.index(s.level))
 
 
 def _of_outcome(result: Result) -> list[Statement]:
@@ -245,34 +245,38 @@ def _of_residuals(result: Result) -> list[Statement]:
         return [Statement("note", f"{text} {remedy}")]
     lowest, highest = (extreme(views, key=lambda v: v["rms_over_sigma"]) for extreme in (min, max))
     low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
-    found = []
+    remarks = []
     if high > NOISE_RANGE[1]:
-        white = bool((highest.get("leftover") or {"white": False})["white"])
+        white = bool((highest.get("residual_test") or {"white": False})["white"])
         level = "warning" if high <= 3 or white else "bad"  # a white residual may be noise with a wrong sigma
         text = f"The residual of training view {_place(highest, views)} is {high:.1f} × the stated noise. "
         text += "Possible causes: a short run, open faces, the calibration (nerif check), a sigma that is too small."
-        found.append(Statement(level, text))
+        remarks.append(Statement(level, text))
     if low < NOISE_RANGE[0]:
         text = f"The residual of training view {_place(lowest, views)} is {low:.2f} × the stated noise: "
-        found.append(Statement("warning", text + "the field fits noise, or sigma is too large."))
-    return found or [Statement("good", f"The residuals of the training views are {low:.2f} to {high:.2f} × the noise.")]
+        remarks.append(Statement("warning", text + "the field fits noise, or sigma is too large."))
+    return remarks or [
+        Statement("good", f"The residuals of the training views are {low:.2f} to {high:.2f} × the noise.")
+    ]
 
 
 def _of_correlated_residuals(result: Result) -> list[Statement]:
-    views = [v for v in _views(result, False) if not (v.get("leftover") or {"white": True})["white"]]
-    found = []
-    for cause in dict.fromkeys(v["leftover"]["cause"] for v in views):
-        own = sorted((v for v in views if v["leftover"]["cause"] == cause), key=lambda v: -v["leftover"]["grain"])
-        worst, share = own[0], correlated_share(own[0])
-        names = ", ".join(_place(v, views) for v in own[:MAX_NAMES]) + (", ..." if len(own) > MAX_NAMES else "")
-        verb = f"Residuals of {len(own)} training views ({names}) are"
-        verb = verb if len(own) > 1 else f"The residual of training view {names} is"
-        where = f"row {worst['leftover']['row']:.0f}, column {worst['leftover']['column']:.0f}"
+    views = [v for v in _views(result, False) if not (v.get("residual_test") or {"white": True})["white"]]
+    remarks = []
+    for cause in dict.fromkeys(v["residual_test"]["cause"] for v in views):
+        group = sorted(
+            (v for v in views if v["residual_test"]["cause"] == cause), key=lambda v: -v["residual_test"]["grain"]
+        )
+        worst, share = group[0], correlated_share(group[0])
+        names = ", ".join(_place(v, views) for v in group[:MAX_NAMES]) + (", ..." if len(group) > MAX_NAMES else "")
+        verb = f"Residuals of {len(group)} training views ({names}) are"
+        verb = verb if len(group) > 1 else f"The residual of training view {names} is"
+        where = f"row {worst['residual_test']['row']:.0f}, column {worst['residual_test']['column']:.0f}"
         text = f"{verb} spatially correlated, up to {share:.1%} of the signal in {_place(worst, views)} around {where}."
         reason = CAUSES.get(cause, "unknown; perhaps flow beyond the box, or a short run")
         text += f" Likely cause: {reason}."
-        found.append(Statement("warning" if share > CORRELATED else "note", text))
-    return found
+        remarks.append(Statement("warning" if share > CORRELATED else "note", text))
+    return remarks
 
 
 def _of_truth(result: Result) -> list[Statement]:
@@ -306,12 +310,12 @@ def _of_rig(result: Result) -> list[Statement]:
     if not table:
         return []
     first, *lines = moved_lines(table)
-    found = [Statement("note", f"Camera refinement: {first}.")]
-    return found + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
+    remarks = [Statement("note", f"Camera refinement: {first}.")]
+    return remarks + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
 
 
 def _of_masks(result: Result) -> list[Statement]:
-    found = []
+    remarks = []
     for quantity in ("density", "temperature"):
         volume = result.volumes.get(quantity)
         count = int(volume.notes.get("masked_voxels", 0)) if volume is not None else 0
@@ -321,5 +325,5 @@ def _of_masks(result: Result) -> list[Statement]:
         voxels = "voxel" if count == 1 else "voxels"
         where = volume.notes.get("masked_where")
         text = f"{quantity.capitalize()} is masked in {count} {voxels} ({percent(share)}): {where}."
-        found.append(Statement("note" if share < 0.05 else "warning", text))
-    return found
+        remarks.append(Statement("note" if share < 0.05 else "warning", text))
+    return remarks

@@ -2,7 +2,7 @@
 
 Each says whether it is wanted, and writes its own files and its own section of metrics.json. A run that is resumed
 passes through all of them again: what is expensive (cross-validation, fit, trials) continues from its own checkpoint or
-is read, the rest is written anew.
+is read, the rest is written again.
 """
 
 from __future__ import annotations
