@@ -36,7 +36,7 @@ class Pair:
     def __init__(self, reference: np.ndarray, flow: np.ndarray, blur: float) -> None:
         size = [(flow.shape[0], flow.shape[1])]
         maps = {"reference": torch.tensor(reference)[None].float(), "flow": torch.tensor(flow)[None].float()}
-        maps = Images.softened(maps, size, blur) if blur else maps
+        maps = Images.blur(maps, size, blur) if blur else maps
         self.references = References(maps["reference"], size)
         self.references.match(maps["flow"])
         row, column = torch.meshgrid(*(torch.arange(n) for n in flow.shape), indexing="ij")
@@ -53,7 +53,7 @@ class Pair:
 
     def left(self, d: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
         """Return the difference to the flow image, grey values."""
-        return self.references.seen(self.view, self.pixel, d) - self.flow
+        return self.references.flow_at(self.view, self.pixel, d) - self.flow
 
     def rms(self, d: Float[Tensor, "n 2"]) -> float:
         """Return the rms difference inside the margin, gain and offset fitted."""

@@ -134,7 +134,7 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         found: dict[str, Any] = {"name": camera.name, "withheld": camera.name in reprojection.withheld}
         found |= {"measured": kind.measured, "unit": kind.unit}
         if kind.derived:  # what no flow would show is no merit of the field
-            still = models[kind].mapped(torch.zeros(height, width, kind.integrals), view)
+            still = models[kind].to_map(torch.zeros(height, width, kind.integrals), view)
             measured, predicted = measured - still, predicted - still
         found |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
         if kind.unit != "1":

@@ -181,7 +181,7 @@ def reproject(
                 known[integral, i] = sampled(camera).where(seen, torch.zeros(()))
             elif (integral, i) not in known:
                 known[integral, i] = predict_view(field, camera, projector, box, device)
-            predicted[i, :height, :width] = forward.mapped(known[integral, i], i)
+            predicted[i, :height, :width] = forward.to_map(known[integral, i], i)
             done += 1
             on_view(done, total)
         maps[kind.name] = predicted

@@ -90,7 +90,7 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, pref
         return images.without(measurement)
     whole = measurement if source == "both" or displacements is None else displacements.without(measurement)
     sizes = [camera.image_size for camera in whole.cameras]
-    maps = images.technique.softened(whole.maps, sizes, blur)
+    maps = images.technique.blur(whole.maps, sizes, blur)
     variable = images.technique.measured
     maps[variable] = maps[variable].where(whole.usable_for(_pair(whole)[0] or images), math.nan)
     if displacements is not None:

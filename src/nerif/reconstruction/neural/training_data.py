@@ -183,7 +183,7 @@ class TrainingData:
 
     def kept(self) -> dict[str, Tensor]:
         """Return what has been fitted beside the field, as a checkpoint keeps it."""
-        kept = {str(i): model.settled.clone() for i, model in enumerate(_settling(self.target))}
+        kept = {str(i): model.brightness.clone() for i, model in enumerate(_settling(self.target))}
         return kept | kept_of(self.refinement)
 
     def restore(self, stage: int, kept: dict[str, Tensor]) -> None:
@@ -199,7 +199,7 @@ class TrainingData:
         """Let the images that are held back be as bright as those that are not."""
         if self.withheld is not None:
             for model, judge in zip(_settling(self.target), _settling(self.withheld), strict=False):
-                judge.adopt(model.settled[[self.names.index(name) for name in self.judging]])
+                judge.adopt(model.brightness[[self.names.index(name) for name in self.judging]])
 
     def __len__(self) -> int:
         return len(self.target)
