@@ -71,14 +71,10 @@ class Intensity(Absorption):
 
     p = 1 has uniform noise if it is that of the detector, p = 1/2 if it is shot noise: the variance of the square root
     of a Poisson variable is 1/4, whatever its mean (Bartlett, J. R. Stat. Soc. Suppl. 3, 1936).
-
-    Parameters
-    ----------
-    power : p
     """
 
     linear = False
-    power: float = 1.0
+    power: float = 1.0  # p
 
     @property
     def linear_twin(self) -> ForwardModel:
@@ -92,12 +88,10 @@ class Intensity(Absorption):
         return read, None if sigma is None else self.power * read * sigma
 
 
+# readings by the names that settings have for them, the default first
 MODELS: dict[str, Callable[[], Absorption]] = {
-    "absorbance": Absorption,
-    "intensity": Intensity,
-    "poisson": partial(Intensity, 0.5),
-}
-"""Readings by the names that settings have for them, the default first."""
+    "absorbance": Absorption, "intensity": Intensity, "poisson": partial(Intensity, 0.5)
+}  # fmt: skip
 
 
 def absorbance(
@@ -112,19 +106,14 @@ def absorbance(
 
     Where no light is left, I - D is half a quantum, with the variance of a whole one: such a pixel shows that the
     absorbance is large, and omitting it would bias towards its brighter neighbours. Pixels without a reference are NaN.
+    It is an error if, by more than their noise, intensities are negative or I exceeds I0.
 
     Parameters
     ----------
-    intensity, reference : I and I0, counts
-    dark : D, counts without light
+    intensity, reference, dark : I, I0 and D, counts
     electrons_per_count : g, detected quanta per count
     read_noise : r, standard deviation, counts
     reference_images : N, images averaged in the reference
-
-    Raises
-    ------
-    InputError
-        If shapes differ, or if, by more than their noise, intensities are negative or I exceeds I0.
     """
     for name, image in (("reference", reference), ("dark", np.asarray(dark))):
         if image.shape != intensity.shape and (name, image.shape) != ("dark", ()):
@@ -136,10 +125,10 @@ def absorbance(
     one, many = (np.maximum(x, quantum) * quantum + read_noise**2 for x in (passed, whole))
     noise = [one, many / reference_images]
     for name, x, variance in (("intensity", passed, noise[0]), ("reference", whole, noise[1])):
-        negative = float(np.mean(x < -MAX_NOISE * np.sqrt(variance)))
-        if negative > MAX_SHARE:
-            where = f"{negative:.0%} of the pixels"
-            raise InputError(f"expected counts of 0 or more, got negative ones at {where}; is dark right?", field=name)
+        share = float(np.mean(x < -MAX_NOISE * np.sqrt(variance)))
+        if share > MAX_SHARE:
+            message = f"expected counts of 0 or more, got negative ones at {share:.0%} of the pixels; is dark right?"
+            raise InputError(message, field=name)
     brighter = float(np.mean(passed - whole > MAX_NOISE * np.sqrt(noise[0] + noise[1])))
     if brighter > MAX_SHARE:
         raise InputError(

@@ -36,39 +36,25 @@ Mask = Bool[Tensor, "row column"]
 
 
 class Light(Protocol):
-    """The part of a measurement on which forward models depend."""
+    """The part of a measurement on which forward models depend; `maps` are by their names in the file."""
 
     @property
-    def n_ambient(self) -> float:
-        """Refractive index of the ambient."""
-
+    def n_ambient(self) -> float: ...
     @property
-    def wavelength_nm(self) -> float | None:
-        """Wavelength of the light, nm."""
-
+    def wavelength_nm(self) -> float | None: ...
     @property
-    def cameras(self) -> Sequence[Camera]:
-        """Cameras of the views."""
-
+    def cameras(self) -> Sequence[Camera]: ...
     @property
-    def maps(self) -> Mapping[str, Tensor]:
-        """Maps of all views by their names in the file, except displacements."""
+    def maps(self) -> Mapping[str, Tensor]: ...
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Quadrature weights of the samples of rays: a_m = profile_m value, b_m = profile_m slope.
+    """Quadrature weights of the samples of rays: a_m = profile_m value, b_m = profile_m slope."""
 
-    Parameters
-    ----------
-    profile : (n, m) along each ray, with the length of each sample
-    value : (n, c) of f, or None for 0
-    slope : (n, c, 3) of grad f, or None for 0
-    """
-
-    profile: Float[Tensor, "n m"]
-    value: Float[Tensor, "n c"] | None = None
-    slope: Float[Tensor, "n c 3"] | None = None
+    profile: Float[Tensor, "n m"]  # includes the length of each sample
+    value: Float[Tensor, "n c"] | None = None  # of f; None for 0
+    slope: Float[Tensor, "n c 3"] | None = None  # of grad f; None for 0
 
     def __call__(self, value: Tensor | None, gradient: Tensor | None) -> Float[Tensor, "n c"]:
         """Return the prediction from f (n, m) and grad f (n, m, 3) at the samples; one without weights may be None."""
@@ -85,11 +71,8 @@ class Weights:
 
     def in_units(self, value: float, gradient: float) -> Weights:
         """Return the weights of a field and a gradient in these units."""
-        return Weights(
-            self.profile,
-            None if self.value is None else self.value * value,
-            None if self.slope is None else self.slope * gradient,
-        )
+        a, b = self.value, self.slope
+        return Weights(self.profile, None if a is None else a * value, None if b is None else b * gradient)
 
     def sizes(self, length: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Return the prediction, rms over channels, for a field of 1 whose gradient is 1 over a length (mm)."""
@@ -105,59 +88,34 @@ class Weights:
 class ForwardModel(ABC):
     """A technique: its field, its measured quantity, and the relation between them."""
 
-    name: ClassVar[str]
-    """Value of attribute `technique` of measurement files."""
-    tomography: ClassVar[str] = "tomography"
-    """Name of the reconstruction of a volume."""
-    measured: ClassVar[str]
-    """Variable of the file with the measured quantity."""
-    sigma: ClassVar[str]
-    """Variable with its standard deviation."""
-    beside: ClassVar[Mapping[str, tuple[int, str]]] = {}
-    """Further maps: components and unit, by variable."""
-    channels: ClassVar[tuple[str, ...]]
-    """Names of the components of the measured quantity."""
-    integrals: ClassVar[int] = 0
-    """Components of the path integral of a pixel; 0 for one per channel."""
-    unit: ClassVar[str]
-    """Unit of the measured quantity."""
-    misscaled: ClassVar[str] = "another scale"
-    """Likely cause if all values of one view are too large or too small."""
-    limits: ClassVar[tuple[float, float]]
-    """Smallest plausible sigma; largest plausible value and sigma."""
-    quantity: ClassVar[str]
-    """The field (volume.QUANTITIES)."""
-    gauge: ClassVar[bool] = False
-    """Whether the data leave a constant of the field undetermined."""
-    background: ClassVar[bool] = False
-    """Whether the cameras need a background."""
-    bounds: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
-    """Lowest and highest possible value of the field, in its unit."""
-    traced: ClassVar[bool] = False
-    """Whether there is a model with rays traced through the field (ray_tracing.py)."""
-    straight: ClassVar[bool] = True
-    """Whether samples lie on the straight ray."""
+    name: ClassVar[str]  # value of attribute `technique` of measurement files
+    tomography: ClassVar[str] = "tomography"  # name of the reconstruction of a volume
+    measured: ClassVar[str]  # variable of the file with the measured quantity
+    sigma: ClassVar[str]  # variable with its standard deviation
+    beside: ClassVar[Mapping[str, tuple[int, str]]] = {}  # further maps: components and unit, by variable
+    channels: ClassVar[tuple[str, ...]]  # names of the components of the measured quantity
+    integrals: ClassVar[int] = 0  # components of the path integral of a pixel; 0 for one per channel
+    unit: ClassVar[str]  # of the measured quantity
+    misscaled: ClassVar[str] = "another scale"  # likely cause if all values of one view are too large or too small
+    limits: ClassVar[tuple[float, float]]  # smallest plausible sigma; largest plausible value and sigma
+    quantity: ClassVar[str]  # the field (volume.QUANTITIES)
+    gauge: ClassVar[bool] = False  # the data leave a constant of the field undetermined
+    background: ClassVar[bool] = False  # the cameras need a background
+    bounds: ClassVar[tuple[float, float]] = (-math.inf, math.inf)  # lowest and highest possible value of the field
+    traced: ClassVar[bool] = False  # there is a model with rays traced through the field (ray_tracing.py)
+    straight: ClassVar[bool] = True  # samples lie on the straight ray
+    # a pixel is a sum of a non-negative field with positive weights (on a grid with ambient faces, where the spline is
+    # mirrored, weights may be as low as minus a hundredth of the largest)
     additive: ClassVar[bool] = False
-    """Whether a pixel is a sum of a non-negative field with positive weights (on a grid with ambient faces, where the
-    spline is mirrored, weights may be as low as minus a hundredth of the largest)."""
-    fill: ClassVar[float] = 1.0
-    """Approximate share of the path through the box that contributes: for the size of the field."""
-    gains: ClassVar[bool] = False
-    """Whether intensity gains of cameras can be fitted."""
-    averaged: ClassVar[bool] = True
-    """Whether the mean over neighbouring pixels is the measurement of their mean ray."""
-    windowed: ClassVar[bool] = False
-    """Whether a pixel may be the mean over a correlation window."""
-    derived: ClassVar[str] = ""
-    """Technique whose values are computed from these, such as displacements from images."""
-    guess: ClassVar[str] = ""
-    """Map with approximate values of the path integral."""
-    outlier: ClassVar[float] = math.inf
-    """Residual in sigma beyond which the loss is linear (Huber)."""
-    settles: ClassVar[bool] = False
-    """Whether parameters of the images have to be fitted beside the field (`settle`)."""
-    linear: ClassVar[bool] = True
-    """Whether the weights are the whole model, without `bend` and `read`."""
+    fill: ClassVar[float] = 1.0  # approximate share of the path through the box that contributes: for the field's size
+    gains: ClassVar[bool] = False  # intensity gains of cameras can be fitted
+    averaged: ClassVar[bool] = True  # the mean over neighbouring pixels is the measurement of their mean ray
+    windowed: ClassVar[bool] = False  # a pixel may be the mean over a correlation window
+    derived: ClassVar[str] = ""  # technique whose values are computed from these, such as displacements from images
+    guess: ClassVar[str] = ""  # map with approximate values of the path integral
+    outlier: ClassVar[float] = math.inf  # residual in sigma beyond which the loss is linear (Huber)
+    settles: ClassVar[bool] = False  # parameters of the images have to be fitted beside the field (`settle`)
+    linear: ClassVar[bool] = True  # the weights are the whole model, without `bend` and `read`
 
     @classmethod
     @abstractmethod
@@ -170,7 +128,7 @@ class ForwardModel(ABC):
 
     @classmethod
     def in_pixels(cls) -> bool:
-        """Return whether values are lengths in the image, which scale with it."""
+        """Return whether values are lengths in the image."""
         return cls.unit == "px"
 
     @property
@@ -205,9 +163,9 @@ class ForwardModel(ABC):
     ) -> tuple[SampleVectors, SampleVectors]:
         """Return the offset of the samples from the straight ray (mm), and a vector to subtract from their gradient.
 
-        Only for models that are not `straight`; field and gradient are those on the straight ray.
+        For models that are not `straight`, from field and gradient on the straight ray.
         """
-        raise NotImplementedError(f"{type(self).__name__} has straight rays")
+        raise NotImplementedError
 
     @classmethod
     def check(cls, values: Map, sigma: Map | None, usable: Mask) -> None:
@@ -238,11 +196,11 @@ class ForwardModel(ABC):
     @property
     def brightness(self) -> Tensor:
         """The parameters from `settle`, view by view."""
-        raise NotImplementedError(f"{type(self).__name__} settles nothing")
+        raise NotImplementedError
 
     def adopt(self, brightness: Tensor) -> None:
         """Set the parameters to those of another fit."""
-        raise NotImplementedError(f"{type(self).__name__} settles nothing")
+        raise NotImplementedError
 
     @classmethod
     def complete(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -251,12 +209,7 @@ class ForwardModel(ABC):
 
     @classmethod
     def blur(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
-        """Return maps blurred by a Gaussian of a standard deviation, where that helps to fit them.
-
-        Parameters
-        ----------
-        sizes : (height, width) of each view, px
-        """
+        """Return maps of views of (height, width) px, blurred by a Gaussian if that helps to fit them."""
         return dict(maps)
 
     def prepare(self) -> None:

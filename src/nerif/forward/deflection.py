@@ -24,14 +24,7 @@ __all__ = ["Curved", "Deflection", "LeverArm", "Paraxial"]
 
 @dataclass(frozen=True)
 class Deflection(ForwardModel):
-    """Displacement of a background by refraction.
-
-    Parameters
-    ----------
-    n_ambient : refractive index from which the excess is counted
-
-    Source: the forward model in docs/conventions.md; paper, Eqs. (1) and (3).
-    """
+    """Displacement of a background by refraction (docs/conventions.md; paper, Eqs. (1) and (3))."""
 
     name = "deflection"
     tomography = "background-oriented schlieren tomography"
@@ -41,10 +34,7 @@ class Deflection(ForwardModel):
     misscaled = "binning, or another lever arm"
     limits = (1e-6, 1e5)
     quantity = "index_excess"
-    gauge = True
-    background = True
-    traced = True
-    windowed = True
+    gauge = background = traced = windowed = True
 
     n_ambient: float = 1.0
 
@@ -80,8 +70,7 @@ class Paraxial(Deflection):
 class Curved(LeverArm):
     """Samples on the ray as bent by the field: correct to second order in the deflection."""
 
-    straight = False
-    linear = False
+    straight = linear = False
 
     @property
     def linear_twin(self) -> ForwardModel:
@@ -103,5 +92,5 @@ class Curved(LeverArm):
         return offset + turn * (step / 8)[..., None], angle * along[..., None] + slower
 
 
+# by the names that settings have for them, the default first
 MODELS: dict[str, type[Deflection]] = {"lever_arm": LeverArm, "paraxial": Paraxial, "curved": Curved}
-"""The models by the names that settings have for them, the default first."""

@@ -30,8 +30,7 @@ class Emission(LineIntegral):
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
     misscaled = "another gain or exposure"
-    additive = True
-    gains = True
+    additive = gains = True
     bounds = (0.0, math.inf)
 
     @classmethod

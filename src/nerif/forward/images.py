@@ -33,20 +33,16 @@ from nerif.geometry import Rays
 
 __all__ = ["ROUNDING_VARIANCE", "Images", "References", "difference_variance", "grey_variance", "local_mean"]
 
-DEGREE = 4
-"""Total degree of the polynomials of gain and offset."""
+DEGREE = 4  # total, of the polynomials of gain and offset
 RIDGE = 1e-4  # of the weight of a pixel, for every term beyond the constants
 ROUNDS, OUTLIER = 3, 3.0  # of the fit; residual in standard deviations, beyond which a pixel counts less
 MAX_PIXELS = 1 << 16  # of a view, for the fit of gain and offset
 PAD = 2  # rows and columns of the spline beyond the edges, mirrored
-GUESS = "displacement_guess"
-"""Map of an approximate displacement, px: where to begin, and about which to linearise."""
-ROUNDING_VARIANCE = 1 / 12
-"""Grey values squared."""
+GUESS = "displacement_guess"  # map of an approximate displacement, px: the start, and the point of linearisation
+ROUNDING_VARIANCE = 1 / 12  # grey values squared
 DOTS_PX = 4.0  # standard deviation of the window of local means
 MIN_PIXELS = 256  # to decide whether there is a pattern
-MIN_PATCHES, MAX_PATCH = 64, 4
-"""Patches with a common displacement: the least along the shorter side of an image, and their largest edge, px."""
+MIN_PATCHES, MAX_PATCH = 64, 4  # with a common displacement: along the shorter side of an image; their edge, px
 
 PerPixel = Float[Tensor, " n"]
 Positions = Float[Tensor, "n 2"]  # (column, row), px
@@ -81,8 +77,7 @@ class References:
         self.coefficients = coefficients.flatten()
         self.sizes = torch.tensor(sizes)
         terms = (DEGREE + 1) * (DEGREE + 2) // 2
-        self.brightness = torch.zeros(views, 2, terms)
-        """(view, 2, k) coefficients of gain and offset."""
+        self.brightness = torch.zeros(views, 2, terms)  # coefficients of gain and offset
         self.brightness[:, 0, 0] = 1
 
     def flow_at(self, view: Views, pixel: Positions, d: Positions) -> PerPixel:
@@ -202,14 +197,7 @@ def _pixels(height: int, width: int, mask: Tensor | None = None) -> tuple[Tensor
 
 @dataclass(frozen=True, eq=False)
 class Images(LeverArm):
-    """Grey values of the flow image, as those of the displaced reference image.
-
-    Parameters
-    ----------
-    n_ambient : refractive index from which the excess is counted
-    maps : reference, flow and perhaps an approximate displacement, by their names
-    sizes : (height, width) of each view, px
-    """
+    """Grey values of the flow image, as those of the displaced reference image."""
 
     name = "images"
     measured, sigma = "flow", "image_sigma"
@@ -219,16 +207,13 @@ class Images(LeverArm):
     unit = "grey value"
     misscaled = "another exposure"
     limits = (1e-9, 1e9)
-    traced = False
-    windowed = False
-    linear = False
-    averaged = False
+    traced = windowed = linear = averaged = False
     derived, guess = "deflection", GUESS
     outlier = 0.75  # the error of splines at a sharp pattern has long tails
     settles = True
 
     maps: Mapping[str, Tensor] = field(default_factory=dict)
-    sizes: Sequence[tuple[int, int]] = ()
+    sizes: Sequence[tuple[int, int]] = ()  # (height, width) of each view, px
 
     @classmethod
     def of(cls, light: Light, model: str) -> ForwardModel:
@@ -293,7 +278,6 @@ class Images(LeverArm):
         return torch.where(valid | d.isnan().any(dim=-1), residual, 0.0).reshape(measured.shape)
 
     def settle(self, prediction: PerRay, measured: PerRay, inverse_sigma: PerRay, rays: Rays) -> None:
-        """Fit gain and offset of every view for predicted displacements."""
         view, pixel = _of_patches(rays, measured.shape[1])
         d = prediction.repeat_interleave(measured.shape[1], dim=0)
         self.references.fit(view, pixel, d, measured.flatten(), inverse_sigma.flatten())

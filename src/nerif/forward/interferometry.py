@@ -26,12 +26,7 @@ MAX_JUMPS = 0.1  # times the shorter side of the image: fewer than around a smal
 
 @dataclass(frozen=True)
 class Interferometry(LineIntegral):
-    """Unwrapped phase in fringes; it is 0 on rays through the ambient alone, which fixes the index.
-
-    Parameters
-    ----------
-    wavelength_nm : of the light in vacuum
-    """
+    """Unwrapped phase in fringes; it is 0 on rays through the ambient alone, which fixes the index."""
 
     name = "interferometry"
     tomography = "interferometric tomography"
@@ -39,7 +34,7 @@ class Interferometry(LineIntegral):
     quantity = "index_excess"
     misscaled = "another wavelength, or a double pass"
 
-    wavelength_nm: float = 532.0
+    wavelength_nm: float = 532.0  # in vacuum
 
     @classmethod
     def of(cls, light: Light, model: str) -> ForwardModel:

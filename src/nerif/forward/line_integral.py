@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from nerif.forward.base import ForwardModel, Map, Mask, Samples, Weights
 from nerif.geometry import Rays
 
 __all__ = ["MAX_NOISE", "LineIntegral", "share_below"]
 
-MAX_NOISE = 5.0
-"""Standard deviations beyond which a deviation is not noise."""
+MAX_NOISE = 5.0  # standard deviations, beyond which a deviation is not noise
 GAUSSIAN = 1.4826  # standard deviation over the median absolute value of a Gaussian variable
 
 
@@ -27,11 +28,13 @@ def share_below(lowest: float, values: Map, sigma: Map | None, usable: Mask) -> 
     """
     if not bool(usable.any()):
         return 0.0
-    if sigma is None:
+    noise: Tensor | float
+    if sigma is not None:
+        noise = sigma[usable]
+    else:
         steps = values.diff(dim=1)[usable[:, 1:] & usable[:, :-1]]
         noise = GAUSSIAN * float(steps.abs().median()) / 2**0.5 if len(steps) else 0.0
-        return float((values[usable] < lowest - MAX_NOISE * noise).float().mean())
-    return float((values[usable] < lowest - MAX_NOISE * sigma[usable]).float().mean())
+    return float((values[usable] < lowest - MAX_NOISE * noise).float().mean())
 
 
 @dataclass(frozen=True)

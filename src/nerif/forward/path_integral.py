@@ -19,33 +19,25 @@ from nerif.geometry import Rays
 
 __all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]
 
-LENS_RAYS = 16
-"""Rays through the lens of a pixel, each with half as many samples as a thin ray."""
+LENS_RAYS = 16  # through the lens of a pixel, each with half as many samples as a thin ray
 CHUNK_RAYS = {"cpu": 32, "cuda": 4096}  # arrays that stay in the cache of a CPU, and fill a GPU
 
 
 class Projector(ABC):
-    """From a field and rays to the measured quantity of the pixels."""
+    """The projections of a field along rays that are clipped to the box."""
 
-    channels: int
-    """Components of the measured quantity."""
+    channels: int  # components of the measured quantity
 
     @abstractmethod
-    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]:
-        """Return the projections of a field along rays that are clipped to the box."""
+    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]: ...
 
 
 @dataclass(frozen=True)
 class PathIntegral(Projector):
-    """The integral of a forward model by midpoints of equal intervals; through a lens the mean over its rays.
-
-    Parameters
-    ----------
-    samples : along a ray
-    """
+    """The integral of a forward model by midpoints of equal intervals; through a lens the mean over its rays."""
 
     model: ForwardModel
-    samples: int = 200
+    samples: int = 200  # along a ray
 
     def __post_init__(self) -> None:
         if self.samples < 1:
@@ -76,18 +68,12 @@ class PathIntegral(Projector):
 
 
 def places(
-    model: ForwardModel,
-    rays: Rays,
-    s: Float[Tensor, "n m"],
-    step: Float[Tensor, "n m"],
+    model: ForwardModel, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"],
     look: Callable[[Float[Tensor, "n m 3"]], tuple[Float[Tensor, "n m"], Float[Tensor, "n m 3"]]],
-) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"] | None]:
+) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"] | None]:  # fmt: skip
     """Return the positions of samples (mm), and a vector to subtract from their gradient, or None.
 
-    Parameters
-    ----------
-    s, step : path lengths of the samples, and the length of each, mm
-    look : returns the field and its gradient (1/mm) at points; called only if rays are not straight
+    For rays that are not straight `look` returns the field and its gradient (1/mm) at points.
     """
     points = rays.at(s)
     if model.straight:

@@ -74,17 +74,11 @@ def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: flo
 
 @dataclass(frozen=True)
 class CurvedRays(Projector):
-    """The `traced` model: d = S (X - X0) with X the background point of the bent ray.
-
-    Parameters
-    ----------
-    steps : Runge-Kutta steps through the box
-    n_ambient : refractive index from which the excess is counted
-    """
+    """The `traced` model: d = S (X - X0) with X the background point of the bent ray."""
 
     channels = 2
 
-    steps: int = 150
+    steps: int = 150  # of Runge-Kutta through the box
     n_ambient: float = 1.0
 
     def __post_init__(self) -> None:

@@ -18,19 +18,16 @@ __all__ = [
     "technique", "technique_of",
 ]  # fmt: skip
 
+# by their names in files; a technique of your own is one more entry
 TECHNIQUES: dict[str, type[ForwardModel]] = {
     c.name: c for c in (Deflection, Images, Absorption, Emission, Interferometry)
 }
-"""By their names in files; a technique of your own is one more entry."""
-ASSUMED = Deflection
-"""The technique of files without the attribute: version 1.0, and stores."""
+ASSUMED = Deflection  # of files without the attribute: version 1.0, and stores
 AUTO = "auto"
+# names of the models of techniques that have several, the default first
 MODELS: dict[str, tuple[str, ...]] = {
-    Deflection.name: tuple(deflection.MODELS),
-    Images.name: ("lever_arm",),
-    Absorption.name: tuple(absorption.MODELS),
-}
-"""Names of the models of techniques that have several, the default first."""
+    Deflection.name: tuple(deflection.MODELS), Images.name: ("lever_arm",), Absorption.name: tuple(absorption.MODELS)
+}  # fmt: skip
 
 
 def technique(name: str) -> type[ForwardModel]:
@@ -73,14 +70,7 @@ def forward_model(kind: type[ForwardModel], light: Light, model: str = AUTO) -> 
 def forward_models(
     kinds: Sequence[type[ForwardModel]], light: Light, model: str = AUTO, linear: bool = False
 ) -> tuple[ForwardModel, ...]:
-    """Return the model of each technique of a measurement.
-
-    Parameters
-    ----------
-    light : the measurement
-    model : auto, or the name of a model of one of the techniques
-    linear : whether only linear models are allowed
-    """
+    """Return the model of each technique of a measurement: `model` is auto, or that of one of the techniques."""
     check_model(model)
     names = [name for kind in kinds for name in MODELS.get(kind.name, ())]
     if model != AUTO and model not in names:
