@@ -13,8 +13,14 @@ from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels import problem as problem_module
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.preconditioner import filtered, response, spectrum_of_differences
-from nerif.reconstruction.voxels.problem import Penalty, Problem, conjugate_gradients
+from nerif.reconstruction.voxels.problem import (
+    Penalty,
+    Problem,
+    conjugate_gradients,
+    filtered,
+    response,
+    spectrum_of_differences,
+)
 from nerif.simulation.simulate import simulate
 
 SHAPE = (6, 8, 9)
