@@ -471,7 +471,7 @@ def test_where_no_quantum_is_left_the_absorbance_is_large():
     assert math.isnan(found[0])
     unseen = torch.tensor([[math.nan], [2.0]])
     for kind in (Absorption, Emission):
-        values, _ = kind.detected(unseen, 1e4, torch.Generator().manual_seed(0))
+        values, _ = kind.detect(unseen, 1e4, torch.Generator().manual_seed(0))
         assert values.isnan().flatten().tolist() == [True, False]
 
 

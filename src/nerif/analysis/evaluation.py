@@ -130,7 +130,7 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"name": camera.name, "withheld": camera.name in reprojection.withheld}
         row |= {"measured": kind.measured, "unit": kind.unit}
         if kind.derived:
-            still = models[kind].mapped(torch.zeros(height, width, kind.integrals), view)
+            still = models[kind].to_map(torch.zeros(height, width, kind.integrals), view)
             measured, predicted = measured - still, predicted - still
         row |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
         if kind.unit != "1":

@@ -171,7 +171,7 @@ def reproject(
                 integrals[integral, i] = sampled(camera).where(crosses, torch.zeros(()))
             elif (integral, i) not in integrals:
                 integrals[integral, i] = predict_view(field, camera, projector, box, device)
-            predicted[i, :height, :width] = forward.mapped(integrals[integral, i], i)
+            predicted[i, :height, :width] = forward.to_map(integrals[integral, i], i)
             done += 1
             on_view(done, total)
         maps[kind.name] = predicted

@@ -166,7 +166,7 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
     maps = {name: _map(dataset, name) for name in map_names() if name in dataset and name not in arguments}
     for kind in TECHNIQUES.values():
         if kind.measured in maps:
-            maps = kind.completed(maps, dataset.attrs)
+            maps = kind.complete(maps, dataset.attrs)
     index = any(kind.quantity == Deflection.quantity for kind in _techniques(dataset))
     lower, upper = _array(dataset, "box").tolist()
     return {

@@ -23,12 +23,7 @@ def check_aperture(aperture: str) -> None:
 
 
 def seen_through(measurement: Measurement, aperture: str) -> Measurement:
-    """Return the measurement with the lenses and windows that a setting applies, or with thin rays.
-
-    Parameters
-    ----------
-    aperture : "auto" for those of the measurement, "on" to require an aperture, "off" for thin rays
-    """
+    """Return the measurement with its lenses and windows ("auto"; "on" requires an aperture) or thin rays ("off")."""
     check_aperture(aperture)
     lenses = [camera.lens for camera in measurement.cameras if camera.lens is not None]
     if aperture == "on" and not any(lens.diameter > 0 for lens in lenses):
@@ -43,12 +38,10 @@ def seen_through(measurement: Measurement, aperture: str) -> Measurement:
 
 
 def lens_rays(measurement: Measurement, count: int = 0) -> int:
-    """Return the rays of a pixel in the last part of a training; 1 where rays are thin.
+    """Return the rays of a pixel in the last part of a training: 1 where rays are thin, else `count` or the default.
 
-    Parameters
-    ----------
-    count : as set by the user; 0 for RAYS_PER_PX2 r^2, 2 to MAX_RAYS, where r is the radius in px of the cone in the
-        middle of the box, or of a disc of the area of the window
+    That is RAYS_PER_PX2 r^2, 2 to MAX_RAYS, where r is the radius in px of the cone in the middle of the box, or of a
+    disc of the area of the window.
     """
     centre, radii = torch.tensor(measurement.box.centre, dtype=torch.float64), []
     for camera in measurement.cameras:

@@ -51,9 +51,7 @@ def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
     return inside
 
 
-def _in_hull(
-    measurement: Measurement, masks: Bool[Tensor, "view row column"], grid: Grid
-) -> Bool[Tensor, "z y x"]:  # fmt: skip
+def _in_hull(measurement: Measurement, masks: Tensor, grid: Grid) -> Bool[Tensor, "z y x"]:
     """The points of a grid inside the masks of all views that have them in their image."""
     points = grid.points(torch.float64).reshape(-1, 3)
     inside = torch.ones(len(points), dtype=torch.bool)
@@ -65,7 +63,7 @@ def _in_hull(
     return inside.reshape(grid.shape)
 
 
-def _outside(measurement: Measurement, masks: Bool[Tensor, "view row column"], grid: Grid) -> Bool[Tensor, "z y x"]:
+def _outside(measurement: Measurement, masks: Tensor, grid: Grid) -> Bool[Tensor, "z y x"]:
     """The voxels of a grid that are outside the hull with their centres and all corners."""
     (x0, y0, z0), (x1, y1, z1), (hx, hy, hz) = grid.box.lower, grid.box.upper, (edge / 2 for edge in grid.spacing)
     # a grid whose voxel centres are the corners of the voxels
@@ -78,18 +76,12 @@ def _outside(measurement: Measurement, masks: Bool[Tensor, "view row column"], g
 
 @dataclass(frozen=True)
 class AmbientRegion:
-    """Faces of the box, and voxels outside the visual hull, where the index excess is 0.
-
-    Parameters
-    ----------
-    empty : (m, 3) centres of voxels that are outside the hull with all their corners, mm; may be of length 0
-    voxel : edges of those voxels, mm
-    """
+    """Faces of the box, and voxels outside the visual hull, where the index excess is 0."""
 
     box: Box
     faces: tuple[str, ...]
-    empty: Float[Tensor, "m 3"]
-    voxel: tuple[float, float, float]
+    empty: Float[Tensor, "m 3"]  # centres of voxels that are outside the hull with all their corners, mm
+    voxel: tuple[float, float, float]  # their edges, mm
 
     @classmethod
     def of(cls, measurement: Measurement, faces: tuple[str, ...], resolution: int = 48) -> AmbientRegion | None:

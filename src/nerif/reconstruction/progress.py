@@ -11,19 +11,15 @@ from nerif.reconstruction.base import OnStep, compose
 __all__ = ["QUIET", "Monitor"]
 
 
-def _quiet(*_: object) -> None:
-    return None
+def _quiet(*_: object) -> None: ...
 
 
 @dataclass(frozen=True)
 class Monitor:
     """Callbacks of long work; by default silent.
 
-    Parameters
-    ----------
-    say : takes a line for the user
-    training : takes a title, returns a context that gives a callback for every Step of a reconstruction
-    counting : takes a title, returns a context that gives a callback for (items done, all items)
+    `say` takes a line for the user; `training` and `counting` take a title and return a context that gives a callback
+    for every Step of a reconstruction, and for (items done, all items).
     """
 
     say: Callable[[str], None] = _quiet

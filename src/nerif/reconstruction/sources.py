@@ -32,18 +32,11 @@ FITTED_AGAIN = (0.5, 0.75)  # of a run: intensity gains and offsets are fitted a
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of a run.
+    """A part of a run."""
 
-    Parameters
-    ----------
-    begin : share of the run at which it begins
-    measurement : returns the data to fit
-    words : their name
-    """
-
-    begin: float
-    measurement: Callable[[], Measurement]
-    words: str
+    begin: float  # share of the run at which it begins
+    measurement: Callable[[], Measurement]  # the data to fit
+    words: str  # their name
 
 
 def check_source(source: str, measurement: Measurement | None = None) -> None:
@@ -71,15 +64,9 @@ def chosen_source(measurement: Measurement, source: str, preferred: str) -> str:
 
 
 def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, preferred: str = "images") -> Measurement:
-    """Return the measurement with the data to fit: images, displacements, or both.
+    """Return the measurement with the data to fit: images (blurred, standard deviation in px), displacements, or both.
 
     Data of other techniques are unchanged. Images retain the displacements as a first approximation.
-
-    Parameters
-    ----------
-    source : one of SOURCES
-    blur : of the images, standard deviation in px
-    preferred : meaning of "auto" if there are both
     """
     check_source(source, measurement)
     images, displacements = _pair(measurement)
@@ -90,7 +77,7 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, pref
         return images.without(measurement)
     whole = measurement if source == "both" or displacements is None else displacements.without(measurement)
     sizes = [camera.image_size for camera in whole.cameras]
-    maps = images.technique.softened(whole.maps, sizes, blur)
+    maps = images.technique.blur(whole.maps, sizes, blur)
     variable = images.technique.measured
     maps[variable] = maps[variable].where(whole.usable_for(_pair(whole)[0] or images), math.nan)
     if displacements is not None:

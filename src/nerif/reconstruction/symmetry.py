@@ -51,15 +51,7 @@ def find_axis(
     measurement: Measurement, symmetry: Symmetry, sigma: tuple[float, float], faces: tuple[str, ...],
     open_faces: tuple[str, ...] = (),
 ) -> Axis:  # fmt: skip
-    """Estimate the axis of a flow.
-
-    Parameters
-    ----------
-    symmetry : about the axis as given
-    sigma : standard deviations of its position (mm) and direction (rad); 0 for certain
-    faces : of the box on which the field is ambient
-    open_faces : whose rays are dropped
-    """
+    """Estimate the axis of a flow, with standard deviations of its position (mm) and direction (rad); 0 for certain."""
     symmetry, across = _across(measurement, symmetry)
     before = (sigma[0], sigma[0], sigma[1], sigma[1])
     refined = [i for i, s in enumerate(before) if s > 0 and across[i % 2] > MIN_ACROSS]

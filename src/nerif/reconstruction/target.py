@@ -24,23 +24,14 @@ PIECE_RAYS = 1 << 17
 
 @dataclass(frozen=True)
 class Part:
-    """Rays and their measured values by one technique.
-
-    Parameters
-    ----------
-    measured : (n, c) as the model's `reading` gives them
-    inverse_scale : (n, c) factor of residuals: 1/sigma, scaled so that the ambient field has mean square 1 over all
-        parts of a target
-    outlier : scaled residual beyond which the loss is linear (Huber)
-    offset : (n, k) added to predictions, or None
-    """
+    """Rays and their measured values by one technique."""
 
     model: ForwardModel
     rays: Rays
-    measured: Float[Tensor, "n c"]
-    inverse_scale: Float[Tensor, "n c"]
-    outlier: float = math.inf
-    offset: Float[Tensor, "n k"] | None = None
+    measured: Float[Tensor, "n c"]  # as the model's `reading` gives them
+    inverse_scale: Float[Tensor, "n c"]  # 1/sigma, scaled to an ambient residual of mean square 1 over all parts
+    outlier: float = math.inf  # scaled residual beyond which the loss is linear (Huber)
+    offset: Float[Tensor, "n k"] | None = None  # added to predictions
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -51,18 +42,17 @@ class Part:
         return replace(self, rays=self.rays[index], measured=measured, inverse_scale=inverse, offset=offset)
 
     def to(self, device: torch.device | str) -> Part:
-        """Return the part on another device."""
         measured, inverse = self.measured.to(device), self.inverse_scale.to(device)
         return replace(self, rays=self.rays.to(device), measured=measured, inverse_scale=inverse)
 
     def residual(self, prediction: Float[Tensor, "n k"]) -> Float[Tensor, "n c"]:
         """Return the scaled difference between a path integral and the measured values.
 
-        One beyond `outlier` is reduced by a factor without gradient, so that the slope of its square is that of Huber's
-        loss.
+        Outliers are reduced by a factor without gradient, so that the slope of their square is that of Huber's loss.
         """
         integral = prediction if self.offset is None else prediction + self.offset
-        return self._robust(self.model.residual(integral, self.measured, self.rays) * self.inverse_scale)
+        r = self.model.residual(integral, self.measured, self.rays) * self.inverse_scale
+        return r if math.isinf(self.outlier) else r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
 
     @property
     def of_nothing(self) -> Float[Tensor, "n c"]:
@@ -78,11 +68,6 @@ class Part:
         """Return the part in pieces that need little memory."""
         return [self[i : i + PIECE_RAYS] for i in range(0, len(self), PIECE_RAYS)]
 
-    def _robust(self, r: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
-        if math.isinf(self.outlier):
-            return r
-        return r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
-
 
 def check_target(measurement: Measurement, model: str = AUTO, linear: bool = False) -> None:
     """Raise InputError for a model that no technique has, and for several techniques without sigma."""
@@ -95,22 +80,15 @@ def check_target(measurement: Measurement, model: str = AUTO, linear: bool = Fal
 
 @dataclass(frozen=True)
 class Target:
-    """The data of all techniques.
+    """The data of all techniques."""
 
-    Parameters
-    ----------
-    parts : one for each technique
-    scale : typical size of the field, from that of the data
-    chi_square : mean square of the ambient field's residual over sigma (over 1 without sigma): the factor from the mean
-        square of a scaled residual to that in units of the noise
-    noise : mean square residual of the noise over that of the ambient field; None without sigma
-    """
-
-    parts: tuple[Part, ...]
-    scale: float
+    parts: tuple[Part, ...]  # one for each technique
+    scale: float  # typical size of the field, from that of the data
+    # mean square of the ambient field's residual over sigma (over 1 without sigma): the factor from the mean square of
+    # a scaled residual to that in units of the noise
     chi_square: float
     sigma_known: bool
-    noise: float | None = None
+    noise: float | None = None  # mean square residual of the noise over that of the ambient field; None without sigma
 
     @classmethod
     def of(
@@ -119,11 +97,7 @@ class Target:
     ) -> Target:  # fmt: skip
         """Collect the usable rays that cross none of the open faces, or those of bins of edge x edge pixels.
 
-        Parameters
-        ----------
-        model : name of the forward model, or auto
-        linear : whether a linear one is required
-        single : whether every pixel has a ray of its own, even if the model has patches
+        `linear` requires a linear model; with `single` every pixel has a ray of its own, even if the model has patches.
         """
         check_target(measurement, model, linear)
         models = forward_models(measurement.techniques, measurement, model, linear)
@@ -169,7 +143,6 @@ class Target:
         return replace(self, parts=tuple(replace(part, outlier=math.inf) for part in self.parts))
 
     def to(self, device: torch.device | str) -> Target:
-        """Return the target on another device."""
         return replace(self, parts=tuple(part.to(device) for part in self.parts))
 
 
@@ -179,11 +152,9 @@ def _rays(
     """The rays that cross none of the open faces, the values of them or their patches, and sigma."""
     if patch > 1:
         return patches(measurement, observation, patch, open_faces)
-    rays, values, sigma = (
-        binned_rays(measurement, observation, edge, open_faces)
-        if edge > 1 and observation.technique.averaged
-        else measurement.rays(observation)
-    )
+    binned = edge > 1 and observation.technique.averaged
+    bins = binned_rays(measurement, observation, edge, open_faces) if binned else None
+    rays, values, sigma = bins or measurement.rays(observation)
     keep = ~rays.exit_faces(measurement.box, open_faces)
     if not bool(keep.any()):
         raise InputError("every ray crosses one of them, so none is left; name fewer faces", field="open_faces")

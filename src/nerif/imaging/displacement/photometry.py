@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from nerif.forward.images import LEAST, around, difference_variance, grey_variance
+from nerif.forward.images import ROUNDING_VARIANCE, difference_variance, grey_variance, local_mean
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.frames import as_float
 
@@ -79,9 +79,9 @@ class CameraNoise:
         at = np.array([max(grey[part].mean(), 0.0) for part in classes])
         of_class = np.mean if median == 1.0 else lambda x: np.median(x) / median
         variance = np.array([of_class(squares[part]) for part in classes])
-        weight = 1 / np.maximum(variance, LEAST)  # the error of a variance is a share of it
+        weight = 1 / np.maximum(variance, ROUNDING_VARIANCE)  # the error of a variance is a share of it
         found, _ = nnls(np.stack([weight, weight * at], axis=1), weight * variance)
-        return cls(max(float(found[0]), LEAST), float(found[1]))
+        return cls(max(float(found[0]), ROUNDING_VARIANCE), float(found[1]))
 
     def variance(self, grey: Image) -> Image:
         """Return the variance of grey values."""
@@ -141,7 +141,7 @@ def _of_interpolation(
 ) -> Image:  # fmt: skip
     """What interpolation between the pixels of the reference adds to the variance of what is left."""
     steep = np.square(np.gradient(moved.astype(np.float64))).sum(axis=0)
-    share = around(np.square(d - np.round(d)).sum(axis=-1) * steep)
+    share = local_mean(np.square(d - np.round(d)).sum(axis=-1) * steep)
     squares, shares = left[good].astype(np.float64) ** 2, share[good]
     few = squares <= np.quantile(squares, TRIMMED)
     found = float((squares - variance[good])[few].sum() / max(shares[few].sum(), 1e-12))

@@ -201,11 +201,11 @@ class TrainingData:
         """Give withheld pixels the nuisance parameters of the others."""
         if self.withheld is not None:
             for model, other in zip(_nuisance_models(self.target), _nuisance_models(self.withheld), strict=False):
-                other.adopt(model.settled[[self.names.index(name) for name in self.withheld_names]])
+                other.adopt(model.brightness[[self.names.index(name) for name in self.withheld_names]])
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return nuisance parameters and rig for a checkpoint."""
-        nuisance = {str(i): model.settled.clone() for i, model in enumerate(_nuisance_models(self.target))}
+        nuisance = {str(i): model.brightness.clone() for i, model in enumerate(_nuisance_models(self.target))}
         return nuisance | rig_state(self.refinement)
 
     def load_state_dict(self, stage: int, state: dict[str, Tensor]) -> None:

@@ -41,8 +41,7 @@ from nerif.reconstruction.base import Reconstruction, Reconstructor
 
 __all__ = ["KINDS", "VOXELS", "Deviations", "Maps", "Member", "Original", "Trials", "best_covered", "certainty"]
 
-KINDS = {"off": 0, "fast": 2, "full": 8}
-"""Number of trials."""
+KINDS = {"off": 0, "fast": 2, "full": 8}  # trials
 VOXELS = 64  # along the longest edge of the box, on which errors are compared
 WIDTH = 0.04  # of the box edge: standard deviation of G
 DETAIL_PX = 0.7  # in the middle of the box: standard deviation of g
@@ -51,24 +50,17 @@ MIN_DETAIL = 1e-10  # of the squares of a field: less is rounding
 BLOCK = 8  # px: edge of the blocks in which residuals keep their sign
 TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations of the percentiles
 
-Maps = Mapping[str, Float[Tensor, "view row column c"]]
-"""Projections, or their noise, by the name of the technique."""
+Maps = Mapping[str, Float[Tensor, "view row column c"]]  # projections, or their noise, by the name of the technique
 
 
 @dataclass(frozen=True)
 class Original:
-    """The reconstruction that the trials repeat.
-
-    Parameters
-    ----------
-    measurement : its data
-    project : from a field to its projections into the views of the measurement
-    """
+    """The reconstruction that the trials repeat."""
 
     result: Reconstruction
     reconstructor: Reconstructor
     measurement: Measurement
-    project: Callable[[Field], Maps]
+    project: Callable[[Field], Maps]  # from a field to its projections into the views of the measurement
 
     @cached_property
     def volume(self) -> Volume:
@@ -115,7 +107,6 @@ class Trials:
 
     @property
     def members(self) -> int:
-        """Number of trials."""
         return KINDS[self.kind]
 
     def member(self, number: int, original: Original) -> Member:
@@ -146,7 +137,7 @@ def best_covered(cameras: Sequence[Camera]) -> list[str]:
     return [cameras[int(i)].name for i in order]
 
 
-def _signs(like: Float[Tensor, "view row column c"], generator: torch.Generator) -> Float[Tensor, "view row column c"]:
+def _signs(like: Float[Tensor, "view row column c"], generator: torch.Generator) -> Tensor:
     """1 or -1 at random, the same in blocks of pixels."""
     views, height, width, channels = like.shape
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
@@ -178,25 +169,19 @@ def _blurred(values: Tensor, grid: Grid, mm: float) -> Tensor:
 class Deviations:
     """Standard deviations of every quantity from the errors of trials.
 
-    Parameters
-    ----------
-    main : the original field on the grid of the result
-    gas : settings of density and temperature
+    `main` is the original field on the grid of the result.
     """
 
     def __init__(self, main: Volume, gas: GasSettings, original: Original) -> None:
         self.main, self.gas, self.original = main, gas, original
         self.pixel = mean(original.measurement.pixel_sizes)  # mm, in the middle of the box
         self.squares: list[Tensor] = []
-        self.detail: list[tuple[float, float]] = []
-        """Mean square detail of a trial and of its truth, where that has any."""
-        self.residual_ratios: list[float] = []
-        """Mean square residual of a trial over that of the reconstruction."""
+        self.detail: list[tuple[float, float]] = []  # mean square of a trial and of its truth, where that has any
+        self.residual_ratios: list[float] = []  # mean square of a trial over that of the reconstruction
         self.grid: Grid | None = None
 
     @property
     def count(self) -> int:
-        """Number of trials."""
         return len(self.squares)
 
     def add(self, member: Member, result: Reconstruction) -> None:

@@ -29,28 +29,19 @@ MIN_HALVED_VOXELS = 4  # along an edge that is halved
 
 @dataclass(frozen=True)
 class Layout(ABC):
-    """Grids of coefficients, and the fields they define.
+    """Grids of coefficients, and the fields they define."""
 
-    Parameters
-    ----------
-    box : of the measurement, mm
-    faces : of it on which the field is ambient
-    basis : of the spline
-    """
-
-    box: Box
-    faces: tuple[str, ...]
-    basis: str
+    box: Box  # of the measurement, mm
+    faces: tuple[str, ...]  # of it, on which the field is ambient
+    basis: str  # of the spline
 
     @property
     def degree(self) -> int:
-        """Degree of the spline."""
         return DEGREES[self.basis]
 
     @property
     @abstractmethod
-    def boundary(self) -> Boundary:
-        """How coefficients are extended beyond the grid."""
+    def boundary(self) -> Boundary: ...
 
     @abstractmethod
     def grid(self, voxels: int) -> Grid:
@@ -64,8 +55,7 @@ class Layout(ABC):
         """Return the projector of coefficients on a grid."""
 
     @abstractmethod
-    def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field:
-        """Return the field of coefficients."""
+    def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field: ...
 
     @abstractmethod
     def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z y x"]:

@@ -59,12 +59,10 @@ class Multiplicative(VoxelReconstructor):
         return uniform * (float(block.data.sum()) / max(float(block.project(uniform).sum()), block.floor) or 1.0)
 
     @abstractmethod
-    def blocks(self, problem: Problem) -> list[Block]:
-        """Return the blocks of rays of one iteration."""
+    def blocks(self, problem: Problem) -> list[Block]: ...
 
     @abstractmethod
-    def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """Return x after the update by a block of rays."""
+    def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]: ...
 
 
 @dataclass(frozen=True)
@@ -122,22 +120,13 @@ class MART(Multiplicative):
 
 @dataclass(frozen=True)
 class Block:
-    """The rays of one view or of all.
+    """The rays of one view or of all."""
 
-    Parameters
-    ----------
-    operators : one for each technique
-    data : (n,) measured values, 0 where noise made them negative
-    reach : (z, y, x) A^T 1; 1 where no ray passes
-    scale : field of one unit of x
-    floor : of predictions
-    """
-
-    operators: tuple[VoxelOperator, ...]
-    data: Float[Tensor, " n"]
-    reach: Float[Tensor, "z y x"]
-    scale: float
-    floor: float
+    operators: tuple[VoxelOperator, ...]  # one for each technique
+    data: Float[Tensor, " n"]  # measured values, 0 where noise made them negative
+    reach: Float[Tensor, "z y x"]  # A^T 1; 1 where no ray passes
+    scale: float  # field of one unit of x
+    floor: float  # of predictions
 
     @classmethod
     def of(cls, problem: Problem, view: int | None) -> Block:

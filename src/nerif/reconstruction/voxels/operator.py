@@ -19,10 +19,10 @@ from nerif.reconstruction.voxels.planes import Bundle
 
 __all__ = ["VoxelOperator", "apply_rows", "check_step", "operator_norm", "rays_through"]
 
+# distance of planes in voxels: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)
 MAX_STEP = {"linear": 0.5, "cubic": 1.0}
-"""Distance of planes in voxels: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
+# of rays through a lens, per voxel of the cone's radius in the middle of the box; of a pixel
 PAIRS_PER_VOXEL, MAX_PAIRS = 2.0, 8
-"""Pairs of rays through a lens per voxel of the cone's radius in the middle of the box, and the most of a pixel."""
 
 
 class VoxelOperator:
@@ -47,8 +47,7 @@ class VoxelOperator:
     interpolation in planes; Lacroute & Levoy, SIGGRAPH (1994), for the resampling along the axis.
     """
 
-    padded_axes: tuple[int, ...] = (0, 1, 2)
-    """Those of z, y, x along which coefficients are extended beyond the box."""
+    padded_axes: tuple[int, ...] = (0, 1, 2)  # of z, y, x: along them coefficients are extended beyond the box
 
     def __init__(
         self, rays: Rays, grid: Grid, model: ForwardModel, basis: str = "linear", boundary: Boundary | None = None,
@@ -93,9 +92,8 @@ class VoxelOperator:
 
     def for_rays(self, rays: Rays, model: ForwardModel) -> VoxelOperator:
         """Return the operator of other rays on the same grid."""
-        return VoxelOperator(
-            rays, self.grid, model, self.basis, self.boundary, self.step, self.device, self.dtype
-        )  # fmt: skip
+        settings = self.basis, self.boundary, self.step, self.device, self.dtype
+        return VoxelOperator(rays, self.grid, model, *settings)
 
     def __call__(self, coefficients: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
         """Return the projections of all rays."""
@@ -163,16 +161,14 @@ class VoxelOperator:
         rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32, channels: int = 2,
         step: float | None = None,
     ) -> int:  # fmt: skip
-        """Estimate the memory of an operator while it is applied: rays, B, the padded grid and its planes.
-
-        Paths and planes count in double precision, as on a CPU; planes are those of value and slope, forward and
-        adjoint, and their intermediate arrays.
-        """
-        inner = 8
+        """Estimate the memory of an operator while it is applied: rays, B, the padded grid and its planes."""
+        inner = 8  # bytes of paths and planes on a CPU
         layers, each = (DEGREES[basis] + 1) // 2, math.ceil(1 / (step or MAX_STEP[basis]))
         padded = math.prod(n + 2 * layers for n in grid.shape)
         per_ray = 8 * inner + 3 * channels * dtype.itemsize + 16  # path, B, integers
-        return rays * per_ray + padded * (2 * dtype.itemsize + each * (4 * inner + 6 * dtype.itemsize))
+        return rays * per_ray + padded * (
+            2 * dtype.itemsize + each * (4 * inner + 6 * dtype.itemsize)
+        )  # value and slope
 
 
 def rays_through(rays: Rays, length: float) -> int:
@@ -202,17 +198,12 @@ def apply_rows(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) 
 
 
 def operator_norm(
-    forward: Callable[[Tensor], Tensor],
-    adjoint: Callable[[Tensor], Tensor],
-    start: Tensor,
-    iterations: int = 30,
+    forward: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], start: Tensor, iterations: int = 30,
     tolerance: float = 1e-3,
-) -> float:
-    """Estimate the largest singular value from below, by the power method on the normal operator.
+) -> float:  # fmt: skip
+    """Estimate the largest singular value from below, until it grows by less than `tolerance` per iteration.
 
-        x <- A^T A x / |A^T A x|,     |A| = sqrt(|A^T A x|)
-
-    It stops when the estimate grows by less than `tolerance` per iteration.
+    Power method on the normal operator: x <- A^T A x / |A^T A x|,     |A| = sqrt(|A^T A x|)
     """
     x, estimate = start, 0.0
     for _ in range(iterations):

@@ -29,19 +29,12 @@ OUTSIDE = 0.25  # voxels by which rays clipped in single precision, far from the
 
 @dataclass(frozen=True)
 class Planes:
-    """Evenly spaced planes across one axis of a grid, each in the middle of its share of the box.
-
-    Parameters
-    ----------
-    degree : of the spline
-    axis : 0, 1, 2 for x, y, z
-    each : planes in a voxel
-    """
+    """Evenly spaced planes across one axis of a grid, each in the middle of its share of the box."""
 
     grid: Grid
-    degree: int
-    axis: int
-    each: int
+    degree: int  # of the spline
+    axis: int  # 0, 1, 2 for x, y, z
+    each: int  # planes in a voxel
 
     @property
     def across(self) -> tuple[int, int]:
@@ -96,28 +89,19 @@ class Bundle:
 
     Sample m of a ray is on plane first + m, at start + m stride, with weight profile_0 + m profile_1 or profile_m; the
     first and the last sample lack the share of the space between planes that the ray does not cross.
-
-    Parameters
-    ----------
-    index : (n,) numbers of the rays
-    start, stride : (n, 2) along u and v, in voxels, 0 at the first coefficient of a plane
-    profile : (n, 2) or (n, m, 1)
-    lost : (n, 2) shares that the first and the last sample lack
-    first, count : (n,) first plane, number of planes
-    gradient, value : (n, c, 3), (n, c, 1) applied to the integrals of the slopes along u, v and the axis, per voxel,
-        and of the field; None where the model does not depend on it
     """
 
     planes: Planes
-    index: Int[Tensor, " n"]
-    start: Float[Tensor, "n 2"]
+    index: Int[Tensor, " n"]  # numbers of the rays
+    start: Float[Tensor, "n 2"]  # along u and v, in voxels, 0 at the first coefficient of a plane
     stride: Float[Tensor, "n 2"]
-    profile: Tensor
-    lost: Float[Tensor, "n 2"]
-    first: Int[Tensor, " n"]
-    count: Int[Tensor, " n"]
+    profile: Tensor  # (n, 2) or (n, m, 1)
+    lost: Float[Tensor, "n 2"]  # shares that the first and the last sample lack
+    first: Int[Tensor, " n"]  # plane
+    count: Int[Tensor, " n"]  # of planes
+    # applied to the integrals of the slopes along u, v and the axis, per voxel; None if the model depends on f alone
     gradient: Float[Tensor, "n c 3"] | None
-    value: Float[Tensor, "n c 1"] | None
+    value: Float[Tensor, "n c 1"] | None  # applied to the integral of f, or None
 
     @property
     def path(self) -> tuple[Tensor, ...]:
@@ -137,8 +121,7 @@ class Bundle:
     def _of(cls, rays: Rays, index: Int[Tensor, " n"], planes: Planes, model: ForwardModel) -> Bundle:
         rays = rays.to(dtype=torch.float64)  # cameras are far away: positions lose digits in single precision
         grid, axis, each = planes.grid, planes.axis, planes.each
-        spacing = torch.tensor(grid.spacing, dtype=torch.float64, device=rays.near.device)
-        lower = torch.tensor(grid.box.lower, dtype=torch.float64, device=rays.near.device)
+        spacing, lower = rays.near.new_tensor(grid.spacing), rays.near.new_tensor(grid.box.lower)
         origin, direction = (rays.origin - lower) / spacing, rays.direction / spacing  # in voxels
         ends = origin[:, None] + torch.stack([rays.near, rays.far], dim=1)[..., None] * direction[:, None]
         upper = ends.new_tensor([float(n) for n in reversed(grid.shape)])

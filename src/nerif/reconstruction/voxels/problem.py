@@ -10,7 +10,7 @@ means the same on every grid. Voxels that are not free are ambient: x = 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 
@@ -22,28 +22,24 @@ from nerif.fields.grid import Boundary
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.preconditioner import filtered, response, spectrum_of_differences
 
-__all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients", "minimise"]
+__all__ = [
+    "Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients", "filtered", "minimise", "response",
+    "spectrum_of_differences",
+]  # fmt: skip
 
 ROUND_ITERATIONS = 10  # before the set of voxels at their bounds is updated
 MAX_HALVINGS = 20  # of a step, beyond which it is below rounding
+MIN_RESPONSE = 1e-2  # of the largest value of S, the spectrum of F^T F
 
 
 @dataclass(frozen=True)
 class Iterate:
-    """The state after an iteration.
+    """The state after an iteration."""
 
-    Parameters
-    ----------
-    x : (z, y, x) scaled coefficients
-    residual : |F x - b|^2; 1 for the zero field
-    penalty : R(x)
-    """
-
-    x: Tensor
-    residual: float
-    penalty: float
+    x: Tensor  # (z, y, x) scaled coefficients
+    residual: float  # |F x - b|^2; 1 for the zero field
+    penalty: float  # R(x)
 
     def objective(self, weight: float) -> float:
         """Return |F x - b|^2 + weight R(x)."""
@@ -143,7 +139,7 @@ class Problem:
 
     @cached_property
     def response(self) -> Float[Tensor, "z y k"]:
-        """The approximate spectrum of F^T F (preconditioner.py)."""
+        """The approximate spectrum of F^T F."""
         free = None if self._free is None else self._free > 0
         return response(lambda x: self.adjoint(self.forward(x)), self.zero(), free)
 
@@ -160,10 +156,8 @@ class Problem:
 class Penalty:
     """A quadratic penalty R(x) = |L x|^2, a mean over voxels.
 
-    Parameters
-    ----------
-    kind : "identity" (L = 1), "gradient" (L = edge grad) or "laplacian" (L = edge^2 div grad)
-    face_weights : for "gradient": weights of the squares at the faces along z, y, x; None for 1
+    L = 1 ("identity"), edge grad ("gradient") or edge^2 div grad ("laplacian"); the squares of the gradient may have
+    weights at the faces along z, y, x.
     """
 
     KINDS = ("identity", "gradient", "laplacian")
@@ -245,8 +239,10 @@ def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Te
         alpha = s.z / (|F p|^2 + weight |L p|^2),         x <- x + alpha p,    r <- r - alpha F p
         s = F^T r - weight L^T L x,    z = M^-1 s,        p <- z + (s.z / s_last.z_last) p
 
-    M is the preconditioner (preconditioner.py). Voxels at a bound towards which the objective falls are fixed; the
-    others are not clipped.
+    Voxels at a bound towards which the objective falls are fixed; the others are not clipped. M = S + weight T is the
+    preconditioner, with T the spectrum of L^T L and S that of F^T F, which is nearly a convolution. It finds early the
+    components that few views leave nearly undetermined: S is small for waves whose wave vector lies in none of the
+    image planes, so it must not be averaged over directions.
 
     Source: Bjorck, Numerical Methods for Least Squares Problems (SIAM, 1996), Sec. 7.4; with circulant M: Chan & Ng,
     SIAM Review 38 (1996) 427.
@@ -288,3 +284,33 @@ def _square(x: Tensor) -> float:
 
 def _concatenated(parts: list[Tensor]) -> Float[Tensor, " n"]:
     return parts[0].reshape(-1) if len(parts) == 1 else torch.cat([part.reshape(-1) for part in parts])
+
+
+def response(
+    normal: Callable[[Tensor], Tensor], empty: Float[Tensor, "z y x"], free: Bool[Tensor, "z y x"] | None
+) -> Float[Tensor, "z y k"]:
+    """Return S, from the response of F^T F (`normal`) to the free voxel nearest to the middle."""
+    lines = [torch.arange(n, device=empty.device) - n // 2 for n in empty.shape]
+    distance = sum(a**2 for a in torch.meshgrid(*lines, indexing="ij"))
+    assert isinstance(distance, Tensor)
+    if free is not None:
+        distance = torch.where(free.to(distance.device), distance, distance.max() + 1)
+    at = torch.unravel_index(distance.argmin(), empty.shape)
+    point = empty.clone()
+    point[at] = 1
+    spectrum = torch.fft.rfftn(normal(point).roll([-int(i) for i in at], (0, 1, 2))).real
+    largest = float(spectrum.max())
+    return spectrum.clamp_min(MIN_RESPONSE * largest) if largest > 0 else torch.ones_like(spectrum)
+
+
+def spectrum_of_differences(x: Float[Tensor, "z y x"], inverse: Sequence[float]) -> Float[Tensor, "z y k"]:
+    """Return the spectrum of squared differences between neighbours of x, sum_axis (2 - 2 cos k) inverse^2."""
+    last = torch.fft.rfftfreq(x.shape[2], dtype=torch.float64)
+    waves = [*(torch.fft.fftfreq(n, dtype=torch.float64) for n in x.shape[:2]), last]
+    along = [i**2 * (2 - 2 * torch.cos(2 * math.pi * k)) for i, k in zip(inverse, waves, strict=True)]
+    return (along[0][:, None, None] + along[1][:, None] + along[2]).to(x)
+
+
+def filtered(x: Float[Tensor, "z y x"], spectrum: Float[Tensor, "z y k"]) -> Float[Tensor, "z y x"]:
+    """Return x with its spectrum divided by another."""
+    return torch.fft.irfftn(torch.fft.rfftn(x) / spectrum, s=x.shape)

@@ -39,12 +39,8 @@ class SymmetricOperator(VoxelOperator):
 
         (A c)_p = sum_m w_pm [A_p f(x_pm) + B_p grad f(x_pm)],    f(x) = sum_k D_k(x) sum_ij c_jki b_i(r) b_j(h)
 
-    Samples are evenly spaced along each ray, at least two in a voxel. It runs on the CPU.
-
-    Parameters
-    ----------
-    symmetry : Symmetry, mm
-    rays, grid, model, basis, boundary, step, dtype : as for VoxelOperator; the grid is that of (r, k, h)
+    Samples are evenly spaced along each ray, at least two in a voxel. It runs on the CPU. The grid is that of
+    (r, k, h); other parameters are those of VoxelOperator.
     """
 
     padded_axes = (0, 2)
@@ -57,9 +53,8 @@ class SymmetricOperator(VoxelOperator):
         super().__init__(rays, grid, model, basis, boundary, step, "cpu", dtype)
 
     def for_rays(self, rays: Rays, model: ForwardModel) -> SymmetricOperator:
-        return SymmetricOperator(
-            self.symmetry, rays, self.grid, model, self.basis, self.boundary, self.step, self.dtype
-        )
+        settings = self.basis, self.boundary, self.step, self.dtype
+        return SymmetricOperator(self.symmetry, rays, self.grid, model, *settings)
 
     @property
     def samples(self) -> int:

@@ -40,13 +40,10 @@ class Choice:
 
 
 def choose_weight(solve: Solve, x: Tensor, noise: float | None = None, guess: float | None = None) -> Choice:
-    """Return the weight by the discrepancy principle or the L-curve.
+    """Return the weight by the discrepancy principle or the L-curve, starting from x.
 
-    Parameters
-    ----------
-    x : start
-    noise : residual |F x - b|^2 of the noise alone, or None where sigma is not known
-    guess : weight on a coarser grid, around which to search; None to begin with HIGHEST
+    The noise is its residual |F x - b|^2, None where sigma is not known; the guess is the weight of a coarser grid,
+    around which to search, or None to begin with HIGHEST.
     """
     weights = [HIGHEST if guess is None else guess]
     path = [solve(weights[0], x)]
