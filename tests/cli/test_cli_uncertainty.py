@@ -149,7 +149,7 @@ def test_diverged_runs(path, tmp_path, capsys, monkeypatch, diverged):
         assert "trial 2 diverged" in lines
         entries = metrics_of(out)["uncertainty"]
         assert (entries["members"], entries["diverged"]) == (1, [2])
-        assert "Trials 2 diverged" in (out / "report.html").read_text()
+        assert "trials 2 diverged" in (out / "report.html").read_text()
     else:
         assert len(calls) == 1
         assert "uncertainty: skipped: the main run diverged" in lines
