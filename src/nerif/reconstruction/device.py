@@ -2,7 +2,7 @@
 
 Torch and Numba use the same number of threads, at most the number of cores that no other program uses. Threads that
 share a step wait for one another: two threads on two cores, one of them busy, take eight times as long as one thread
-(benchmarks/results/busy-cpu.md).
+(docs/decisions/026).
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ def keep_freed_memory() -> None:
     """Ask glibc to keep freed blocks for the next step, rather than hand megabytes back to the kernel each time.
 
     A step on the CPU allocates the same few arrays again and again; with the default thresholds their pages are
-    unmapped and zeroed anew every time, which takes as long as the arithmetic (benchmarks/README.md).
+    unmapped and zeroed anew every time, which takes as long as the arithmetic (docs/decisions/006).
     """
     if platform.libc_ver()[0] != "glibc":
         return

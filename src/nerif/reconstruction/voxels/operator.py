@@ -20,7 +20,7 @@ from nerif.reconstruction.voxels.planes import Bundle
 __all__ = ["STEPS", "VoxelOperator", "check_step", "made_of", "operator_norm", "rays_through"]
 
 STEPS = {"linear": 0.5, "cubic": 1.0}
-"""Voxels between planes, at most: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
+"""Voxels between planes, at most: the gradient of the linear basis jumps from voxel to voxel (docs/decisions/011)."""
 
 PAIRS, MOST_PAIRS = 2.0, 8
 """Of rays through a lens, for each voxel that the cone's radius is wide in the middle of the box, and at most."""
