@@ -75,16 +75,9 @@ def between_planes(camera: Camera, plane: Any) -> np.ndarray:
 
 
 def measure(
-    folder: Path,
-    views: int,
-    arc: float,
-    pixels: int,
-    sensor: float,
-    poses: int,
-    backgrounds: int,
-    target: str,
+    folder: Path, views: int, arc: float, pixels: int, sensor: float, poses: int, backgrounds: int, target: str,
     seed: int,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     cameras = rig(views, arc, pixels, sensor, seed)
     experiment = Experiment(
         target=target, columns=12, rows=9, poses=poses, backgrounds=backgrounds, references=1, seed=seed
