@@ -25,9 +25,8 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.runner import peer
 from nerif.geometry import Camera, Grid
 
-__all__ = ["ORDERS", "PEERS", "SMOOTHING", "HalfView", "ParallelView", "Peer", "Revolution", "attempts", "pyabel"]
-
 Array = np.ndarray
+Inversion = Callable[["HalfView", float], Float[Array, "row n"]]
 
 SMOOTHING = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of the Gaussian that a displacement map is smoothed by along rows and columns, px."""
@@ -111,31 +110,16 @@ class HalfView:
         return 0.5 * self.view.pixel * (both - both[:, -1:])
 
 
-def three_point(half: HalfView, _: float) -> Float[Array, "row n"]:
-    """Dasch, Appl. Opt. 31 (1992) 1146."""
-    return pyabel().dasch.three_point_transform(half.projection(), basis_dir=None, dr=half.view.pixel)
+def by_pyabel(transform: str, parameter: str = "", **settings: Any) -> Inversion:
+    """Return a transform of F by PyAbel, such as "dasch.three_point_transform", and the name of its parameter there."""
 
+    def invert(half: HalfView, value: float) -> Float[Array, "row n"]:
+        module, name = transform.split(".")
+        parameters = {parameter: int(value) if parameter == "hold_order" else value} if parameter else {}
+        function = getattr(getattr(pyabel(), module), name)
+        return function(half.projection(), dr=half.view.pixel, **settings, **parameters)
 
-def onion_peeling(half: HalfView, _: float) -> Float[Array, "row n"]:
-    """Dasch, Appl. Opt. 31 (1992) 1146."""
-    return pyabel().dasch.onion_peeling_transform(half.projection(), basis_dir=None, dr=half.view.pixel)
-
-
-def hansen_law(half: HalfView, order: float) -> Float[Array, "row n"]:
-    """Hansen & Law, J. Opt. Soc. Am. A 2 (1985) 510."""
-    return pyabel().hansenlaw.hansenlaw_transform(half.projection(), dr=half.view.pixel, hold_order=int(order))
-
-
-def basex(half: HalfView, strength: float) -> Float[Array, "row n"]:
-    """Dribinski et al., Rev. Sci. Instrum. 73 (2002) 2634."""
-    return pyabel().basex.basex_transform(
-        half.projection(), reg=strength, basis_dir=None, dr=half.view.pixel, verbose=False
-    )
-
-
-def daun(half: HalfView, strength: float) -> Float[Array, "row n"]:
-    """Daun et al., Appl. Opt. 45 (2006) 4638."""
-    return pyabel().daun.daun_transform(half.projection(), reg=strength, degree=1, dr=half.view.pixel, verbose=False)
+    return invert
 
 
 def quadrature(half: HalfView, _: float) -> Float[Array, "row n"]:
@@ -178,7 +162,7 @@ class Peer:
 
     name: str
     form: str
-    invert: Callable[[HalfView, float], Float[Array, "row n"]]
+    invert: Inversion
     parameter: str = ""
     values: tuple[float, ...] = (0.0,)
 
@@ -191,14 +175,24 @@ class Peer:
 STRENGTHS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 
 PEERS = (
-    Peer("three-point", "projection", three_point),
-    Peer("onion peeling", "projection", onion_peeling),
-    Peer("Hansen-Law", "projection", hansen_law, "hold order", (0.0, 1.0)),
-    Peer("BASEX", "projection", basex, "reg", STRENGTHS),
-    Peer("Daun", "projection", daun, "reg", STRENGTHS),
+    Peer("three-point", "projection", by_pyabel("dasch.three_point_transform", basis_dir=None)),
+    Peer("onion peeling", "projection", by_pyabel("dasch.onion_peeling_transform", basis_dir=None)),
+    Peer(
+        "Hansen-Law", "projection", by_pyabel("hansenlaw.hansenlaw_transform", "hold_order"), "hold order", (0.0, 1.0)
+    ),
+    Peer(
+        "BASEX",
+        "projection",
+        by_pyabel("basex.basex_transform", "reg", basis_dir=None, verbose=False),
+        "reg",
+        STRENGTHS,
+    ),
+    Peer("Daun", "projection", by_pyabel("daun.daun_transform", "reg", degree=1, verbose=False), "reg", STRENGTHS),
     Peer("quadrature", "derivative", quadrature),
     Peer("Daun", "derivative", daun_of_slope, "reg", STRENGTHS),
 )
+"""Dasch, Appl. Opt. 31 (1992) 1146 (three-point, onion peeling); Hansen & Law, J. Opt. Soc. Am. A 2 (1985) 510;
+Dribinski et al., Rev. Sci. Instrum. 73 (2002) 2634 (BASEX); Daun et al., Appl. Opt. 45 (2006) 4638."""
 
 
 def attempts(

@@ -1,9 +1,9 @@
 """Absorption: NeRIF and the voxel methods compared with svmbir.
 
 The burnt fraction of the flame phantom as extinction, seen along parallel rays over half a turn; every pixel of the
-reference counts so many quanta, with Poisson noise. svmbir (model-based iterative reconstruction, BSD-3) fits the
-same absorbances on voxels of a pixel with its default regularisation and the weights of transmission. L2 / svmbir and
-seconds / svmbir are ratios on the same data.
+reference counts a stated number of quanta, with Poisson noise. svmbir (model-based iterative reconstruction, BSD-3)
+fits the same absorbances on voxels of a pixel with its default regularisation and the weights of transmission. L2 /
+svmbir and seconds / svmbir are ratios on the same data.
 """
 
 from __future__ import annotations
@@ -60,16 +60,9 @@ def by_svmbir(measurement: Measurement, azimuths: np.ndarray, folder: Path) -> F
 
 
 def measure(
-    folder: Path,
-    views: int,
-    counts: float,
-    peak: float,
-    pixels: int,
-    voxels: int,
-    seconds: float,
-    method: str,
+    folder: Path, views: int, counts: float, peak: float, pixels: int, voxels: int, seconds: float, method: str,
     seed: int,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     azimuths = 180 / views * np.arange(views)
     ring = Ring(
         views=views, arc=(0.0, float(azimuths[-1])), projection="telecentric", image_size=(pixels, pixels),

@@ -38,8 +38,8 @@ COLUMNS = {
 
 def cases(quick: bool) -> Iterator[Settings]:
     yield {
-        "views": 2 if quick else 9, "arc": 20.0 if quick else 170.0, "pixels": 320 if quick else 640, "sensor": 20.0,
-        "poses": 8 if quick else 40, "backgrounds": 2 if quick else 5, "target": "charuco", "seed": 0,
+        "views": 2 if quick else 9, "arc": 20.0 if quick else 170.0, "pixels": 200 if quick else 640, "sensor": 20.0,
+        "poses": 6 if quick else 40, "backgrounds": 1 if quick else 5, "target": "charuco", "seed": 0,
     }  # fmt: skip
 
 
@@ -75,16 +75,9 @@ def between_planes(camera: Camera, plane: Any) -> np.ndarray:
 
 
 def measure(
-    folder: Path,
-    views: int,
-    arc: float,
-    pixels: int,
-    sensor: float,
-    poses: int,
-    backgrounds: int,
-    target: str,
+    folder: Path, views: int, arc: float, pixels: int, sensor: float, poses: int, backgrounds: int, target: str,
     seed: int,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     cameras = rig(views, arc, pixels, sensor, seed)
     experiment = Experiment(
         target=target, columns=12, rows=9, poses=poses, backgrounds=backgrounds, references=1, seed=seed

@@ -46,15 +46,9 @@ def flame(box: Box, voxels: int) -> VoxelField:
 
 
 def measure(
-    folder: Path,
-    pixels: int,
-    noise: float,
-    preset: str,
-    time_limit: float,
-    device: str,
-    flame_voxels: int,
+    folder: Path, pixels: int, noise: float, preset: str, time_limit: float, device: str, flame_voxels: int,
     truth_voxels: int,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     path = folder / f"full-size-{pixels}-{flame_voxels}-{noise:g}.nc"
     if not path.is_file():
         cameras, box = paper_rig(pixels)

@@ -72,16 +72,9 @@ def simulated(folder: Path, phantom: str, pixels: int, noise: float, voxels: int
 
 
 def measure(
-    folder: Path,
-    phantom: str,
-    pixels: int,
-    noise: float,
-    method: str,
-    limit: float,
-    voxels: int,
-    truth_voxels: int,
+    folder: Path, phantom: str, pixels: int, noise: float, method: str, limit: float, voxels: int, truth_voxels: int,
     seed: int,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     data, truth = simulated(folder, phantom, pixels, noise, truth_voxels, seed)
     settings: dict[str, Any] = {"time_limit": limit, "epochs": 1e9, "seed": seed} if method == "NeRIF" else {}
     settings |= {"voxels": voxels} if voxels else {}

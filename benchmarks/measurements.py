@@ -22,8 +22,6 @@ from nerif.geometry import Box, Camera, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.simulation.simulate import simulate
 
-__all__ = ["FAULTS", "RIGS", "Case", "random_case"]
-
 FAULTS = ("nothing", "sigma halved", "sigma doubled", "camera knocked", "view mirrored", "flow beyond", "few views")
 KNOCK = 1.0  # mm
 SHRUNK = 0.6  # of the width of the box, where the flow extends beyond it

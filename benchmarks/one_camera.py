@@ -78,16 +78,9 @@ def best_of(peer: Peer, measurement: Measurement, truth: Volume) -> tuple[float,
 
 
 def measure(
-    folder: Path,
-    phantom: str,
-    noise: float,
-    half_angle: float,
-    pixels: int,
-    voxels: int,
-    seconds: float,
-    device: str,
-    seed: int,
-) -> dict[str, Any]:
+    folder: Path, phantom: str, noise: float, half_angle: float, pixels: int, voxels: int, seconds: float,
+    device: str, seed: int,
+) -> dict[str, Any]:  # fmt: skip
     field, grid = make_phantom(phantom, BOX), Grid.of_resolution(EVALUATED, voxels)
     truth = Volume(field.sample(grid), grid)
     measurement = add_noise(simulate(field, [camera_of(half_angle, pixels)], BOX, N_AMBIENT), noise, seed)

@@ -14,8 +14,6 @@ from nerif.fields.grid import VoxelField
 from nerif.fields.turbulence import inertial_scalar
 from nerif.geometry import Box
 
-__all__ = ["EDGE", "Bodies", "random_flow"]
-
 CONTRAST = 2.2e-4
 EDGE = 50.0  # mm
 

@@ -74,13 +74,10 @@ def draw_slices(axes: Axes, series: Mapping[str, tuple[Line, Sequence[Mapping[st
 
 
 def draw_curves(
-    axes: Axes,
-    curves: Mapping[str, tuple[Line, Sequence[Mapping[str, Any]]]],
-    across: str,
-    score: str,
+    axes: Axes, curves: Mapping[str, tuple[Line, Sequence[Mapping[str, Any]]]], across: str, score: str,
     points: Mapping[str, tuple[Line, float, float]] | None = None,
     levels: Mapping[str, tuple[Line, float]] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Draw errors over time or epochs, both logarithmic.
 
     Parameters

@@ -97,14 +97,9 @@ class Resolution:
 
 @torch.no_grad()
 def measure_resolution(
-    field: Field,
-    phantom: Octahedron,
-    half_length: float = 0.4,
-    patches: int = 4,
-    points: int = 4,
-    samples: int = 256,
-    device: torch.device | str = "cpu",
-) -> Resolution:
+    field: Field, phantom: Octahedron, half_length: float = 0.4, patches: int = 4, points: int = 4,
+    samples: int = 256, device: torch.device | str = "cpu",
+) -> Resolution:  # fmt: skip
     """Measure the spatial resolution of a reconstruction of the octahedron.
 
     Parameters

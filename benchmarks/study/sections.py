@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from benchmarks.study import tables
-from benchmarks.study.claims_of_method import MARGIN, resolution_of, to_paper_error
+from benchmarks.study.claims import MARGIN, resolution_of, to_paper_error
 from benchmarks.study.paper import L2, NETWORK_LOSS, RESOLUTION
 from benchmarks.study.plan import METHODS, SECTIONS
 from benchmarks.study.results import Record, Results, finite, first_at, metric

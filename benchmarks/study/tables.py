@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from benchmarks.study.claims import worse_than_paper
-from benchmarks.study.claims_of_method import to_paper_error
+from benchmarks.study.claims import to_paper_error, worse_than_paper
 from benchmarks.study.paper import CORRELATION, L2, MEMORY_GB, MINUTES, paper_value
 from benchmarks.study.plan import METHODS, NOISES, PHANTOMS
 from benchmarks.study.results import Results, finite, metric

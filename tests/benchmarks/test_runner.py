@@ -117,14 +117,20 @@ def test_bad_input(fake, tmp_path, capsys, words, field):
     assert capsys.readouterr().err.startswith(f"benchmarks: {field}: ")
 
 
-def test_another_revision_is_compared_as_ratios(fake, tmp_path, monkeypatch, capsys):
-    def in_turns(name, case, data, checkout, before_first):
-        return {"metrics": {"l2": 3.0, "outcome": "x"}, "before": {"metrics": {"l2": 2.0, "outcome": "x"}}}
+def test_another_revision_runs_in_turns_and_is_compared_as_ratios(fake, tmp_path, monkeypatch, capsys):
+    order = []
 
-    monkeypatch.setattr(runner, "in_turns", in_turns)
+    def elsewhere(name, case, data, checkout):
+        order.append("now" if checkout == runner.ROOT else "before")
+        return {"metrics": {"l2": 3.0 if checkout == runner.ROOT else 2.0, "outcome": "x"}}
+
+    monkeypatch.setattr(runner, "_elsewhere", elsewhere)
     monkeypatch.setattr(runner, "worktree", contextlib.nullcontext)
     assert main(["run", "fake", "--quick", "--against", "HEAD"]) == 0
-    assert "| phantom=a, size=2, seed=0 | l2 | 2 | 3 | 1.500 |" in capsys.readouterr().out
+    assert order[-4:] == ["before", "now", "now", "before"]
+    text = capsys.readouterr().out
+    assert "| phantom=a, size=2, seed=0 | l2 | 2 | 3 | 1.500 |" in text
+    assert "| l2 | 1.500 | 2 |" in text
 
 
 def killed(*arguments):

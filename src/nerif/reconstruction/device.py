@@ -2,7 +2,7 @@
 
 Torch and Numba use the same number of threads, at most the number of cores that no other program uses. Threads that
 share a step wait for each other: two threads on two cores, one of them busy, take eight times as long as one thread
-(benchmarks/results/busy-cpu.md).
+(docs/decisions/026).
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ def keep_freed_memory() -> None:
     """Make glibc keep freed blocks for the next step instead of returning them to the kernel.
 
     A step on the CPU allocates the same few arrays again and again; with the default thresholds their pages are
-    unmapped and zeroed each time, which takes as long as the arithmetic (benchmarks/README.md).
+    unmapped and zeroed each time, which takes as long as the arithmetic (docs/decisions/006).
     """
     if platform.libc_ver()[0] != "glibc":
         return

@@ -13,7 +13,6 @@ from nerif.cli.commands import evaluate, reconstruct, simulate
 from nerif.cli.commands.output import MONITOR, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.installation import install
-from nerif.common.settings import Positive
 from nerif.geometry import Ring
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.results.directory import ResultDirectory
@@ -32,8 +31,8 @@ class Demo(Settings):
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
     """Directory to write."""
-    time_limit: Positive = 22.0
-    """Time limit in seconds of each of three runs: the reconstruction and two bootstrap trials."""
+    steps: Annotated[int, Ge(1)] = 800
+    """Training steps of each of three runs: the reconstruction and two bootstrap trials."""
     pixels: Annotated[int, Ge(8)] = 64
     """Pixels along an edge of each view (paper: 200)."""
     noise: float = 0.05
@@ -59,7 +58,7 @@ def run(settings: Demo) -> None:
         reconstruct.ReconstructNeRIF(
             measurement=path, out=settings.out, preset="fast", voxels=80, force=True,
             run=Run(withhold=(f"{WITHHELD_ANGLE:g}deg",), uncertainty="fast", report=False),
-            reconstructor=NeRIF(time_limit=settings.time_limit, seed=settings.seed),
+            reconstructor=NeRIF(max_steps=settings.steps, seed=settings.seed),
         )
     )  # fmt: skip
     evaluate.run(evaluate.Evaluate(settings.out, truth=truth))

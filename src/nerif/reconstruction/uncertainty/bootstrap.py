@@ -10,7 +10,7 @@ then a sample of the error of q.
 q is smoother than the truth, and detail that the reconstruction cannot resolve is absent from q. The loss is estimated
 from the share k^2 of the detail of q that the trials retain, with g as fine as the pixels. If they retain all of it,
 the errors are due to noise; if not, q has lost more of the truth than the trials have lost of q. C was fitted to
-random flows (benchmarks/deviations.py). If the reconstruction was trained longer than the trials, it fits its data d
+random flows (docs/decisions/055). If the reconstruction was trained longer than the trials, it fits its data d
 better than they fit theirs, d_j, and its errors are smaller by rho.
 
 A single error is noisy, so squares are averaged around each voxel by a Gaussian G. No truth is used.

@@ -19,7 +19,7 @@ from nerif.reconstruction.voxels.planes import Bundle
 
 __all__ = ["VoxelOperator", "apply_rows", "check_step", "operator_norm", "rays_through"]
 
-# distance of planes in voxels: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)
+# distance of planes in voxels: the gradient of the linear basis jumps from voxel to voxel (docs/decisions/011)
 MAX_STEP = {"linear": 0.5, "cubic": 1.0}
 # of rays through a lens, per voxel of the cone's radius in the middle of the box; of a pixel
 PAIRS_PER_VOXEL, MAX_PAIRS = 2.0, 8
