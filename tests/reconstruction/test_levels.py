@@ -38,7 +38,9 @@ def difference(a, b, voxels: int) -> float:
 
 def test_bins_are_a_voxel_wide_before_the_end_and_small_at_the_end(flame):
     def of(voxels, coarse_to_fine):
-        return levels(flame, InSpace(flame.box, (), "cubic").grids(voxels, coarse_to_fine), coarse_to_fine)
+        return levels(
+            flame, InSpace(box=flame.box, faces=(), basis="cubic").grids(voxels, coarse_to_fine), coarse_to_fine
+        )
 
     result = of(48, coarse_to_fine=True)
     assert [max(level.grid.shape) for level in result] == [12, 24, 48, 48]

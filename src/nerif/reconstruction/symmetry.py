@@ -59,8 +59,8 @@ def find_axis(
     values = torch.zeros(4, dtype=torch.float64)
     if not refined:
         return Axis(symmetry, tuple(values.tolist()), before, before, math.nan)
-    layout = Symmetric(measurement.box, faces, "cubic", axisymmetric)
-    grid = layout.grid(VOXELS)
+    layout = Symmetric(box=measurement.box, faces=faces, basis="cubic", symmetry=axisymmetric)
+    grid, settings = layout.grid(VOXELS), ("cubic", layout.boundary, None, torch.float64)
     target = Target.of(measurement, open_faces, bins_of(measurement, grid), linear=True).without_outliers().to("cpu")
     if len(target) > MAX_RAYS:
         target = target[torch.randperm(len(target), generator=torch.Generator().manual_seed(0))[:MAX_RAYS]]
@@ -75,10 +75,7 @@ def find_axis(
 
     def operators(t: Float[Tensor, " 4"]) -> list[SymmetricOperator]:
         symmetry = about(t)
-        return [
-            SymmetricOperator(symmetry, p.rays, grid, p.model, "cubic", layout.boundary, dtype=torch.float64)
-            for p in target.parts
-        ]
+        return [SymmetricOperator(symmetry, p.rays, grid, p.model, *settings) for p in target.parts]
 
     def project(t: Float[Tensor, " 4"], c: Tensor) -> Tensor:
         x = c.reshape(grid.shape)

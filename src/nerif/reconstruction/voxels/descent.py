@@ -35,7 +35,7 @@ from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, 
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.voxels.layout import layout_of
+from nerif.reconstruction.voxels.layout import InSpace, Layout, Symmetric
 from nerif.reconstruction.voxels.levels import Level, coarser, levels
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 from nerif.reconstruction.voxels.weight import COARSE_WEIGHT, DISCREPANCY, choose_weight
@@ -79,8 +79,11 @@ class Descent:
         faces = ambient_faces(measurement, settings.ambient_faces)
         check_gauge(measurement, faces, settings.hull)
         self.axis = axis_of(settings, measurement)
-        symmetry = None if self.axis is None else self.axis.symmetry
-        self.layout = layout_of(symmetry, measurement.box, faces, settings.basis)
+        common: dict[str, Any] = {
+            "box": measurement.box, "faces": faces, "basis": settings.basis, "step": settings.step,
+            "device": self.device, "dtype": getattr(torch, settings.precision),
+        }  # fmt: skip
+        self.layout: Layout = Symmetric(symmetry=self.axis.symmetry, **common) if self.axis else InSpace(**common)
         grids = self.layout.grids(settings.voxels, settings.coarse_to_fine)
         self.levels = levels(measurement, grids, settings.coarse_to_fine)
         finest = grids[-1]
@@ -150,7 +153,6 @@ class Descent:
 
     @property
     def here(self) -> Level:
-        """The present level."""
         return self.levels[self.level]
 
     def _choose(self, problem: Problem, pixels: Problem | None, x: Tensor) -> Tensor:
@@ -189,11 +191,11 @@ class Descent:
         field = self.start if self.x is None else self._field(self.levels[self.level - 1])
         if field is None:
             return self.settings.begin(problem, problem.zero())
-        values = self.layout.sample(field, problem.operator.grid, self.device)
+        values = self.layout.sample(field, problem.operator.grid)
         return self.settings.begin(problem, values.to(device, dtype) / self.scale)
 
     def _field(self, level: Level) -> Field:
-        """The field of the present solution, which is on the grid of the level."""
+        """The field of the present solution, on the grid of the level."""
         assert self.x is not None
         return self.layout.field(self.x * self.scale, level.grid)
 
@@ -213,15 +215,10 @@ class Descent:
         return self._problem(level, target), None if level.edge == 1 else self._problem(level, self.pixel_target)
 
     def _problem(self, level: Level, target: Target) -> Problem:
-        settings, grid = self.settings, level.grid
-        dtype = getattr(torch, settings.precision)
         if self.rig is not None:
             target = replace(target, parts=tuple(self.rig.of(part) for part in target.parts))
-        operators = [
-            self.layout.operator(part.rays, grid, part.model, settings.step, self.device, dtype)
-            for part in target.parts
-        ]
-        return Problem(operators, target, None if self.free is None else coarser(self.free, grid), self.bounds)
+        operators = [self.layout.operator(part.rays, level.grid, part.model) for part in target.parts]
+        return Problem(operators, target, None if self.free is None else coarser(self.free, level.grid), self.bounds)
 
     # -- iterations ------------------------------------------------------------------------------------------------
 

@@ -21,19 +21,22 @@ from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
-__all__ = ["InSpace", "Layout", "Symmetric", "layout_of"]
+__all__ = ["InSpace", "Layout", "Symmetric"]
 
 MIN_FIRST_VOXELS = 12  # along the longest edge of the first grid
 MIN_HALVED_VOXELS = 4  # along an edge that is halved
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Layout(ABC):
     """Grids of coefficients, and the fields they define."""
 
     box: Box  # of the measurement, mm
     faces: tuple[str, ...]  # of it, on which the field is ambient
     basis: str  # of the spline
+    step: float | None = None  # of operators: distance of planes in voxels
+    device: torch.device | str = "cpu"
+    dtype: torch.dtype = torch.float32
 
     @property
     def degree(self) -> int:
@@ -48,17 +51,13 @@ class Layout(ABC):
         """Return the grid of voxels whose edge is the longest edge of the box over `voxels`."""
 
     @abstractmethod
-    def operator(
-        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
-        dtype: torch.dtype,
-    ) -> VoxelOperator:  # fmt: skip
-        """Return the projector of coefficients on a grid."""
+    def operator(self, rays: Rays, grid: Grid, model: ForwardModel) -> VoxelOperator: ...
 
     @abstractmethod
     def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field: ...
 
     @abstractmethod
-    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z y x"]:
+    def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z y x"]:
         """Return a field at the positions of the coefficients, as a first approximation of them."""
 
     @abstractmethod
@@ -87,23 +86,20 @@ class InSpace(Layout):
         nz, ny, nx = (max(layers, n) for n in Grid.of_resolution(self.box, voxels).shape)
         return Grid(self.box, (nz, ny, nx))
 
-    def operator(
-        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
-        dtype: torch.dtype,
-    ) -> VoxelOperator:  # fmt: skip
-        return VoxelOperator(rays, grid, model, self.basis, self.boundary, step, device, dtype)
+    def operator(self, rays: Rays, grid: Grid, model: ForwardModel) -> VoxelOperator:
+        return VoxelOperator(rays, grid, model, self.basis, self.boundary, self.step, self.device, self.dtype)
 
     def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field:
         return VoxelField.of(coefficients, grid, self.degree, self.boundary)
 
-    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z y x"]:
-        return field.sample(grid, device)
+    def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z y x"]:
+        return field.sample(grid, self.device)
 
     def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
         return visual_hull(measurement, grid)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Symmetric(Layout):
     """Splines of (r, h), one for each azimuth of the symmetry."""
 
@@ -126,11 +122,9 @@ class Symmetric(Layout):
         angles, grids = self.symmetry.angles, super().grids(voxels, coarse_to_fine)
         return [Grid(grid.box, (grid.shape[0], angles, grid.shape[2])) for grid in grids]
 
-    def operator(
-        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
-        dtype: torch.dtype,
-    ) -> VoxelOperator:  # fmt: skip
-        return SymmetricOperator(self.symmetry, rays, grid, model, self.basis, self.boundary, step, dtype)
+    def operator(self, rays: Rays, grid: Grid, model: ForwardModel) -> SymmetricOperator:
+        settings = self.basis, self.boundary, self.step, self.dtype
+        return SymmetricOperator(self.symmetry, rays, grid, model, *settings)
 
     def field(self, coefficients: Float[Tensor, "z k x"], grid: Grid) -> Field:
         (nz, angles, nx), layers = grid.shape, (self.degree + 1) // 2
@@ -139,7 +133,7 @@ class Symmetric(Layout):
         parts = [VoxelField.of(plane, flat, self.degree, self.boundary) for plane in planes]
         return SymmetricVoxels(parts, self.symmetry)
 
-    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z k x"]:
+    def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z k x"]:
         angle = 2 * math.pi * torch.arange(self.symmetry.angles, dtype=torch.float64) / self.symmetry.angles
         h, angle, r = torch.meshgrid(grid.axis("z"), angle, grid.axis("x"), indexing="ij")
         points = self.symmetry.places(r, angle, h).float()
@@ -158,8 +152,3 @@ class Symmetric(Layout):
         total = torch.bincount(cell, minlength=nz * nx)
         free = (2 * torch.bincount(cell[inside[on_grid]], minlength=nz * nx) > total) | (total == 0)
         return free.reshape(nz, 1, nx).expand(nz, angles, nx).contiguous()
-
-
-def layout_of(symmetry: Symmetry | None, box: Box, faces: tuple[str, ...], basis: str) -> Layout:
-    """Return the layout of a flow with a symmetry, or with none."""
-    return InSpace(box, faces, basis) if symmetry is None else Symmetric(box, faces, basis, symmetry)
