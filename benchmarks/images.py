@@ -28,8 +28,8 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, paper_rig
 from nerif.imaging.displacement.displacement import DisplacementSettings, measure
-from nerif.imaging.measuring import Scene, Surroundings, join_views
 from nerif.imaging.patterns import Background
+from nerif.imaging.recording import Scene, Surroundings, join_views
 from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
 
 REFERENCES = 5
