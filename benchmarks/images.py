@@ -26,8 +26,8 @@ from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, Lens, paper_rig
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.displacement.displacement import measure as measure_displacement
-from nerif.imaging.measuring import Scene, Surroundings, join_views
 from nerif.imaging.patterns import Background
+from nerif.imaging.recording import Scene, Surroundings, join_views
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.shared_settings import Source
 from nerif.reconstruction.voxels.total_variation import TotalVariation

@@ -22,8 +22,8 @@ from scipy.optimize import least_squares
 from nerif.data.measurement import Measurement
 from nerif.imaging.calibration.importers.importers import ImportSettings
 from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera
-from nerif.imaging.measuring import Recording, Scene, Surroundings, measure_instant
 from nerif.imaging.readers.views import find_views
+from nerif.imaging.recording import Recording, Scene, Surroundings, measure_instant
 from nerif.plotting.drawing import style
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor

@@ -21,9 +21,9 @@ from nerif.forward.deflection import Deflection
 from nerif.geometry import Box
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
-from nerif.imaging.measuring import Recording, Scene, Surroundings, measure_instant
-from nerif.imaging.over_time import frame_numbers, instants_of, measure_recording
 from nerif.imaging.readers.views import find_views
+from nerif.imaging.recording import Recording, Scene, Surroundings, measure_instant
+from nerif.imaging.recording_sequence import frame_numbers, instants_of, measure_recording
 
 __all__ = ["Displacement", "main", "run"]
 

@@ -18,10 +18,10 @@ from nerif.imaging import workers
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
-from nerif.imaging.measuring import Recording, RestingView, Scene, camera_of, measure_instant
-from nerif.imaging.over_time import RestingRecording, measure_recording
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View, find_views
+from nerif.imaging.recording import Recording, Scene, ViewReference, camera_of, measure_instant
+from nerif.imaging.recording_sequence import RecordingReference, measure_recording
 from refusals import refused
 
 SHAPE = (60, 72)
@@ -187,7 +187,7 @@ def test_saturated_pixels_are_not_valid_whichever_side_the_bits_are_on(tmp_path,
 @pytest.mark.parametrize("film", [False, True])
 def test_pixels_that_are_not_valid_are_inside_the_flow_mask(tmp_path, film):
     recording = replace(write_experiment(tmp_path, spot=True), masks=MaskSettings(smallest=16))
-    measurement = RestingRecording.of(recording).measure(0)[0] if film else measure_instant(recording)[0]
+    measurement = RecordingReference.of(recording).measure(0)[0] if film else measure_instant(recording)[0]
     assert measurement.flow_mask is not None
     usable = measurement.usable
     assert not bool(usable.all())
@@ -222,7 +222,7 @@ def test_a_film_is_opened_once_and_each_page_read_once(tmp_path, monkeypatch):
 
 
 def test_a_view_is_measured_without_opening_its_files_again(recording, monkeypatch):
-    resting = RestingView.of(recording, recording.views[0])
+    resting = ViewReference.of(recording, recording.views[0])
     opens: list[str] = []
     opened = tifffile.TiffFile.__init__
 
