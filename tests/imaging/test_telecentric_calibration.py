@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from calibration_images import target_images
 from nerif.geometry import TELECENTRIC, Camera, Ring
 from nerif.imaging.calibration.bundle import _Layout
-from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_the_right_side, calibrate
-from nerif.imaging.calibration.first_guess import first_guess, mirrored
+from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
+from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.simulation.experiment import side_of_one, world_axes
@@ -115,7 +115,7 @@ def test_the_first_guess_tells_every_tilt_up_to_one_mirror(seed):
     relative = truth[views[0].name] @ truth[views[1].name].T
     apart = [
         np.degrees(Rotation.from_matrix(b.cameras[0].rotation @ b.cameras[1].rotation.T @ relative.T).magnitude())
-        for b in (bundle, mirrored(bundle))
+        for b in (bundle, mirror(bundle))
     ]
     assert min(apart) < 2.0 < 10.0 < max(apart)
 
@@ -123,9 +123,9 @@ def test_the_first_guess_tells_every_tilt_up_to_one_mirror(seed):
 def test_the_mirror_image_takes_the_same_images_and_the_side_decides():
     bundle, observations = first_guess(IMAGES, ("k1",), "0", TELECENTRIC)
     for o in observations:
-        assert np.allclose(bundle.project(o), mirrored(bundle).project(o), atol=1e-9)
+        assert np.allclose(bundle.project(o), mirror(bundle).project(o), atol=1e-9)
     for face, sign in (("x+", 1), ("x-", -1)):
-        chosen = _on_the_right_side(bundle, dataclasses.replace(SETTINGS, side=(NAMES[0], face)), NAMES)
+        chosen = _on_side(bundle, dataclasses.replace(SETTINGS, side=(NAMES[0], face)), NAMES)
         assert -sign * float(SETTINGS.rotation[0] @ chosen.cameras[0].rotation[2]) > 0.5
 
 
@@ -188,7 +188,7 @@ def test_sides_that_cannot_be(side, words):
 def test_a_side_on_which_the_mirror_image_stands_too():
     bundle, _ = first_guess(IMAGES, ("k1",), "0", TELECENTRIC)
     with refused("side"):
-        _on_the_right_side(bundle, dataclasses.replace(SETTINGS, side=(NAMES[1], "y+")), NAMES)
+        _on_side(bundle, dataclasses.replace(SETTINGS, side=(NAMES[1], "y+")), NAMES)
 
 
 def test_an_unknown_projection_is_refused():

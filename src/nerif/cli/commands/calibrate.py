@@ -73,9 +73,9 @@ def run(settings: Calibrate) -> None:
     box = Box.between(settings.lower, settings.upper)
     if settings.simple and not settings.method.kind.shows_depth:
         raise InputError(f"expected perspective with --simple, got {settings.method.projection}", field="projection")
-    if not settings.simple and settings.rig.given:
+    if not settings.simple and settings.rig.entries:
         raise InputError(
-            "expected together with --simple; add it, or leave them out", field=", ".join(settings.rig.given)
+            "expected together with --simple; add it, or leave them out", field=", ".join(settings.rig.entries)
         )
     rig, errors = settings.out.with_suffix(".rig.png"), settings.out.with_suffix(".errors.png")
     if settings.check:
@@ -87,7 +87,7 @@ def run(settings: Calibrate) -> None:
         check_file(settings.out, settings.force, rig)
         camera, box = _simple(settings, box)
         cameras = (camera,)
-        write_cameras(settings.out, cameras, {"source": str(settings.source), "simple": settings.rig.given}, box)
+        write_cameras(settings.out, cameras, {"source": str(settings.source), "simple": settings.rig.entries}, box)
         _tell_simple(settings.out, camera, box)
     elif is_calibration(settings.source):
         check_file(settings.out, settings.force, rig)
