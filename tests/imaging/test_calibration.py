@@ -210,8 +210,9 @@ FAULTS: dict[str, Callable[[ViewImages], ViewImages]] = {
     "too few": lambda view: replace(view, poses=dict(list(view.poses.items())[:2]), background={}),
     "none in common": lambda view: replace(view, poses={f"9{n}": d for n, d in view.poses.items()}),
 }
+COMMON = next(n for n in images("telecentric")[0].poses if n in images("telecentric")[1].poses)
 FAULTS["one in common"] = lambda view: replace(
-    view, poses={"0": view.poses["0"], **FAULTS["none in common"](view).poses}
+    view, poses={n if n == COMMON else f"9{n}": d for n, d in view.poses.items()}
 )
 
 
