@@ -70,9 +70,9 @@ def run(settings: Calibrate) -> None:
     box = Box.between(settings.lower, settings.upper)
     if settings.simple and not settings.method.kind.shows_depth:
         raise InputError(f"expected perspective with --simple, got {settings.method.projection}", field="projection")
-    if not settings.simple and settings.rig.given:
+    if not settings.simple and settings.rig.entries:
         raise InputError(
-            "expected together with --simple; add it, or leave them out", field=", ".join(settings.rig.given)
+            "expected together with --simple; add it, or leave them out", field=", ".join(settings.rig.entries)
         )
     out, rig, errors = settings.out, settings.out.with_suffix(".rig.png"), settings.out.with_suffix(".errors.png")
     if settings.check:
@@ -84,7 +84,7 @@ def run(settings: Calibrate) -> None:
     check_output(out, settings.force, rig, *([] if no_images else [errors]), endings=(".toml",))
     if settings.simple:
         camera, box = _simple(settings, box)
-        write_cameras(out, [camera], {"source": str(settings.source), "simple": settings.rig.given}, box)
+        write_cameras(out, [camera], {"source": str(settings.source), "simple": settings.rig.entries}, box)
         _print_simple(out, camera, box)
         _draw(rig, [camera], box)
         return

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from nerif.forward.images import difference_variance, grey_variance
+from nerif.forward.images import ROUNDING_VARIANCE, difference_variance, grey_variance, local_mean
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.frames import as_float
 
