@@ -129,7 +129,7 @@ class MaskCard:
     async def _threshold(self) -> None:
         index = self.measurement.names.index(str(self.view.value))
         with refusals():
-            asked = self.job.view.made()
+            asked = self.job.view.record()
             settings: MaskSettings = asked.masks
             address = await self.work.beside(threshold_address, self.measurement, index, settings, asked.sigma)
             with ui.dialog() as dialog, ui.card():
