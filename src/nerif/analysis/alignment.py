@@ -9,7 +9,7 @@ from torch import Tensor
 from nerif.common.conventions import Points, Values, Vectors
 from nerif.data.volume import Volume
 from nerif.fields.base import Field, in_chunks
-from nerif.geometry.pose import turned
+from nerif.geometry.pose import rotation_matrix
 
 __all__ = ["Moved", "aligned"]
 
@@ -31,7 +31,7 @@ class Moved(Field):
         self.field, self.turn, self.shift = field, turn, shift
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
-        rotation = turned(self.turn.double()).to(points)
+        rotation = rotation_matrix(self.turn.double()).to(points)
         value, gradient = self.field.value_and_gradient(points @ rotation.T + self.shift.to(points))
         return value, gradient @ rotation
 
@@ -57,7 +57,7 @@ def aligned(field: Field, truth: Volume) -> Moved:
     for _ in range(ROUNDS):
         seen = [found.value_and_gradient(some) for some in in_chunks(points)]
         value, slope = (torch.cat(parts).double() for parts in zip(*seen, strict=True))
-        rotation = turned(found.turn)
+        rotation = rotation_matrix(found.turn)
         place, slope = points.double() @ rotation.T, slope @ rotation.T  # where f is asked, but for the shift
         jacobian = torch.cat([torch.linalg.cross(place, slope) * (1 / reach), slope], dim=1)
         step = torch.linalg.lstsq(jacobian, (wanted - value)[:, None]).solution[:, 0]

@@ -141,7 +141,7 @@ def kept_half(
         raise InputError(
             f"expected half an image ('{words[0]}') with --symmetry axis only; name views", field="withhold"
         )
-    symmetry = axis if isinstance(axis, Symmetry) else Symmetry.kept(axis["symmetry"])
+    symmetry = axis if isinstance(axis, Symmetry) else Symmetry.from_entries(axis["symmetry"])
     parts = halved(measurement, symmetry)
     return parts, tuple(name for name in parts.names if name.endswith(f" {words[0]}"))
 

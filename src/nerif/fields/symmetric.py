@@ -45,7 +45,7 @@ class SymmetricNetwork(Network):
 
     def pull_back(self, p: Tensor, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
         slope = encode_pullback(encoded, cotangent, self.waves)
-        return self.symmetry.turned_back(self.symmetry.local(p).to(slope), slope)
+        return self.symmetry.gradient(self.symmetry.local(p).to(slope), slope)
 
     def _value(self, p: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         if self.layered:
@@ -63,7 +63,7 @@ class SymmetricNetwork(Network):
 
     def _gradient_heads(self, p: Tensor, h: Tensor) -> Tensor:
         slope = super()._gradient_heads(p, h)
-        return self.symmetry.turned_back(self.symmetry.local(p).to(slope), slope)
+        return self.symmetry.gradient(self.symmetry.local(p).to(slope), slope)
 
 
 def symmetry_of_field(field: Field) -> Symmetry | None:
@@ -132,8 +132,8 @@ class SymmetricVoxels(Field):
         found = [part.value_and_gradient(place) for part in self.parts]
         if len(found) == 1:
             value, slope = found[0]
-            return value, self.symmetry.turned_back(w, slope)
+            return value, self.symmetry.gradient(w, slope)
         share, rise = self.symmetry.shares(w)
         values, slopes = torch.stack([v for v, _ in found], dim=-1), torch.stack([s for _, s in found], dim=-2)
-        slope = self.symmetry.turned_back(w, (share[..., None] * slopes).sum(dim=-2))
+        slope = self.symmetry.gradient(w, (share[..., None] * slopes).sum(dim=-2))
         return (share * values).sum(dim=-1), slope + (rise * values[..., None]).sum(dim=-2)

@@ -77,7 +77,7 @@ def find_axis(
 
     def about(v: Float[Tensor, " 4"]) -> Symmetry:
         a, b, c, d = v.tolist()
-        return still.moved((a, b), (c, d))
+        return still.move((a, b), (c, d))
 
     def operators(v: Float[Tensor, " 4"]) -> list[SymmetricOperator]:
         moved = about(v)

@@ -108,7 +108,7 @@ class Result:
     def meridian(self) -> Meridian | None:
         """The quantities over (r, h) of a symmetric flow; None of any other."""
         axis = self.metrics.get("axis") if self.volumes else None
-        return Meridian.of(self.volumes, Symmetry.kept(axis["symmetry"])) if axis else None
+        return Meridian.of(self.volumes, Symmetry.from_entries(axis["symmetry"])) if axis else None
 
     @property
     def method(self) -> str:

@@ -160,7 +160,7 @@ class Refinement:
         if numbers is not None and list(numbers) != list(range(len(self.cameras))):
             rays = replace(rays, view=torch.tensor(numbers, device=rays.view.device).to(rays.view)[rays.view.long()])
         geometric = any(i < len(GEOMETRY) for i in self.columns)
-        moved = self._corrections.moved(rays, self.box) if geometric else rays
+        moved = self._corrections.apply(rays, self.box) if geometric else rays
         return replace(part, rays=replace(moved, view=part.rays.view), offset=self._offset(self.values, rays))
 
     def table(self) -> list[dict[str, Any]]:
@@ -285,7 +285,7 @@ class Refinement:
         seen : the path integral, where it is known
         """
         if seen is None:
-            seen = predict(part, self._of(values).moved(part.rays, self.box))
+            seen = predict(part, self._of(values).apply(part.rays, self.box))
         offset = self._offset(values, part.rays)
         shifted = seen if offset is None else seen + offset
         return part.model.residual(shifted, part.measured, part.rays) * part.inverse_scale, seen

@@ -133,7 +133,7 @@ class SequenceStore(VolumeSequence):
     def symmetry(self) -> Symmetry | None:
         """Of the fields of all frames, mm, if they have one."""
         kept = self.attributes.get("symmetry")
-        return Symmetry.kept(kept) if kept else None
+        return Symmetry.from_entries(kept) if kept else None
 
     @property
     def status(self) -> np.ndarray:
@@ -224,6 +224,6 @@ def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0) -> Networ
     low, high = attributes.get("bounds", (None, None))  # JSON knows no infinity
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
     if attributes.get("symmetry"):
-        own = Symmetry.kept(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
+        own = Symmetry.from_entries(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
         return SymmetricNetwork(shape, own, bounds)
     return Network(shape, bounds=bounds)
