@@ -92,7 +92,7 @@ def test_local_contrast_copes_with_uneven_light(pattern, truth):
 def test_sigma_is_about_the_error(pattern, truth, method, references):
     many, flow = images(pattern, truth, references, noise=40.0)
     found = measure(many, [flow], DisplacementSettings(method), FULL)
-    assert found.noise_from == ("repeats" if references >= 3 else "structure tensor")
+    assert found.noise_source == ("repeats" if references >= 3 else "structure tensor")
     error = (found.displacement - truth)[8:-8, 8:-8]
     ratio = np.sqrt(np.mean((error / found.sigma[8:-8, 8:-8]) ** 2))
     assert 0.3 < ratio < 3

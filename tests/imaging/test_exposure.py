@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imaging_files import packed, write_photron
-from nerif.imaging.displacement.exposure import check_exposure, effective_bits, full_scale, saturated
+from nerif.imaging.readers.exposure import check_exposure, effective_bits, full_scale, saturated
 from nerif.imaging.readers.open import open_frames
 
 SHAPE = (60, 80)

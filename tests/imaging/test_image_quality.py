@@ -9,10 +9,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from nerif.imaging.image_quality import address_of, look_at, reduced
+from nerif.imaging.image_quality import image_quality, jpeg_address, shrink
 from nerif.imaging.readers.crop import Crop
-from nerif.imaging.readers.views import find_views
-from nerif.imaging.readers.views_file import BEFORE, write_crops
+from nerif.imaging.readers.views import BEFORE, find_views, write_crops
 from refusals import refused
 
 
@@ -33,8 +32,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_bad_images_are_named_with_the_reason(folder):
-    look = look_at(find_views(folder)[0], "reference")
-    assert (look.count, look.looked, look.shape, look.first) == (4, 4, (40, 56), 0)
+    look = image_quality(find_views(folder)[0], "reference")
+    assert (look.count, look.sampled, look.shape, look.first) == (4, 4, (40, 56), 0)
     ((name, why),) = look.bad
     assert name == "cam1/reference/p2.png"
     assert "cannot be read" in why
@@ -43,7 +42,7 @@ def test_bad_images_are_named_with_the_reason(folder):
 
 
 def test_what_is_saturated_is_told(folder):
-    look = look_at(find_views(folder)[1], "flow")
+    look = image_quality(find_views(folder)[1], "flow")
     assert look.saturated == pytest.approx(10 * 14 / (40 * 56))
     assert "over-exposed" in look.notes[0]
 
@@ -51,16 +50,16 @@ def test_what_is_saturated_is_told(folder):
 def test_a_source_without_a_good_image_is_refused(folder):
     (folder / "cam1" / "flow" / "p0.png").write_bytes(b"")
     with refused("view 'cam1'"):
-        look_at(find_views(folder)[0], "flow")
+        image_quality(find_views(folder)[0], "flow")
     with refused("view 'cam1'"):
-        look_at(find_views(folder)[0], "target")
+        image_quality(find_views(folder)[0], "target")
 
 
 def test_images_are_reduced_and_never_enlarged():
     image = np.arange(80 * 120, dtype=np.uint16).reshape(80, 120)
-    assert reduced(image, 30).shape == (20, 30)
-    assert reduced(image, 300) is image
-    kind, _, coded = address_of(image, 60).partition(";base64,")
+    assert shrink(image, 30).shape == (20, 30)
+    assert shrink(image, 300) is image
+    kind, _, coded = jpeg_address(image, 60).partition(";base64,")
     assert kind == "data:image/jpeg"
     assert iio.imread(base64.b64decode(coded)).shape == (40, 60)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from nerif.common.conventions import InputError
-from nerif.imaging.masks import MaskShape, drawn_masks, mask_of, read_mask, write_masks
+from nerif.imaging.masks import MaskShape, drawn_masks, mask_of, write_masks
+from nerif.imaging.readers.open import read_mask
 from refusals import refused
 
 SQUARE = MaskShape("polygon", ((4, 2), (11, 2), (11, 8), (4, 8)))

@@ -15,7 +15,8 @@ from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.forward.emission import Emission
 from nerif.geometry import Box, Grid, Ring
-from nerif.imaging.masks import MaskSettings, drawn_masks, flow_mask, read_mask, with_flow_masks
+from nerif.imaging.masks import MaskSettings, drawn_masks, flow_mask, with_flow_masks
+from nerif.imaging.readers.open import read_mask
 from nerif.reconstruction.gauge import visual_hull
 from nerif.simulation.simulate import simulate
 from refusals import refused
@@ -108,7 +109,7 @@ def test_drawn_masks_are_taken_as_they_are(four, tmp_path):
     iio.imwrite(tmp_path / f"{name}.png", image)
     valid = four.usable.clone()
     valid[1, :5] = False
-    masked = with_flow_masks(replace(four, valid=valid), drawn=drawn_masks(tmp_path, four.names)).flow_mask
+    masked = with_flow_masks(replace(four, valid=valid), drawings=drawn_masks(tmp_path, four.names)).flow_mask
     assert masked is not None
     assert torch.equal(masked[1], torch.from_numpy(image > 0))
     with pytest.raises(InputError, match="no such folder"):

@@ -10,14 +10,14 @@ from scipy.ndimage import gaussian_filter
 
 from nerif.imaging.calibration.targets import eight_bit, saddle_points
 from nerif.imaging.displacement.correlation import correlate, normalised_median_outliers
-from nerif.imaging.displacement.displacement import AtRest, DisplacementSettings, displacement, measure
-from nerif.imaging.displacement.exposure import check_exposure, saturated
-from nerif.imaging.displacement.noise import local_correlation, smoothed_away, structure_variance
+from nerif.imaging.displacement.displacement import DisplacementSettings, Reference, displacement, measure
+from nerif.imaging.displacement.noise import local_correlation, smoothing_error, structure_variance
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
-from nerif.imaging.image_quality import reduced
+from nerif.imaging.image_quality import shrink
 from nerif.imaging.masks import MaskSettings, flow_mask
+from nerif.imaging.readers.exposure import check_exposure, saturated
 
 SHAPE = 32, 36
 ALL = np.ones(SHAPE, dtype=bool)
@@ -44,10 +44,10 @@ FUNCTIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "displacement": lambda a, b: displacement(a, b, WHOLE),
     "displacement, local contrast": lambda a, b: displacement(a, b, LOCAL),
     "measure": lambda a, b: measure([a], [b], WHOLE, 255.0).displacement,
-    "at rest": lambda a, b: AtRest.of([a, b], WHOLE, 255.0).mean,
+    "at rest": lambda a, b: Reference.of([a, b], WHOLE, 255.0).mean,
     "structure variance": lambda a, b: structure_variance(a, b, 1.8),
     "local correlation": lambda a, b: local_correlation(a, b, 3.0),
-    "smoothed away": lambda a, b: smoothed_away(stacked(a, b), 1.8),
+    "smoothed away": lambda a, b: smoothing_error(stacked(a, b), 1.8),
     "outliers": lambda a, b: normalised_median_outliers(stacked(a, b)),
     "correlate": lambda a, b: correlate(a, b, 12, passes=1).movement,
     "warp": lambda a, b: warp(a, SHIFT),
@@ -60,7 +60,7 @@ FUNCTIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "mask": lambda a, b: flow_mask(stacked(a, b), stacked(np.maximum(b, 9), np.maximum(a, 9)), MASKS),
     "eight bit": lambda a, b: eight_bit(a),
     "saddle points": lambda a, b: saddle_points(a, np.array([[9.0, 12.0], [20.3, 22.1]]), 5.0)[0],
-    "reduced": lambda a, b: reduced(a, 23),
+    "shrink": lambda a, b: shrink(a, 23),
 }
 
 

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from nerif.forward.images import Images
-from nerif.imaging.displacement.displacement import AtRest, DisplacementSettings, measure
+from nerif.imaging.displacement.displacement import DisplacementSettings, Reference, measure
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.warping import warp
 
@@ -44,7 +44,7 @@ def test_the_noise_does_not_change_with_the_number_of_references(references, mon
     monkeypatch.setattr("nerif.imaging.displacement.displacement._repeat_sigma", lambda *_: None)  # it is slow
     light, draw = scene(), np.random.default_rng(0)
     images = [light + np.sqrt(variance(light)) * draw.standard_normal(light.shape) for _ in range(references)]
-    noise = AtRest.of(images, DisplacementSettings()).camera
+    noise = Reference.of(images, DisplacementSettings()).camera_noise
     assert float(np.mean(noise.variance(light) / variance(light))) == pytest.approx(1, abs=0.03)
 
 
@@ -82,7 +82,7 @@ def test_noise_told_by_attributes_of_a_file_is_that_of_a_pair():
     noise = CameraNoise(READ**2, 1 / ELECTRONS)
     pair = ImagePair.of(reference, flow, np.zeros((*light.shape, 2)), noise, 1, everywhere, everywhere)
     maps = {"flow": torch.tensor(flow)[None], "reference": torch.tensor(reference)[None]}
-    told = Images.completed(maps, {"read_noise": READ, "electrons_per_grey_value": ELECTRONS})["image_sigma"]
+    told = Images.complete(maps, {"read_noise": READ, "electrons_per_grey_value": ELECTRONS})["image_sigma"]
     np.testing.assert_allclose(told[0].numpy(), pair.sigma, rtol=0.01)
 
 

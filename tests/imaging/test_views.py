@@ -7,8 +7,9 @@ import pytest
 import tifffile
 
 from nerif.common.conventions import InputError
+from nerif.imaging.calibration.target_images import find_targets
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.imaging.readers.views import _pose_keys, find_targets, find_views, good_images
+from nerif.imaging.readers.views import find_views, good_images
 from refusals import refused
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from nerif.app.project import Project
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
-from nerif.imaging.image_quality import SourceLook, address_of, look_at
+from nerif.imaging.image_quality import ImageQuality, image_quality, jpeg_address
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View
 
@@ -43,9 +43,9 @@ class ImageFiles:
         found = [os.stat(where), *(entry.stat() for entry in os.scandir(where))] if where.is_dir() else [os.stat(where)]
         return len(found), max(f.st_mtime_ns for f in found), sum(f.st_size for f in found)
 
-    def look(self, view: View, source: str, most: int) -> SourceLook:
+    def look(self, view: View, source: str, most: int) -> ImageQuality:
         """Return how the images of a source are; InputError where there are none of use."""
-        return self._once(view, source, ("look", most), lambda: look_at(view, source, most))
+        return self._once(view, source, ("look", most), lambda: image_quality(view, source, most))
 
     def image(self, view: View, source: str, number: int, largest: int, crop: Crop | None, white: float = 0.0) -> str:
         """Return an image in a data address: of a frame, or of the part that `crop` leaves of it."""
@@ -53,7 +53,7 @@ class ImageFiles:
         def read() -> str:
             frames = view.open(source)
             image = frames[number]
-            return address_of(crop(image, frames.name(number)) if crop else image, largest, white)
+            return jpeg_address(crop(image, frames.name(number)) if crop else image, largest, white)
 
         return self._once(view, source, ("image", number, largest, crop, white), read)
 

@@ -11,8 +11,9 @@ from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.result import ImageError
+from nerif.imaging.calibration.target_images import pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
-from nerif.imaging.readers.views import View, pose_names
+from nerif.imaging.readers.views import View
 
 __all__ = ["TargetImages"]
 

@@ -1,13 +1,14 @@
-"""Axis names, units and array aliases: the one place where each is written down (prose in docs/conventions.md).
+"""Axis names, units and array aliases (prose: docs/conventions.md).
 
 Lengths are millimetres, image quantities pixels, angles radians, times seconds. Volumes are indexed [z, y, x].
 """
 
 from __future__ import annotations
 
+import math
 from typing import SupportsFloat
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 __all__ = [
@@ -25,8 +26,8 @@ __all__ = [
     "Points",
     "Values",
     "Vectors",
-    "VoxelIndex",
     "ambient_index",
+    "check_positive",
     "parse_faces",
     "unit_shown",
     "with_unit",
@@ -39,10 +40,10 @@ FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 """Faces of the box, by outward normal."""
 
 DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
-"""Where the index is taken as ambient when nothing else is said: the side faces (the gauge)."""
+"""Faces with the ambient index by default: the side faces (the gauge)."""
 
 AMBIENT_INDEX = 1.00027
-"""Of air at 20 °C and one atmosphere, where nothing else is said."""
+"""Default refractive index: air at 20 °C and one atmosphere."""
 
 STATISTICS = {
     "std": "standard deviation",
@@ -50,13 +51,13 @@ STATISTICS = {
     "p95": "95th percentile",
     "certainty": "certainty",
 }
-"""Endings of what repetitions of a reconstruction tell of a quantity (density_std), in words."""
+"""Suffixes of bootstrap statistics of a quantity (density_std), and their names."""
 
 LARGEST_INDEX = 4.0
-"""Of gases, liquids and glasses."""
+"""Upper limit of the refractive index of gases, liquids and glasses."""
 
 LARGEST_LENGTH = 1e7
-"""Beyond ten kilometres (mm) a length is taken for a mistake of its unit."""
+"""Ten kilometres in mm: a longer length is taken for an error of unit."""
 
 Points = Float[Tensor, "*batch 3"]  # mm, world frame
 Vectors = Float[Tensor, "*batch 3"]  # direction (1) or gradient (1/mm)
@@ -64,16 +65,15 @@ Values = Float[Tensor, "*batch"]  # index excess n - n_ambient (1)
 Pixels = Float[Tensor, "*batch 2"]  # px, (column u, row v), (0, 0) the centre of the top-left pixel
 Matrix3 = Float[Tensor, "3 3"]
 Mask = Bool[Tensor, "*batch"]
-VoxelIndex = Int[Tensor, "*batch 3"]
 
 
 class InputError(ValueError):
-    """Invalid input: the message names the field, what was expected, what came, and the remedy.
+    """Invalid input.
 
     Parameters
     ----------
-    message : what was expected, what came, the remedy
-    field : name of the parameter, variable or file at fault, which the message then begins with
+    message : the expected and the actual value, and the remedy
+    field : name of the parameter, variable or file; precedes the message
     """
 
     def __init__(self, message: str, *, field: object = "") -> None:
@@ -81,43 +81,40 @@ class InputError(ValueError):
         super().__init__(f"{self.field}: {message}" if self.field else message)
 
     def inside(self, place: object) -> InputError:
-        """Return the error with the file or view in which it occurred before its message; the field stays."""
+        """Return the error with the file or view in which it occurred as prefix and the field unchanged."""
         error = InputError(f"{place}: {self}")
         error.field = self.field
         return error
 
 
-def ambient_index(value: object, name: str = "n_ambient") -> float:
-    """Return the refractive index around the flow as a number.
+def check_positive(record: object, *names: str, zero: bool = False, limit: float = math.inf) -> None:
+    """Check that numbers of a record are above 0, or 0 if `zero` is set, and at most `limit`."""
+    for name in names:
+        value = getattr(record, name)
+        if not (0 < value <= limit or (zero and value == 0)):
+            upper = f" and at most {limit:g}" if limit < math.inf else ""
+            raise InputError(f"expected a number {'from' if zero else 'above'} 0{upper}, got {value}", field=name)
 
-    Raises
-    ------
-    InputError
-        If it is not a number between 0.9 and 4, as of gases, liquids and glasses.
-    """
+
+def ambient_index(value: object, name: str = "n_ambient") -> float:
+    """Return the refractive index around the flow, a number between 0.9 and 4, as a float."""
     if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < LARGEST_INDEX:
         raise InputError(f"expected a refractive index such as 1.00027, got {value}", field=name)
     return float(value)
 
 
 def unit_shown(unit: str) -> str:
-    """Return a unit as people see it: nothing for that of a pure number, 1."""
+    """Return the unit as printed; empty for the unit 1."""
     return "" if unit == "1" else unit
 
 
 def with_unit(value: object, unit: str) -> str:
-    """Return a number, or a text that ends with one, with its unit behind it."""
+    """Return a number, or a text that ends with one, followed by its unit."""
     return f"{value} {unit_shown(unit)}".rstrip()
 
 
 def parse_faces(text: str | tuple[str, ...] | list[str], name: str = "ambient_faces") -> tuple[str, ...]:
-    """Return the faces named in a text such as ``"x- x+ y- y+"``.
-
-    Raises
-    ------
-    InputError
-        If a word is not one of ``x- x+ y- y+ z- z+``.
-    """
+    """Return the faces named in a text such as ``"x- x+ y- y+"``."""
     words = tuple(text.replace(",", " ").split()) if isinstance(text, str) else tuple(text)
     for word in words:
         if word not in FACES:

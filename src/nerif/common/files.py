@@ -1,7 +1,4 @@
-"""Files that appear whole or not at all: atomic writes, TOML and JSON.
-
-TOML is checked for misspelled keys when read; JSON has null for numbers that are not finite.
-"""
+"""Atomic writing of files, TOML and JSON."""
 
 from __future__ import annotations
 
@@ -21,15 +18,15 @@ from nerif.common.conventions import InputError
 __all__ = ["atomic", "check_known", "read_toml", "write_json", "write_toml", "written"]
 
 written: list[Path] = []
-"""What this process has written, in that order."""
+"""Paths that this process has written, in order."""
 
 
 @contextmanager
 def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path beside `path` that takes its name at the end, and is removed if anything goes wrong.
+    """Yield a temporary path beside `path` that takes its name at the end, and is removed after an error.
 
-    The temporary name is hidden and keeps the ending, by which libraries choose a format. What is written may be a file
-    or a directory; a file replaces a file, and a directory whatever stands at `path`.
+    The temporary name is hidden and keeps the suffix, by which libraries choose a format. A file replaces a file; a
+    directory replaces either.
     """
     path = Path(path)
     part = path.with_name(f".{path.stem}.part{path.suffix}")
@@ -52,13 +49,7 @@ def _remove(path: Path) -> None:
 
 
 def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises
-    ------
-    InputError
-        If it is missing (`expected` says what should be there), or no TOML.
-    """
+    """Read a TOML file; `expected` is its content, for the message if there is none."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -68,30 +59,24 @@ def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict
 
 
 def write_toml(path: str | os.PathLike[str], table: Mapping[str, Any], head: str = "") -> None:
-    """Write a TOML file, atomically, below a comment."""
+    """Write a TOML file atomically, with `head` as leading comment."""
     import tomli_w
 
     with atomic(path) as part:
         part.write_text(head + tomli_w.dumps(table), encoding="utf-8")
 
 
-def check_known(words: Iterable[str], known: Iterable[str], where: str, what: str = "key", more: str = "") -> None:
-    """Refuse a word that is not known.
-
-    Raises
-    ------
-    InputError
-        Naming the nearest known one.
-    """
-    known = list(known)
+def check_known(words: Iterable[str], names: Iterable[str], where: str, what: str = "key", more: str = "") -> None:
+    """Raise an InputError that suggests the nearest name for a word that is not among the names."""
+    names = list(names)
     for word in words:
-        if word not in known:
-            near = difflib.get_close_matches(word, known, n=1, cutoff=0)[0]
+        if word not in names:
+            near = difflib.get_close_matches(word, names, n=1, cutoff=0)[0]
             raise InputError(f"unknown {what} '{word}'; the nearest known one is '{near}'{more}", field=where)
 
 
 def write_json(path: Path, entries: Mapping[str, Any]) -> None:
-    """Write a JSON file, atomically; NaN and infinity as null."""
+    """Write a JSON file atomically; NaN and infinity become null."""
     with atomic(path) as part:
         part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
 
@@ -101,6 +86,4 @@ def _plain(value: Any) -> Any:
         return {k: _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

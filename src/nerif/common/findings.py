@@ -1,4 +1,4 @@
-"""A finding: what is wrong with a measurement, as a code for programs and a sentence for people."""
+"""Findings of the plausibility checks of a measurement."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Finding:
 
     Parameters
     ----------
-    code : one word for its kind.
-        Of the rig: inside, beside, apart, small_box, large_box, moved.
-        Of all views: unrelated, reordered, or what may have happened to one.
-        Of a view: swapped, flipped, flipped_u, flipped_v, mirrored, upside_down, turned, transposed, quarter_turn,
+    code : its kind, one word.
+        Rig: inside, beside, apart, small_box, large_box, moved.
+        All views: unrelated, reordered, or one of the codes of a view.
+        One view: swapped, flipped, flipped_u, flipped_v, mirrored, upside_down, turned, transposed, quarter_turn,
         reversed_columns, reversed_rows, reversed_axes, exchanged, misscaled, unlike.
-        Of the flow: open_face
-    sentence : what it is, and what to do about it
-    views : names of the views it concerns; none where it concerns the measurement as a whole
+        Flow: open_face
+    sentence : description and remedy
+    views : names of the views concerned; empty for the whole measurement
     """
 
     code: str
@@ -33,7 +33,7 @@ class Finding:
 
     @staticmethod
     def subject(views: Sequence[str], total: int) -> str:
-        """Return what a sentence about some of `total` views begins with: view a; views a and b; all views."""
+        """Return the subject of a sentence about some of `total` views: view a; views a and b; all views."""
         if len(views) == total > 1:
             return "all views"
         names = " and ".join(filter(None, (", ".join(views[:-1]), views[-1])))

@@ -1,4 +1,4 @@
-"""The distribution that this program is installed by: not `nerif`, a name that another project has on PyPI."""
+"""The distribution name of this program; `nerif` on PyPI belongs to another project."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ __all__ = ["DISTRIBUTION", "install", "stranger"]
 
 DISTRIBUTION = "nerif-bost"
 COMMAND = "nerif.cli.cli:main"
-"""What the command `nerif` of this program runs, under whatever name it was installed."""
+"""Entry point of this program's command `nerif`."""
 
 
 def install(extra: str) -> str:
@@ -15,13 +15,13 @@ def install(extra: str) -> str:
 
 
 def stranger() -> str:
-    """Return a line that names the other project's package and the remedy, where that is installed; else nothing."""
+    """Return a warning with the remedy if the other project's package `nerif` is installed, else an empty string."""
     from importlib.metadata import distributions
 
-    for found in distributions(name="nerif"):
-        if COMMAND not in {entry.value for entry in found.entry_points}:
+    for distribution in distributions(name="nerif"):
+        if COMMAND not in {entry.value for entry in distribution.entry_points}:
             return (
-                f"the package nerif {found.version} of another project is installed, which is imported by the same "
+                f"the package nerif {distribution.version} of another project is installed and uses the same import "
                 "name; pip uninstall nerif, then install this program again"
             )
     return ""

@@ -1,4 +1,4 @@
-"""Ctrl-C: what is there already, and how to go on."""
+"""Ctrl-C with a message: which files are complete and how to continue."""
 
 from __future__ import annotations
 
@@ -9,20 +9,15 @@ __all__ = ["Interrupted", "if_interrupted"]
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, with one sentence on what is saved and how to go on."""
+    """Ctrl-C, with one sentence on what is saved and how to continue."""
 
 
 @contextmanager
-def if_interrupted(tell: Callable[[], str]) -> Iterator[None]:
-    """Within it, a Ctrl-C carries what `tell` returns, unless something inside knew better.
-
-    Parameters
-    ----------
-    tell : looks what is saved, once it is needed
-    """
+def if_interrupted(message: Callable[[], str]) -> Iterator[None]:
+    """Give a Ctrl-C inside the block the text that `message` returns; the innermost block takes precedence."""
     try:
         yield
     except Interrupted:
         raise
     except KeyboardInterrupt:
-        raise Interrupted(tell()) from None
+        raise Interrupted(message()) from None

@@ -1,4 +1,4 @@
-"""NetCDF-4 files and Zarr stores as they are found: opened lazily, and refused in words where they are damaged."""
+"""NetCDF-4 files and Zarr stores, opened lazily, with an InputError where they are damaged."""
 
 from __future__ import annotations
 
@@ -24,16 +24,11 @@ __all__ = ["opened", "reading", "values"]
 
 @contextmanager
 def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
-    """Give a file as a dataset of which nothing is read yet; what is refused while it is open is told with its name.
+    """Open a file as a lazy dataset; an InputError inside the block gets the file name as prefix.
 
     Parameters
     ----------
-    expected : what the file should be, such as "a measurement"
-
-    Raises
-    ------
-    InputError
-        If it is missing, no NetCDF-4, or damaged.
+    expected : content of the file, such as "a measurement"
     """
     import h5py
     import xarray as xr
@@ -54,70 +49,53 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
 
 
 def values(variable: xr.DataArray) -> np.ndarray:
-    """Read the numbers of a variable.
-
-    Raises
-    ------
-    InputError
-        If they are no numbers, or the file is damaged there.
-    """
-    with reading(f"variable '{variable.name}': cannot be read; is the file damaged?"):
-        read = np.asarray(variable.values)
-    if read.dtype.kind not in "fiub":
-        raise InputError(f"expected numbers, got {read.dtype}", field=f"variable '{variable.name}'")
-    return read
+    """Read the numbers of a variable."""
+    field = f"variable '{variable.name}'"
+    with reading(f"{field}: cannot be read; is the file damaged?"):
+        numbers = np.asarray(variable.values)
+    if numbers.dtype.kind not in "fiub":
+        raise InputError(f"expected numbers, got {numbers.dtype}", field=field)
+    return numbers
 
 
 @contextmanager
-def reading(refusal: str) -> Iterator[None]:
-    """Refuse what a library cannot read: calls of it stand inside, and no others, since any error is taken for damage.
-
-    Raises
-    ------
-    InputError
-        With the refusal, and the first line of what the library says.
-    """
+def reading(message: str) -> Iterator[None]:
+    """Raise an InputError with `message` for any error inside; the block holds nothing but calls of a library."""
     try:
         yield
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # libraries raise whatever the damage leads them to
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{refusal} ({said})") from None
+    except Exception as error:  # libraries raise anything on damaged files
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{message} ({reason})") from None
 
 
 def check_heaps(path: Path) -> None:
-    """Refuse a file whose global heaps do not add up: the HDF5 library would walk along them for ever.
+    """Raise OSError if a global heap does not end where its header states: the HDF5 library would loop forever.
 
     A heap is a header of 16 bytes with its size, and objects: index (2 bytes), references (2), 4 free, size (8), data
     up to a multiple of 8 bytes. Object 0 is the free space, whose size counts its own header.
 
-    Raises
-    ------
-    OSError
-        If one does not end where its header says.
-
     Source: HDF5 File Format Specification 3.0, III.E.
     """
-    with path.open("rb") as file:
-        if not path.stat().st_size:
-            return
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            at = content.find(HEAP)
-            while at >= 0:
-                if at % 8 == 0:
-                    _check_heap(content, at)
-                at = content.find(HEAP, at + 8)
+    if not path.stat().st_size:
+        return
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        start = content.find(HEAP)
+        while start >= 0:
+            if start % 8 == 0:
+                _check_heap(content, start)
+            start = content.find(HEAP, start + 8)
 
 
-def _check_heap(content: mmap.mmap, at: int) -> None:
+def _check_heap(content: mmap.mmap, start: int) -> None:
     header = 16
-    end = at + int.from_bytes(content[at + 8 : at + header], "little")
-    place = at + header
-    while place + header <= min(end, len(content)):
-        index = int.from_bytes(content[place : place + 2], "little")
-        size = int.from_bytes(content[place + 8 : place + header], "little")
+    end = start + int.from_bytes(content[start + 8 : start + header], "little")
+    position = start + header
+    while position + header <= min(end, len(content)):
+        index = int.from_bytes(content[position : position + 2], "little")
+        size = int.from_bytes(content[position + 8 : position + header], "little")
         length = header + -(-size // 8) * 8 if index else size
-        if length < header or place + length > end:
+        if length < header or position + length > end:
             raise OSError("a global heap is damaged")
-        place += length
+        position += length

@@ -1,4 +1,4 @@
-"""Between two pieces of long work: whoever has something to look at meanwhile is called in the thread that does it."""
+"""Callbacks between two pieces of long work, in the thread that does the work."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from contextlib import contextmanager
 
 __all__ = ["at_pauses", "pause"]
 
-_here = threading.local()
+_thread = threading.local()
 
 
 def pause() -> None:
-    """Call what listens in this thread; to be called between pieces of work that take less than a second or so."""
-    for listener in getattr(_here, "listeners", ()):
+    """Call the listeners of this thread; work calls it at least about once a second."""
+    for listener in getattr(_thread, "listeners", ()):
         listener()
 
 
 @contextmanager
 def at_pauses(listener: Callable[[], None]) -> Iterator[None]:
-    """Within it, call `listener` at every pause of this thread."""
-    before = getattr(_here, "listeners", ())
-    _here.listeners = (*before, listener)
+    """Call `listener` at every pause of this thread within the block."""
+    before = getattr(_thread, "listeners", ())
+    _thread.listeners = (*before, listener)
     try:
         yield
     finally:
-        _here.listeners = before
+        _thread.listeners = before

@@ -1,4 +1,4 @@
-"""Numbers on their way to a device: a copy that is waited for keeps a GPU from working ahead."""
+"""Transfers to a device that do not stall the GPU."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ __all__ = ["constant", "sent"]
 
 
 def sent(x: Tensor, device: torch.device) -> Tensor:
-    """Return a tensor of the CPU on a device; a GPU is not waited for."""
-    if device.type == "cpu":
-        return x
-    return x.pin_memory().to(device, non_blocking=True)
+    """Return a CPU tensor on a device; the copy to a GPU is asynchronous."""
+    return x if device.type == "cpu" else x.pin_memory().to(device, non_blocking=True)
 
 
 def constant(values: tuple[float, ...], like: Tensor) -> Tensor:
-    """Return numbers in the precision and on the device of a tensor, copied there once; not to be changed in place."""
+    """Return a cached tensor with the type and device of `like`; do not modify it in place."""
     return _constant(values, like.dtype, like.device)
 
 

@@ -1,4 +1,4 @@
-"""The files of a directory that this program wrote, so that nothing of a person's is overwritten or removed.
+"""The files of a directory that this program wrote; it overwrites and removes no others.
 
 written.json in the directory lists them: name, size in bytes, time of the last change in ns, and SHA-256.
 """
@@ -21,106 +21,74 @@ __all__ = ["WARN", "WRITTEN", "OwnFiles", "remove_empty"]
 WRITTEN = "written.json"
 WARN = logging.getLogger("nerif").warning
 
-FIELDS = ("field.safetensors", "checkpoint.safetensors")
-UNLISTED = {
-    "run.toml": (
-        "run.toml", "metrics.json", "history.csv", "volume.nc", "volume.vti", "reprojection.nc", "report.html",
-        "meridian.nc", "meridian.csv", "live.json", "live.npz", *FIELDS,
-    ),
-    "asked.json": ("asked.json", "views.json", *FIELDS),
-}  # fmt: skip
-"""What versions without a list wrote for certain into a directory that has the file named first: a calibration or a
-figure of such a directory may as well be a person's."""
-HEADS = {"run.toml": b"# nerif reconstruct", "asked.json": b"{"}
-
 
 class OwnFiles:
-    """The files that this program wrote into a directory.
+    """The files that this program wrote into a directory and that are unchanged since.
 
-    A file that was changed since it was written is no longer one of them. Two processes that write at once may lose an
-    entry of the list; the file then counts as somebody else's, and is left alone.
+    Of two processes that write at once one may lose its entry in the list; the file then counts as foreign.
 
     Parameters
     ----------
-    directory : which need not be there yet
-    say : is given a line about each file that is renamed or left
+    directory : may not exist yet
+    say : called with a line about each file that is renamed or left
     """
 
     def __init__(self, directory: str | os.PathLike[str], say: Callable[[str], None] = WARN) -> None:
         self.directory, self.say = Path(directory), say
 
     def __contains__(self, name: str) -> bool:
-        return self._is_own(name, self._listed())
+        return self._is_own(name, self._entries())
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
-        """Give the path to write a file to, and list the file once it is written; one of somebody else is renamed."""
+        """Yield the path to write a file to and list the file afterwards; rename a foreign file of that name."""
         self.set_aside([name])
         path = self.directory / name
         yield path
-        listed = self._listed()
-        listed[name] = _identity(path)
-        self._keep(listed)
+        self._write_list({**self._entries(), name: _identity(path)})
 
     def set_aside(self, names: Sequence[str]) -> None:
-        """Rename those of the files that somebody else wrote or changed: NAME.before.ENDING, or NAME.before2.ENDING.
-
-        Such a name is never one of this program's, so the file stays for good.
-        """
-        listed = self._listed()
+        """Rename foreign files to NAME.before.SUFFIX, NAME.before2.SUFFIX, ..., names that this program never uses."""
+        entries = self._entries()
         for name in names:
             path = self.directory / name
-            if not os.path.lexists(path) or self._is_own(name, listed):
+            if not os.path.lexists(path) or self._is_own(name, entries):
                 continue
-            new = _free(path)
+            new, number = path.with_name(f"{path.stem}.before{path.suffix}"), 1
+            while os.path.lexists(new):
+                number += 1
+                new = path.with_name(f"{path.stem}.before{number}{path.suffix}")
             path.rename(new)
-            self.say(f"{path}: not written by nerif, or changed since; it is {new.name} now")
+            self.say(f"{path}: not written by nerif, or changed since; renamed to {new.name}")
 
     def remove(self, names: Sequence[str] | None = None) -> None:
-        """Remove files of this program, all that are listed by default; those changed since stay, which is said.
-
-        The directory goes with the last file in it, if all were to be removed.
-        """
-        listed = self._listed()
-        chosen = [name for name in listed if names is None or name in names]
-        changed = []
-        for name in chosen:
+        """Remove files of this program that are unchanged; by default all, and the directory if it is then empty."""
+        entries = self._entries()
+        selection, changed = [name for name in entries if names is None or name in names], []
+        for name in selection:
             path = self.directory / name
-            if self._is_own(name, listed):
+            if self._is_own(name, entries):
                 path.unlink()
             elif os.path.lexists(path):
                 changed.append(name)
-            del listed[name]
+            del entries[name]
         if changed:
-            self.say(f"{self.directory}: changed since nerif wrote it, and left: {', '.join(changed)}")
-        if chosen:
-            self._keep(listed)
+            self.say(f"{self.directory}: changed since nerif wrote it, and not removed: {', '.join(changed)}")
+        if selection:
+            self._write_list(entries)
         if names is None:
             remove_empty(self.directory)
 
-    def _listed(self) -> dict[str, Any]:
-        """The list, by name; of names in the directory itself only, whoever wrote them there."""
-        path = self.directory / WRITTEN
-        if not os.path.lexists(path):
-            return self._unlisted()
+    def _entries(self) -> dict[str, dict[str, Any]]:
+        """Entries of the list by name; names outside the directory are ignored."""
         try:
-            found = json.loads(path.read_text())["files"]
-            return {name: dict(entry) for name, entry in found.items() if Path(name).name == name}
+            entries = json.loads((self.directory / WRITTEN).read_text())["files"]
+            return {name: dict(entry) for name, entry in entries.items() if Path(name).name == name}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return {}
 
-    def _unlisted(self) -> dict[str, Any]:
-        """What is there of a version that kept no list."""
-        for mark, names in UNLISTED.items():
-            path = self.directory / mark
-            if path.is_file() and not path.is_symlink():
-                with path.open("rb") as file:
-                    known = file.read(len(HEADS[mark])) == HEADS[mark]
-                return {n: _identity(self.directory / n) for n in names if (self.directory / n).is_file() and known}
-        return {}
-
-    def _is_own(self, name: str, listed: dict[str, Any]) -> bool:
-        path, entry = self.directory / name, listed.get(name)
+    def _is_own(self, name: str, entries: dict[str, dict[str, Any]]) -> bool:
+        path, entry = self.directory / name, entries.get(name)
         if entry is None or path.is_symlink() or not path.is_file():
             return False
         now = path.stat()
@@ -129,16 +97,16 @@ class OwnFiles:
         # a copy of the directory has other times
         return now.st_mtime_ns == entry.get("changed_ns") or _digest(path) == entry.get("sha256")
 
-    def _keep(self, listed: dict[str, Any]) -> None:
+    def _write_list(self, entries: dict[str, dict[str, Any]]) -> None:
         path = self.directory / WRITTEN
-        if listed:
-            write_json(path, {"about": "files that nerif wrote here and may overwrite or remove", "files": listed})
+        if entries:
+            write_json(path, {"about": "files that nerif wrote here and may overwrite or remove", "files": entries})
         else:
             path.unlink(missing_ok=True)
 
 
 def remove_empty(directory: Path) -> None:
-    """Remove a directory, if it is there and nothing is in it."""
+    """Remove a directory if it exists and is empty."""
     with suppress(FileNotFoundError, NotADirectoryError):
         if not any(directory.iterdir()):
             directory.rmdir()
@@ -152,11 +120,3 @@ def _identity(path: Path) -> dict[str, Any]:
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _free(path: Path) -> Path:
-    """A name that no file has: NAME.before.ENDING, NAME.before2.ENDING, ..."""
-    number = 1
-    while os.path.lexists(new := path.with_name(f"{path.stem}.before{number if number > 1 else ''}{path.suffix}")):
-        number += 1
-    return new

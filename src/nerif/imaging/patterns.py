@@ -1,7 +1,7 @@
 """Backgrounds (random dots, wavelet noise, multi-scale noise) and calibration targets, printed at true size.
 
 A pattern is a raster of reflectance, 0 black to 1 white. The dot size is the length of its smallest features on paper;
-in the image it should cover 2 to 5 px (Raffel, Background-oriented schlieren techniques, Exp. Fluids 56 (2015)).
+in the image it should be 2 to 5 px (Raffel, Background-oriented schlieren techniques, Exp. Fluids 56 (2015)).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, check_positive
 from nerif.common.files import atomic
 from nerif.imaging.calibration.targets import CalibrationTarget
 
@@ -22,20 +22,15 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "Background", "paper_for", "print_pattern"]
 
 KINDS = ("dots", "wavelet", "multiscale")
-FINEST = 12  # pixels over a dot: more would not show
+MAX_PIXELS_PER_DOT = 12  # finer rasters look the same
 
 
 @dataclass(frozen=True)
 class Background:
     """A printed background.
 
-    Raises
-    ------
-    InputError
-        If the kind is unknown, a length is not positive, or fill is not between 0 and 0.6.
-
-    Source: wavelet noise as in Cook & DeRose, ACM Trans. Graph. 24 (2005) 803; used for schlieren by Atcheson et al.,
-    Exp. Fluids 46 (2009) 467, from where the idea of features on all scales comes too.
+    Sources: wavelet noise: Cook & DeRose, ACM Trans. Graph. 24 (2005) 803; its use for schlieren, and features on all
+    scales: Atcheson et al., Exp. Fluids 46 (2009) 467.
     """
 
     kind: str = "dots"
@@ -47,23 +42,18 @@ class Background:
     dot: float = 1.0
     """Diameter of a dot, or the smallest feature of a noise, mm: 2 to 5 px in the image (nerif design)."""
     fill: float = 0.35
-    """Share of the paper that dots cover."""
+    """Share of the paper covered by dots."""
     seed: int = 0
-    """Of the pattern: give each camera another one."""
+    """Of the pattern; different for each camera."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="kind")
-        for name in ("width", "height", "dot"):
-            if not 0 < getattr(self, name) < 1e5:
-                raise InputError(f"expected a positive length in mm, got {getattr(self, name)}", field=name)
+        check_positive(self, "width", "height", "dot", limit=1e5)
         if not 0 < self.fill <= 0.6:
             raise InputError(f"expected a share of the paper between 0 and 0.6, got {self.fill}", field="fill")
-        if 4 * self.dot > min(self.width, self.height):
-            raise InputError(
-                f"expected a quarter of the pattern ({min(self.width, self.height):g} mm) or less, got {self.dot}",
-                field="dot",
-            )
+        if 4 * self.dot > (edge := min(self.width, self.height)):
+            raise InputError(f"expected a quarter of the pattern ({edge:g} mm) or less, got {self.dot}", field="dot")
 
     @property
     def size(self) -> tuple[float, float]:
@@ -72,21 +62,15 @@ class Background:
 
     @property
     def label(self) -> str:
-        """What it is, in a line."""
+        """Description in one line."""
         return f"{self.kind}, {self.dot:g} mm, seed {self.seed}"
 
     def raster_pixel(self, pixel: float) -> float:
-        """Edge of a pixel fine enough for the pattern and not finer than `pixel`, mm."""
-        return max(pixel, self.dot / FINEST)
+        """Return the edge of the raster's pixels, mm: `pixel`, or larger if the pattern allows it."""
+        return max(pixel, self.dot / MAX_PIXELS_PER_DOT)
 
     def raster(self, pixel: float) -> np.ndarray:
-        """Return the pattern as reflectance (row, column) from 0 to 1 on pixels of `pixel` mm.
-
-        Raises
-        ------
-        InputError
-            If a pixel is longer than half a dot, which it could not show.
-        """
+        """Return the pattern as reflectance (row, column) from 0 to 1 on pixels of `pixel` mm."""
         if not 0 < pixel <= self.dot / 2:
             raise InputError(f"expected half the dot size ({self.dot / 2:g} mm) or less, got {pixel} mm", field="pixel")
         shape = (max(1, round(self.height / pixel)), max(1, round(self.width / pixel)))
@@ -99,23 +83,22 @@ class Background:
         """Return the centres (n, 2) of the dots, mm from the upper left corner; none nearer than 0.9 diameters."""
         from scipy.spatial import cKDTree
 
-        wanted = round(self.fill * self.width * self.height / (np.pi * self.dot**2 / 4))
+        count = round(self.fill * self.width * self.height / (np.pi * self.dot**2 / 4))
         rng = np.random.default_rng(self.seed)
         size = np.array([self.width, self.height])
         centres = np.empty((0, 2))
-        for _ in range(60):  # draw, and drop the later one of any two that come too close
-            missing = wanted - len(centres)
-            if missing <= 0:
+        for _ in range(60):  # drop the later one of any two that are too close
+            if count <= len(centres):
                 break
-            drawn = np.concatenate([centres, rng.random((missing, 2)) * size])
-            pairs = cKDTree(drawn).query_pairs(0.9 * self.dot, output_type="ndarray")
-            keep = np.ones(len(drawn), dtype=bool)
+            candidates = np.concatenate([centres, rng.random((count - len(centres), 2)) * size])
+            pairs = cKDTree(candidates).query_pairs(0.9 * self.dot, output_type="ndarray")
+            keep = np.ones(len(candidates), dtype=bool)
             keep[pairs.max(axis=1)] = False
-            centres = drawn[keep]
+            centres = candidates[keep]
         return centres
 
     def _draw_dots(self, shape: tuple[int, int], pixel: float) -> np.ndarray:
-        """Dots with edges one pixel soft."""
+        """Dots with edges blurred over one pixel."""
         image = np.ones(shape)
         radius = self.dot / 2 / pixel
         reach = int(np.ceil(radius + 1))
@@ -130,7 +113,7 @@ class Background:
         return image
 
     def _wavelet(self, shape: tuple[int, int], pixel: float) -> np.ndarray:
-        """One octave of noise: white noise less what a twice coarser lattice can hold."""
+        """One octave of noise: white noise minus its part on a lattice of twice the spacing."""
         from scipy.ndimage import zoom
 
         cells = [max(8, 2 * int(np.ceil(n * pixel / self.dot / 2)) + 8) for n in shape]
@@ -140,7 +123,7 @@ class Background:
         return _spread(band, shape, self.dot / pixel)
 
     def _multiscale(self, shape: tuple[int, int], pixel: float) -> np.ndarray:
-        """Octaves of smoothed white noise from the dot size up to a quarter of the pattern, equally strong."""
+        """Octaves of smoothed white noise of equal strength, from the dot size to a quarter of the pattern."""
         total = np.zeros(shape)
         size, octave = self.dot, 0
         while octave == 0 or size <= min(self.width, self.height) / 4:
@@ -153,31 +136,22 @@ class Background:
 
 
 def _spread(cells: np.ndarray, shape: tuple[int, int], spacing: float) -> np.ndarray:
-    """Lay a lattice of values over the pixels by cubic splines; a border of cells is left over on each side."""
+    """Interpolate a lattice with a border of cells to the pixels by cubic splines."""
     from scipy.ndimage import map_coordinates
 
     rows, columns = ((np.arange(n) + 0.5) / spacing + 3 for n in shape)
     return np.asarray(map_coordinates(cells, np.meshgrid(rows, columns, indexing="ij"), order=3, mode="nearest"))
 
 
-MARGIN = 8.0  # mm of paper around a pattern, for its scale bar
+MARGIN = 8.0  # of paper around a pattern, for its scale bar, mm
 PAGES = {"A4": (297, 210), "A3": (420, 297), "A2": (594, 420), "A1": (841, 594), "A0": (1189, 841)}  # mm
-LARGEST = 400e6  # pixels of a raster: more would not fit into the memory of a laptop
+MAX_PIXELS = 400e6  # of a raster, limited by the memory of a laptop
 
 
 def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: float = 600.0) -> None:
-    """Write a pattern at true size: PNG (with its resolution in the file) or PDF (with a scale bar to check the print).
+    """Write a pattern at true size: NAME.png with its resolution, or NAME.pdf with a scale bar to check the print.
 
-    Parameters
-    ----------
-    path : NAME.png or NAME.pdf
-    pattern : what to print
-    dpi : of the printer; the raster is coarser where the pattern has no use for so many
-
-    Raises
-    ------
-    InputError
-        If the name ends in neither, or the raster would be too large.
+    `dpi` is an upper limit of the resolution, which coarse patterns do not need.
     """
     if path.suffix not in (".pdf", ".png"):
         raise InputError(f"expected a name ending in .pdf or .png, got '{path.name}'", field="out")
@@ -186,10 +160,8 @@ def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: floa
     pixel = pattern.raster_pixel(25.4 / dpi)
     width, height = pattern.size
     pixels = width * height / pixel**2
-    if pixels > LARGEST:
-        raise InputError(
-            f"expected at most {LARGEST:.0e} pixels, got {pixels:.1e}; give fewer --dpi", field="width, height"
-        )
+    if pixels > MAX_PIXELS:
+        raise InputError(f"expected up to {MAX_PIXELS:.0e} pixels, got {pixels:.1e}; lower dpi", field="width, height")
     raster = pattern.raster(pixel)
     with atomic(path) as part:
         if path.suffix == ".png":
@@ -201,14 +173,14 @@ def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: floa
 
 
 def paper_for(path: Path, pattern: Background | CalibrationTarget) -> str:
-    """Return the smallest paper on which the file of a pattern fits: A4 to A0, or a plotter's."""
+    """Return the smallest paper for the file of a pattern: A4 to A0, or a plotter."""
     margin = 2 * MARGIN if path.suffix == ".pdf" else 0
     short, long = sorted(length + margin for length in pattern.size)
     return next((name for name, (a, b) in PAGES.items() if long <= a and short <= b), "a plotter")
 
 
 def _page(raster: np.ndarray, pixel: float, label: str) -> Figure:
-    """A page of the pattern's own size with a margin, one millimetre of data to a millimetre of paper."""
+    """A page of the pattern's size with a margin, in coordinates of mm."""
     from matplotlib.figure import Figure
 
     height, width = (n * pixel for n in raster.shape)

@@ -1,4 +1,4 @@
-"""The same work on many things, in several processes where it is worth their start."""
+"""Parallel work in several processes."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ def cores() -> int:
 
 
 def start_method() -> str:
-    """Return how processes start: by a server that has no threads, where there is one, else each from nothing."""
+    """Return the start method of processes: a fork server, which has no threads, where the system has it."""
     return "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
 
 
 def work(
     function: Callable[[Common, Task], Result], common: Common, tasks: Iterable[Task], processes: int
 ) -> Iterator[tuple[int, Result]]:
-    """Yield function(common, task) with the number of each task, in the order in which they are done.
+    """Yield the number and result of function(common, task) for each task, as they finish.
 
     Parameters
     ----------
-    function : of a module, so that other processes find it
-    common : what all tasks need; each process gets it once
-    processes : 1 for none but this
+    function : of a module, so that other processes can import it
+    common : argument of all tasks, sent once to each process
+    processes : 1 for this one only
     """
     tasks = list(tasks)
     processes = min(processes, len(tasks))
@@ -44,31 +44,31 @@ def work(
             yield i, function(common, task)
         return
     context = get_context(start_method())
-    context.set_forkserver_preload([function.__module__])  # imported once for all processes; no matter elsewhere
+    context.set_forkserver_preload([function.__module__])  # imported once for all processes
     with ProcessPoolExecutor(processes, context, _begin, (function, common)) as pool:
         futures = {pool.submit(_one, task): i for i, task in enumerate(tasks)}
         try:
             for future in as_completed(list(futures)):
                 yield futures.pop(future), future.result()
-                del future  # or its result stays in memory
+                del future  # frees its result
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-_common: tuple[Callable[[Any, Any], Any], Any]
+_work: tuple[Callable[[Any, Any], Any], Any]
 
 
 def _begin(function: Callable[[Any, Any], Any], common: object) -> None:
-    """Give a process what all its tasks have in common."""
-    global _common
+    """Store the common argument in a new process."""
+    global _work
     import cv2
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command alone hears Ctrl-C
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     cv2.setNumThreads(1)
-    _common = function, common
+    _work = function, common
 
 
 def _one(task: object) -> Any:
-    function, common = _common
+    function, common = _work
     return function(common, task)

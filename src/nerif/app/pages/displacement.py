@@ -19,7 +19,7 @@ from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.displacement import Displacement
 from nerif.data.measurement import Measurement
-from nerif.imaging.measuring import measure_instant
+from nerif.imaging.recording import measure_instant
 
 __all__ = ["PAGE"]
 

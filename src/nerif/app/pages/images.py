@@ -16,10 +16,9 @@ from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
-from nerif.imaging.image_quality import SourceLook
+from nerif.imaging.image_quality import ImageQuality
 from nerif.imaging.readers.crop import Crop
-from nerif.imaging.readers.views import View
-from nerif.imaging.readers.views_file import write_crops
+from nerif.imaging.readers.views import View, write_crops
 
 __all__ = ["PAGE"]
 
@@ -103,7 +102,7 @@ class ImagesPage:
     async def _cell(self, view: View, turn: int) -> list[str]:
         """Fill the cell of a view; returns what is wrong with it."""
         wrong: list[str] = []
-        looks: dict[str, SourceLook] = {}
+        looks: dict[str, ImageQuality] = {}
         for source in SOURCES:
             try:
                 looks[source] = await self.work.beside(self.files.look, view, source, self.most)
@@ -242,7 +241,7 @@ class ImagesPage:
             await self.build()
 
 
-def _figure(view: View, source: str, look: SourceLook | None, address: str) -> None:
+def _figure(view: View, source: str, look: ImageQuality | None, address: str) -> None:
     """An image, its grey values, and its figures."""
     if look is None or not address:
         text_html(f"No {source} image", classes="missing note")
@@ -251,7 +250,7 @@ def _figure(view: View, source: str, look: SourceLook | None, address: str) -> N
     with ui.element("figure"):
         image = ui.element("img").props("loading=lazy")
         image.props["src"], image.props["alt"] = address, f"{source.capitalize()} of {view.name}"
-        seen = f"{look.count}" if look.looked == look.count else f"{look.count} ({look.looked} read)"
+        seen = f"{look.count}" if look.sampled == look.count else f"{look.count} ({look.sampled} read)"
         full = f"{look.saturated:.2%} saturated" if look.full > 1 else "saturation unknown"
         label = f"Grey values of {source} of {view.name}, {full}"
         ui.html(

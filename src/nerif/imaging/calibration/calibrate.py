@@ -19,8 +19,9 @@ from nerif.geometry import Projection, projection_named
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
+from nerif.imaging.calibration.target_images import find_targets, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget, ViewImages
-from nerif.imaging.readers.views import View, find_targets, pose_names
+from nerif.imaging.readers.views import View
 
 __all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_images"]
 

@@ -1,4 +1,4 @@
-"""How well a pattern fixes a shift, from its gradients and from what is left of the difference once it is moved."""
+"""Error of a shift by the gradients of the pattern and the residual of the images; smoothing error; correlation."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from jaxtyping import Float, Shaped
 
 from nerif.imaging.readers.frames import as_float
 
-__all__ = ["FLOOR", "local_correlation", "smoothed_away", "structure_variance"]
+__all__ = ["FLOOR", "local_correlation", "smoothing_error", "structure_variance"]
 
 Grey = Shaped[np.ndarray, "row column"]
-FLOOR = 1e-3  # px: no optical flow is better than that
+FLOOR = 1e-3  # px, lower limit of the error of an optical flow
 
 
 def structure_variance(flow: Grey, moved: Grey, reach: float) -> Float[np.ndarray, "row column 2"]:
-    """Return the variance (px^2) of a shift by the gradients of the moved image and what is left of the difference.
+    """Return the variance (px^2) of the shift between the flow image and the reference warped by it.
 
-    cov = <r^2> (sum grad(I) grad(I)^T)^-1 with r the difference, over Gaussian windows of standard deviation `reach`.
+    cov = <r^2> (sum grad(I) grad(I)^T)^-1 with r the residual, over Gaussian windows of standard deviation `reach`.
     """
     from scipy.ndimage import gaussian_filter
 
     pixels = 4 * np.pi * reach**2  # effective number in a Gaussian window
     gv, gu = np.gradient(moved.astype(np.float64))
     uu, vv, uv = (gaussian_filter(g, reach) * pixels for g in (gu * gu, gv * gv, gu * gv))
-    left = gaussian_filter((as_float(flow) - as_float(moved)).astype(np.float64) ** 2, max(4.0, 2 * reach))
+    residual = gaussian_filter((as_float(flow) - as_float(moved)).astype(np.float64) ** 2, max(4.0, 2 * reach))
     determinant = np.maximum(uu * vv - uv**2, 1e-9 * (uu + vv) ** 2 + 1e-12)
-    return np.stack([left * vv / determinant, left * uu / determinant], axis=-1)
+    return np.stack([residual * vv / determinant, residual * uu / determinant], axis=-1)
 
 
-def smoothed_away(d: Shaped[np.ndarray, "row column 2"], reach: float) -> Float[np.ndarray, "row column 2"]:
-    """Rms over a Gaussian window of what that window takes from d, px."""
+def smoothing_error(d: Shaped[np.ndarray, "row column 2"], reach: float) -> Float[np.ndarray, "row column 2"]:
+    """Return the local rms of the part of d that a Gaussian window removes, px."""
     from scipy.ndimage import gaussian_filter
 
     d = as_float(d)
@@ -38,7 +38,7 @@ def smoothed_away(d: Shaped[np.ndarray, "row column 2"], reach: float) -> Float[
 
 
 def local_correlation(a: Grey, b: Grey, reach: float) -> Float[np.ndarray, "row column"]:
-    """Correlation coefficient of two images over a Gaussian window."""
+    """Return the correlation coefficient of two images over a Gaussian window."""
     from scipy.ndimage import gaussian_filter
 
     a, b = a.astype(np.float64), b.astype(np.float64)

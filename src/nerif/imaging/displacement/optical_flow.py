@@ -1,7 +1,7 @@
-"""Optical flow by well-kept libraries: one function a method, all with the same habit.
+"""Optical flow by OpenCV, scikit-image and window correlation, with one signature.
 
-Each takes the flow image and the reference, both float32 on a scale of 0 to 255, and returns the movement w (px) of
-what is seen at p in the flow image to where it is in the reference: flow(p) = reference(p + w(p)), so d = -w.
+Each takes the flow image and the reference, both float32 on a scale of 0 to 255, and returns the movement w (px) from
+a point in the flow image to the same point of the pattern in the reference: flow(p) = reference(p + w(p)), d = -w.
 
 Sources: DeepFlow: Weinzaepfel et al., ICCV 2013 (the paper's choice); DIS: Kroeger et al., ECCV 2016; TV-L1: Zach et
 al., DAGM 2007; ILK: Le Besnerais & Champagnat, ICIP 2005.
@@ -20,7 +20,7 @@ __all__ = ["FLOWS"]
 
 
 def deepflow(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
-    """OpenCV's DeepFlow; its smoothness is a fixed one."""
+    """OpenCV's DeepFlow; its smoothness is fixed."""
     import cv2
 
     start: Any = None
@@ -28,7 +28,7 @@ def deepflow(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.n
 
 
 def dis(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
-    """OpenCV's dense inverse search, down to single pixels; it takes eight bits."""
+    """OpenCV's dense inverse search at full resolution, of 8-bit images."""
     import cv2
 
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -50,7 +50,7 @@ def tvl1(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarr
 
 
 def ilk(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
-    """scikit-image's iterative Lucas-Kanade, Gaussian windows."""
+    """scikit-image's iterative Lucas-Kanade with Gaussian windows."""
     from skimage.registration import optical_flow_ilk
 
     radius = max(2, round(6 * smoothness))
@@ -64,9 +64,5 @@ def correlation(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> n
 
 
 FLOWS: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {
-    "deepflow": deepflow,
-    "dis": dis,
-    "tvl1": tvl1,
-    "ilk": ilk,
-    "correlation": correlation,
+    method.__name__: method for method in (deepflow, dis, tvl1, ilk, correlation)
 }

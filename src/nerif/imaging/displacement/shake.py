@@ -1,4 +1,4 @@
-"""Camera shake, fitted where nothing flows, and taken away."""
+"""Camera shake, fitted to a region without flow and removed."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["border", "remove_shake"]
 def remove_shake(
     d: Float[np.ndarray, "row column 2"], still: Bool[np.ndarray, "row column"]
 ) -> Float[np.ndarray, "row column 2"]:
-    """Take away the similarity d = t + [[a, -b], [b, a]] p that fits best where nothing flows.
+    """Subtract the similarity d = t + [[a, -b], [b, a]] p that fits best where nothing flows.
 
     Parameters
     ----------
     d : px
-    still : pixels without flow; outliers among them count little (Cauchy's loss)
+    still : pixels without flow, fitted with Cauchy's loss, robust to outliers
     """
     if still.sum() < 8:
         raise InputError(
@@ -29,19 +29,13 @@ def remove_shake(
     rows, columns = np.mgrid[: d.shape[0], : d.shape[1]].astype(np.float64)
     scale = max(d.shape[:2]) / 2
     x, y = (columns - columns.mean()) / scale, (rows - rows.mean()) / scale
-
-    def design(at: np.ndarray | slice) -> np.ndarray:
-        one, zero = np.ones_like(x[at]), np.zeros_like(x[at])
-        u = np.stack([one, zero, x[at], -y[at]], axis=-1)
-        v = np.stack([zero, one, y[at], x[at]], axis=-1)
-        return np.stack([u, v], axis=-2)
-
-    a, b = design(still).reshape(-1, 4), d[still].reshape(-1).astype(np.float64)
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    design = np.stack([np.stack([one, zero, x, -y], axis=-1), np.stack([zero, one, y, x], axis=-1)], axis=-2)
+    a, b = design[still].reshape(-1, 4), d[still].reshape(-1).astype(np.float64)
     start = np.linalg.lstsq(a, b, rcond=None)[0]
     noise = 1.4826 * np.median(np.abs(a @ start - b)) + 1e-6
     fit = least_squares(lambda p: a @ p - b, start, jac=lambda p: a, loss="cauchy", f_scale=2 * noise)
-    everywhere = design(slice(None)).reshape(-1, 4) @ fit.x
-    return (d - everywhere.reshape(d.shape)).astype(np.float32)
+    return (d - (design.reshape(-1, 4) @ fit.x).reshape(d.shape)).astype(np.float32)
 
 
 def border(shape: tuple[int, ...], width: int) -> Bool[np.ndarray, "row column"]:

@@ -1,4 +1,4 @@
-"""An image or volume moved by a displacement map."""
+"""Images and volumes warped by a displacement map."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["warp"]
 
 
 def warp(image: np.ndarray, movement: np.ndarray) -> np.ndarray:
-    """Return image(p + movement(p)) by cubic splines, edge values beyond the edges.
+    """Return image(p + movement(p)) by cubic splines, with edge values beyond the edges.
 
     Parameters
     ----------

@@ -13,22 +13,23 @@ __all__ = ["ArrayFrames", "Hdf5Frames"]
 
 
 class ArrayFrames(Frames):
-    """A NumPy array: of an .npy file, mapped, or one of an .npz file, read whole, as these cannot be read in parts."""
+    """A NumPy array of an .npy file (memory-mapped) or an .npz file (read whole: it has no partial access)."""
 
     def __init__(self, path: Path, name: str, dataset: str) -> None:
         try:
             if path.suffix.lower() == ".npy":
                 arrays = {"array": np.load(path, mmap_mode="r", allow_pickle=False)}
             else:
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
-                    arrays = {key: found[key] for key in ([dataset] if dataset in found.files else found.files)}
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                    keys = [dataset] if dataset in archive.files else archive.files
+                    arrays = {key: archive[key] for key in keys}
         except Exception as error:
             raise InputError(f"cannot be read, truncated or damaged? ({error}); copy it again", field=name) from None
         key = _choose({k: a.ndim for k, a in arrays.items()}, dataset, name)
         self._array = arrays[key] if arrays[key].ndim == 3 else arrays[key][None]
         self._name = name
         if not len(self._array):
-            raise InputError("expected one frame at least, got none", field=name)
+            raise InputError("expected at least one frame, got none", field=name)
 
     def __len__(self) -> int:
         return len(self._array)
@@ -40,27 +41,27 @@ class ArrayFrames(Frames):
         return np.array(self._array[i])
 
 
-def _choose(dims: dict[str, int], wanted: str, name: str) -> str:
-    """The dataset wanted, or the only one that can hold frames."""
-    fitting = [key for key, n in dims.items() if n in (2, 3)]
-    there = f"the file holds {', '.join(dims) or 'none'}"
-    if wanted:
-        if wanted not in dims:
-            raise InputError(f"no such dataset; {there}", field=f"{name}:{wanted}")
-        if wanted not in fitting:
-            raise InputError(f"expected 2 or 3 dims (frame, row, column), got {dims[wanted]}", field=f"{name}:{wanted}")
-        return wanted
-    if len(fitting) != 1:
-        raise InputError(
-            f"expected one dataset of 2 or 3 dims, got {len(fitting)}; name it after ':' ({there})", field=name
-        )
-    return fitting[0]
+def _choose(dims: dict[str, int], dataset: str, name: str) -> str:
+    """Return the dataset named, or the only one that can hold frames."""
+    candidates = [key for key, n in dims.items() if n in (2, 3)]
+    content = f"the file holds {', '.join(dims) or 'none'}"
+    if not dataset:
+        if len(candidates) != 1:
+            raise InputError(
+                f"expected one dataset of 2 or 3 dims, got {len(candidates)}; name it after ':' ({content})", field=name
+            )
+        return candidates[0]
+    if dataset not in dims:
+        raise InputError(f"no such dataset; {content}", field=f"{name}:{dataset}")
+    if dataset not in candidates:
+        raise InputError(f"expected 2 or 3 dims (frame, row, column), got {dims[dataset]}", field=f"{name}:{dataset}")
+    return dataset
 
 
 class Hdf5Frames(Frames):
     """A dataset (frame, row, column) or (row, column) of an HDF5 file.
 
-    Times (s) may stand in its attribute `times` or in a dataset `times` beside it, effective bits in `bits`.
+    Times (s) are in its attribute `times` or in a dataset `times` beside it, effective bits in the attribute `bits`.
     """
 
     def __init__(self, path: Path, name: str, dataset: str) -> None:
@@ -81,9 +82,9 @@ class Hdf5Frames(Frames):
             raise
         except Exception as error:
             raise InputError(f"cannot be read as HDF5, truncated or damaged? ({error})", field=name) from None
-        self._bits = None if bits is None else int(bits)
+        self.metadata_bits = None if bits is None else int(bits)
         if not self._length:
-            raise InputError("expected one frame at least, got none", field=f"{name}:{self._key}")
+            raise InputError("expected at least one frame, got none", field=f"{name}:{self._key}")
         if times is not None and times.shape != (self._length,):
             raise InputError(f"expected {self._length} times, one for each frame, got shape {times.shape}", field=name)
         self.times = times
@@ -93,10 +94,6 @@ class Hdf5Frames(Frames):
 
     def name(self, i: int) -> str:
         return f"{self._name}:{self._key}" + (f" frame {i}" if self._stack else "")
-
-    @property
-    def known_bits(self) -> int | None:
-        return self._bits
 
     def load(self, i: int) -> np.ndarray:
         import h5py

@@ -1,4 +1,4 @@
-"""Which part of the frames of a sensor is a view's own."""
+"""The part of the frames of a sensor that belongs to a view."""
 
 from __future__ import annotations
 
@@ -14,15 +14,13 @@ __all__ = ["Crop"]
 
 @dataclass(frozen=True)
 class Crop:
-    """A part of each frame, such as one end of a fibre bundle, turned upright.
-
-    First the crop, then the rotation, then the flip. Views of one sensor are crops of one sequence.
+    """A part of each frame, such as one end of a fibre bundle: cropped, then rotated, then flipped.
 
     Parameters
     ----------
-    row, column : of the top-left pixel
-    height, width : px; 0 for all up to the frame's edge
-    flip : "", "horizontal" (left and right change places), "vertical" or "both"
+    row, column : top-left pixel
+    height, width : px; 0 for all up to the edge of the frame
+    flip : "", "horizontal" (exchanges left and right), "vertical" or "both"
     rotate : 0, 90, 180 or 270 degrees counter-clockwise
     """
 
@@ -43,7 +41,7 @@ class Crop:
             raise InputError(f"expected rotate 0, 90, 180 or 270 (degrees), got {self.rotate}", field="crop")
 
     def shape_of(self, shape: tuple[int, int], name: str = "crop") -> tuple[int, int]:
-        """Return height and width after this crop; InputError if it reaches beyond a frame of `shape`."""
+        """Return height and width after the crop of a frame of `shape`; InputError if it reaches beyond."""
         height, width = self.height or shape[0] - self.row, self.width or shape[1] - self.column
         bottom, right = self.row + height, self.column + width
         if bottom > shape[0] or right > shape[1] or height < 1 or width < 1:
@@ -55,7 +53,7 @@ class Crop:
         return (width, height) if self.rotate in (90, 270) else (height, width)
 
     def __call__(self, image: np.ndarray, name: str = "crop") -> np.ndarray:
-        """Return that part of an image (row, column)."""
+        """Return this part of an image (row, column)."""
         self.shape_of((image.shape[0], image.shape[1]), name)
         rows = slice(self.row, self.row + self.height if self.height else None)
         columns = slice(self.column, self.column + self.width if self.width else None)

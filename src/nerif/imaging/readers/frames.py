@@ -1,4 +1,4 @@
-"""Grey frames of one size, counted from 0 and read one at a time, with checks that name the one that is wrong."""
+"""Grey frames of one size, counted from 0 and read one at a time; errors name the frame."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from nerif.common.conventions import InputError
 __all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "read_each", "size_in_words"]
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
+SAMPLE = 5  # frames that determine the layout
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What most frames of a sequence agree on, and what values were met while finding out.
+    """Common properties of most of the sampled frames of a sequence.
 
     Parameters
     ----------
     shape : height and width, px
     dtype : of the grey values
-    example : name of a frame that is so
+    example : name of a frame with these properties
     peak : largest value
-    used : bits that are set in any value, 0 for floats
+    used : bits set in any value, 0 for floats
     """
 
     shape: tuple[int, int]
@@ -39,62 +40,60 @@ class Layout:
 
 
 class Frames(ABC):
-    """Grey frames of one size and type, each read and checked when asked for."""
+    """Grey frames of one size and type, each read and checked on access."""
 
     times: np.ndarray | None = None
-    """When each frame was taken, s; None if the file does not say."""
+    """Recording time of each frame, s; None if the file has none."""
+    metadata_bits: int | None = None
+    """Effective bits in the metadata of the file."""
 
     @abstractmethod
     def __len__(self) -> int: ...
 
     @abstractmethod
     def name(self, i: int) -> str:
-        """Return what messages call frame `i`, such as ``cam1/ref_003.tif`` or ``rec.mraw frame 17``."""
+        """Return the name of frame `i` in messages, such as ``cam1/ref_003.tif`` or ``rec.mraw frame 17``."""
 
     @abstractmethod
     def load(self, i: int) -> np.ndarray:
-        """Return frame `i` as it is stored, unchecked."""
-
-    @property
-    def known_bits(self) -> int | None:
-        """Effective bits by the file's metadata, None where it has none."""
-        return None
+        """Return frame `i` as stored, unchecked."""
 
     def single(self, i: int) -> np.ndarray:
-        """Return frame `i` as uint8, uint16 or float32 (row, column), checked by itself, not against the others."""
+        """Return frame `i` as uint8, uint16 or float32 (row, column), not compared with the others."""
         try:
             image = self.load(i)
         except (InputError, MemoryError):
             raise
         except Exception as error:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            text = f"{self.name(i)}: cannot be read, truncated or damaged? ({reason}); copy or export it again"
-            raise InputError(text) from None
+            text = f"cannot be read, truncated or damaged? ({reason}); copy or export it again"
+            raise InputError(text, field=self.name(i)) from None
         return _grey_frame(image, self.name(i))
 
     @cached_property
     def layout(self) -> Layout:
-        """Size and type of most out of five frames spread over the sequence, so that one bad file does not rule."""
+        """Size and type of the majority of frames spread over the sequence, so that one bad file does not decide."""
         n = len(self)
-        found: list[Layout] = []
+        layouts: list[Layout] = []
         errors: list[InputError] = []
-        for k, i in enumerate(dict.fromkeys([*(round(j * (n - 1) / 4) for j in range(5)), *range(n)])):
-            if found and k >= min(5, n):
+        spread = (round(j * (n - 1) / (SAMPLE - 1)) for j in range(SAMPLE))
+        for k, i in enumerate(dict.fromkeys([*spread, *range(n)])):
+            if layouts and k >= min(SAMPLE, n):
                 break
             try:
                 image = self.single(i)
             except InputError as error:
                 errors.append(error)
-            else:
-                used = int(np.bitwise_or.reduce(image, axis=None)) if image.dtype.kind == "u" else 0
-                size = (image.shape[0], image.shape[1])
-                found.append(Layout(size, image.dtype, self.name(i), float(image.max()), used))
-        if not found:
+                continue
+            used = int(np.bitwise_or.reduce(image, axis=None)) if image.dtype.kind == "u" else 0
+            size = (image.shape[0], image.shape[1])
+            layouts.append(Layout(size, image.dtype, self.name(i), float(image.max()), used))
+        if not layouts:
             raise errors[0]
-        (most, _), *_ = Counter((x.shape, x.dtype) for x in found).most_common()
-        agreeing = [x for x in found if (x.shape, x.dtype) == most]
+        (majority, _), *_ = Counter((x.shape, x.dtype) for x in layouts).most_common()
+        agreeing = [x for x in layouts if (x.shape, x.dtype) == majority]
         used = int(np.bitwise_or.reduce([x.used for x in agreeing]))
-        return Layout(*most, agreeing[0].example, max(x.peak for x in agreeing), used)
+        return Layout(*majority, agreeing[0].example, max(x.peak for x in agreeing), used)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -103,18 +102,18 @@ class Frames(ABC):
 
     @property
     def bits(self) -> int:
-        """Effective bits, full scale being 2**bits - 1: by the metadata, else all the container has (8, 16).
+        """Bits of the metadata, else of the container (8, 16); 1 for floats from 0 to 1. Full scale is 2**bits - 1.
 
-        Floats from 0 to 1 have 1 bit (full scale 1), others 16. For a guess from the values see `effective_bits`.
+        `effective_bits` (exposure.py) estimates them from the values.
         """
-        if self.known_bits is not None:
-            return self.known_bits
+        if self.metadata_bits is not None:
+            return self.metadata_bits
         if self.layout.dtype == np.uint8:
             return 8
         return 1 if self.layout.dtype == np.float32 and self.layout.peak <= 1 else 16
 
     def __getitem__(self, i: int) -> np.ndarray:
-        """Return frame `i`; InputError if it cannot be read, or differs from the others in size or type."""
+        """Return frame `i`; InputError if it is unreadable, or differs from the others in size or type."""
         n, i = len(self), operator.index(i)
         if not -n <= i < n:
             raise IndexError(f"{self.name(0)}: frame {i} of {n}")
@@ -133,7 +132,7 @@ class SelectedFrames(Frames):
     """Some frames of another sequence."""
 
     def __init__(self, frames: Frames, indices: Sequence[int]) -> None:
-        self._frames, self._indices = frames, indices
+        self._frames, self._indices, self.metadata_bits = frames, indices, frames.metadata_bits
         if frames.times is not None:
             self.times = frames.times[list(indices)]
 
@@ -146,16 +145,9 @@ class SelectedFrames(Frames):
     def load(self, i: int) -> np.ndarray:
         return self._frames.load(self._indices[i])
 
-    @property
-    def known_bits(self) -> int | None:
-        return self._frames.known_bits
-
 
 def as_float(values: np.ndarray) -> np.ndarray:
-    """Return an array in single precision, or in double where its values need that.
-
-    Differences, squares and filters of integers wrap around or are cut off.
-    """
+    """Return an array as float32, or as float64 where its type needs that: arithmetic of integers would overflow."""
     return np.asarray(values, dtype=np.result_type(values.dtype, np.float32))
 
 
@@ -164,7 +156,7 @@ def size_in_words(shape: Sequence[int]) -> str:
 
 
 def _grey_frame(image: np.ndarray, name: str) -> np.ndarray:
-    """Return a stored image as a grey one in native byte order, its values checked."""
+    """Convert a stored image to grey values in native byte order and check them."""
     if image.dtype == bool:
         raise InputError(
             "expected grey values of 8 to 16 bit, got a 1-bit image; export it with 8 or 16 bit", field=name
@@ -192,7 +184,7 @@ def _grey_frame(image: np.ndarray, name: str) -> np.ndarray:
 
 
 def _grey(image: np.ndarray) -> np.ndarray:
-    """Luminance of (row, column, channel) as R, G, B; one channel if all agree; alpha is left out."""
+    """Luminance of (row, column, channel) as R, G, B without alpha; exact where all channels are equal."""
     first = image[..., 0]
     if image.shape[2] < 3 or ((image[..., 1] == first).all() and (image[..., 2] == first).all()):
         return np.ascontiguousarray(first)
@@ -201,10 +193,10 @@ def _grey(image: np.ndarray) -> np.ndarray:
 
 
 def read_each(frames: Frames, indices: Iterable[int]) -> Iterator[tuple[int, np.ndarray | InputError]]:
-    """Read frames one after the other, each once: the image, or what is wrong with it."""
+    """Read frames one after the other: the image, or the error."""
     try:
         read = frames.__getitem__ if frames.shape else frames.single
-    except InputError:  # none can be read
+    except InputError:  # no readable frame
         read = frames.single
     for i in indices:
         try:

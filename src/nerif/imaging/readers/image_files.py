@@ -22,7 +22,7 @@ __all__ = ["FileFrames"]
 
 
 class FileFrames(Frames):
-    """Frames of image files. The file of the frame that was read last stays open, so that pages are found once."""
+    """Frames of image files; the file last read stays open, so that its pages are located once."""
 
     def __init__(self, files: list[Path], names: list[str]) -> None:
         self._files, self._names = files, names
@@ -32,13 +32,13 @@ class FileFrames(Frames):
             lavision = _opener(path) is LaVision
             if lavision:
                 _lvpyio()
-            # each LaVision file would have to be read to know
+            # to count the images of a LaVision file is to read it: all are taken to have as many as the first
             counts.append(counts[0] if lavision and counts else self._count(k))
         self._counts = counts
         self._places = [(k, i) for k, count in enumerate(counts) for i in range(count)]
 
     def __getstate__(self) -> dict[str, Any]:
-        """What another process gets: all but the open file."""
+        """State for another process: all but the open file."""
         return {**self.__dict__, "_last": None}
 
     def _open(self, k: int) -> ImageFile:
@@ -50,7 +50,7 @@ class FileFrames(Frames):
     def _count(self, k: int) -> int:
         try:
             return max(1, len(self._open(k)))
-        except Exception:  # counts as one frame, which says what is wrong when it is read
+        except Exception:  # one frame, whose error is reported on access
             return 1
 
     def __len__(self) -> int:
@@ -64,25 +64,24 @@ class FileFrames(Frames):
         k, inner = self._places[i]
         try:
             return self._open(k).read(inner)
-        except InputError as error:  # which does not know the name
+        except InputError as error:
             raise error.inside(self.name(i)) from None
 
     @cached_property
-    def _known_bits(self) -> int | None:
+    def metadata_bits(self) -> int | None:  # type: ignore[override]
         for k in range(len(self._files)):
             try:
                 return self._open(k).bits
-            except Exception:  # of no interest here: reading it says what is wrong
+            except Exception:  # reported when the frame is read
                 continue
         return None
-
-    @property
-    def known_bits(self) -> int | None:
-        return self._known_bits
 
 
 class ImageFile(ABC):
     """An open file of images."""
+
+    bits: int | None = None
+    """Effective bits in the metadata."""
 
     @abstractmethod
     def __init__(self, path: Path) -> None: ...
@@ -92,12 +91,7 @@ class ImageFile(ABC):
 
     @abstractmethod
     def read(self, i: int) -> np.ndarray:
-        """Return image `i` as it is stored; channels, if any, as R, G, B."""
-
-    @property
-    def bits(self) -> int | None:
-        """Effective bits as the file tells them, or None."""
-        return None
+        """Return image `i` as stored; channels, if any, as R, G, B."""
 
 
 class Tiff(ImageFile):
@@ -114,10 +108,10 @@ class Tiff(ImageFile):
             self._pages = len(self._tiff.pages)
 
     def __len__(self) -> int:
-        return self._pages + self._breaks_off()
+        return self._pages + self._is_truncated()
 
-    def _breaks_off(self) -> bool:
-        """Whether the last page points at another beyond the end of the file: tifffile leaves that out in silence."""
+    def _is_truncated(self) -> bool:
+        """Whether the last page points beyond the end of the file, which tifffile ignores silently."""
         handle, layout = self._tiff.filehandle, self._tiff.tiff
         order: Literal["little", "big"] = "little" if self._tiff.byteorder == "<" else "big"
         handle.seek(self._tiff.pages[-1].offset)
@@ -141,7 +135,7 @@ class Tiff(ImageFile):
         return np.moveaxis(image, 0, -1) if page.axes == "SYX" else image
 
     def _read_by_opencv(self, i: int, bits: int) -> np.ndarray:
-        """Compressed and packed pages that tifffile leaves to another package; OpenCV moves packed bits to the top."""
+        """Compressed and packed pages that tifffile cannot decode; OpenCV shifts packed bits to the top."""
         import cv2
 
         _, images = cv2.imreadmulti(str(self._path), start=i, count=1, flags=cv2.IMREAD_UNCHANGED)
@@ -151,7 +145,7 @@ class Tiff(ImageFile):
         return _as_rgb(np.right_shift(image, 16 - bits) if 8 < bits < 16 else image)
 
     @property
-    def bits(self) -> int | None:
+    def bits(self) -> int | None:  # type: ignore[override]
         page: Any = self._tiff.pages[0]
         if 8 < page.bitspersample < 16:
             return int(page.bitspersample)
@@ -161,12 +155,12 @@ class Tiff(ImageFile):
             return int(match[1])
         top = page.tags.valueof("MaxSampleValue")
         top = max(top) if isinstance(top, tuple) else top
-        return {2**bits - 1: bits for bits in (9, 10, 11, 12, 13, 14, 15)}.get(top)
+        return {2**bits - 1: bits for bits in range(9, 16)}.get(top)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep tifffile from logging damage that the error which follows tells."""
+    """Silence the log of tifffile: the error that follows reports the damage."""
     logger = logging.getLogger("tifffile")
     before, logger.disabled = logger.disabled, True
     try:
@@ -176,7 +170,7 @@ def _quiet() -> Iterator[None]:
 
 
 class Png(ImageFile):
-    """A PNG file, checked to its end, which OpenCV would not."""
+    """A PNG file, checked for its end, which OpenCV does not do."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -193,23 +187,22 @@ class Png(ImageFile):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise ValueError("OpenCV cannot decode it")
-        if bits := _significant_bits(chunks):  # the format wants them at the top
-            image = np.right_shift(image, 16 - bits)
-        return _as_rgb(image)
+        bits = _significant_bits(chunks)
+        return _as_rgb(np.right_shift(image, 16 - bits) if bits else image)  # the format stores them at the top
 
     @property
-    def bits(self) -> int | None:
+    def bits(self) -> int | None:  # type: ignore[override]
         return _significant_bits(_png_chunks(self._path.read_bytes()))
 
 
 def _png_chunks(data: bytes) -> dict[bytes, bytes]:
     """The first chunk of each kind."""
     chunks: dict[bytes, bytes] = {}
-    at = 8
-    while at + 8 <= len(data):
-        size, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
-        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
-        at += 12 + size
+    start = 8
+    while start + 8 <= len(data):
+        size, kind = int.from_bytes(data[start : start + 4]), data[start + 4 : start + 8]
+        chunks.setdefault(kind, data[start + 8 : start + 8 + size])
+        start += 12 + size
     return chunks
 
 
@@ -219,7 +212,7 @@ def _significant_bits(chunks: dict[bytes, bytes]) -> int | None:
 
 
 class Image(ImageFile):
-    """What imageio reads: BMP, JPEG."""
+    """An image that imageio reads: BMP, JPEG."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -231,7 +224,7 @@ class Image(ImageFile):
 
 
 class LaVision(ImageFile):
-    """Counts of all images in a file, frame by frame (camera, exposure), as stored: masks and scales are left out."""
+    """Counts of all images in a file, frame by frame (camera, exposure), as stored, without masks and scales."""
 
     def __init__(self, path: Path) -> None:
         self._planes: list[np.ndarray] = []
@@ -254,8 +247,7 @@ def _lvpyio() -> Any:
         import lvpyio
     except ImportError:
         raise InputError(
-            "expected the package lvpyio, which is not installed; "
-            f"get it by {install('lavision')} (it is under LaVision's own terms)",
+            f"expected the package lvpyio, which is not installed; {install('lavision')} (LaVision's own terms)",
             field="LaVision files (.im7, .vc7)",
         ) from None
     return lvpyio
@@ -272,7 +264,7 @@ def _opener(path: Path) -> type[ImageFile]:
 
 
 def _as_rgb(image: np.ndarray) -> np.ndarray:
-    """OpenCV's order, B, G, R, turned round; without alpha."""
+    """Convert OpenCV's B, G, R, alpha to R, G, B."""
     return image[..., 2::-1] if image.ndim == 3 and image.shape[2] >= 3 else image
 
 

@@ -1,4 +1,4 @@
-"""Open images of any format by a file name, a folder or a pattern, with a selection of frames behind it.
+"""Open images of any format by a file name, a folder or a pattern, optionally with a selection of frames.
 
 Frames count from 0, in messages as in selections such as ``rec.cihx[0:50]``.
 """
@@ -11,13 +11,16 @@ import os
 import re
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool
+
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
-from nerif.imaging.readers.frames import Frames, SelectedFrames
+from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
 
-__all__ = ["open_frames"]
+__all__ = ["open_frames", "read_mask"]
 
 FOLDER_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".im7")
 SINGLE_SUFFIXES = (".cih", ".cihx", ".mraw", ".npy", ".npz", ".h5", ".hdf5", ".hdf")
@@ -27,40 +30,42 @@ DATASET = re.compile(r"(.+\.(?:h5|hdf5|hdf|npz)):(.+)", re.IGNORECASE)
 
 
 def open_frames(spec: str | Path, base: Path | None = None) -> Frames:
-    """Open frames without reading them.
+    """Open frames without reading them, in natural order (img2 before img10).
 
     Parameters
     ----------
     spec : a file, a folder (all images in it) or a pattern such as ``cam1/ref_*.tif`` (with ``*``, ``?`` and ``**``),
-        each followed by a selection if wanted, as Python indexes: ``rec.cihx[0:50]``, ``rec.cihx[7]``,
+        each optionally followed by a selection in the syntax of Python: ``rec.cihx[0:50]``, ``rec.cihx[7]``,
         ``stack.tif[::2]``. HDF5 and .npz files may name a dataset: ``file.h5:/path/to/dataset``. Square brackets
-        elsewhere mean themselves; classes such as ``ref_[ab].tif`` are not patterns.
-    base : folder that a relative spec starts from, left out of the names in messages
-
-    Returns
-    -------
-    The frames in natural order (img2 before img10)
-
-    Raises
-    ------
-    InputError
-        If there is no such file, nothing matches, the format is unknown, or the selection is empty.
+        elsewhere are literal; classes such as ``ref_[ab].tif`` are not patterns.
+    base : folder of a relative spec, omitted from the names in messages
     """
-    text, selection = str(spec), ""
+    text, selection, dataset = str(spec), "", ""
     root = Path() if base is None else Path(base)
     if (match := SELECTION.fullmatch(text)) and not (root / text).exists():
         text, selection = match.groups()
-    dataset = ""
     if (match := DATASET.fullmatch(text)) and not (root / text).exists():
         text, dataset = match.groups()
     path = root / Path(text).expanduser()
     files = _find_files(path, base)
-    frames = _open_files(files, [_shown(file, base) for file in files], dataset)
-    return _select(frames, selection, _shown(path, base)) if selection else frames
+    frames = _open_files(files, [_label(file, base) for file in files], dataset)
+    return _select(frames, selection, _label(path, base)) if selection else frames
+
+
+def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"]:
+    """Read a mask from an image of `shape`: True above the middle of its range."""
+    image = open_frames(path)[0]
+    if image.shape != shape:
+        raise InputError(
+            f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}", field=path
+        )
+    low, high = float(image.min()), float(image.max())
+    if low == high:
+        raise InputError(f"expected a mask with black and white in it, got one grey of {high:g}", field=path)
+    return np.asarray(image > (low + high) / 2)
 
 
 def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames:
-    """Open image files, or one recording, by their endings; `names` are for messages."""
     for path, name in zip(files, names, strict=True):
         if path.suffix.lower() not in SUFFIXES:
             raise InputError(f"expected one of {' '.join(SUFFIXES)}, got '{path.suffix}'", field=name)
@@ -77,53 +82,53 @@ def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frame
 
 
 def _select(frames: Frames, selection: str, name: str) -> Frames:
-    n = len(frames)
+    n, field = len(frames), f"{name}[{selection}]"
     if ":" not in selection:
         if not -n <= int(selection) < n:
-            raise InputError(f"expected a frame from 0 to {n - 1}, got {selection}", field=f"{name}[{selection}]")
+            raise InputError(f"expected a frame from 0 to {n - 1}, got {selection}", field=field)
         return SelectedFrames(frames, [int(selection) % n])
     parts = [int(word) if word else None for word in selection.split(":")]
     if len(parts) == 3 and parts[2] == 0:
-        raise InputError("expected a step other than 0", field=f"{name}[{selection}]")
+        raise InputError("expected a step other than 0", field=field)
     indices = range(n)[slice(*parts)]
     if not indices:
-        raise InputError(f"selects none of the {n} frames, which count from 0", field=f"{name}[{selection}]")
+        raise InputError(f"selects none of the {n} frames, which count from 0", field=field)
     return SelectedFrames(frames, indices)
 
 
 def _find_files(path: Path, base: Path | None) -> list[Path]:
     """Files of a file name, folder or pattern, in natural order."""
-    shown = _shown(path, base)
+    label = _label(path, base)
     if path.is_dir():
         files = [p for p in path.iterdir() if p.suffix.lower() in FOLDER_SUFFIXES and not p.name.startswith(".")]
         if not files:
             others = sorted(p.name for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
-            remedy = f"name the file, such as '{shown}/{others[0]}'" if others else "is it the right folder?"
-            raise InputError(f"expected images ({' '.join(FOLDER_SUFFIXES)}), got none; {remedy}", field=shown)
+            remedy = f"name the file, such as '{label}/{others[0]}'" if others else "is it the right folder?"
+            raise InputError(f"expected images ({' '.join(FOLDER_SUFFIXES)}), got none; {remedy}", field=label)
     elif path.is_file():
         return [path]
     elif re.search(r"[*?]", str(path)):
-        found = (Path(p) for p in glob.glob(str(path).replace("[", "[[]"), recursive=True))
-        files = [p for p in found if p.suffix.lower() in SUFFIXES and p.is_file()]
+        matches = (Path(p) for p in glob.glob(str(path).replace("[", "[[]"), recursive=True))
+        files = [p for p in matches if p.suffix.lower() in SUFFIXES and p.is_file()]
         if not files:
-            raise InputError(f"expected files of this pattern, got none{_nearest(path, base)}", field=shown)
+            raise InputError(f"expected files of this pattern, got none{_nearest(path, base)}", field=label)
     else:
-        raise InputError(f"no such file or folder{_nearest(path, base)}", field=shown)
+        raise InputError(f"no such file or folder{_nearest(path, base)}", field=label)
     return sorted(files, key=_natural)
 
 
 def _nearest(path: Path, base: Path | None) -> str:
-    """Return a hint at the existing name most like the first missing part of a path, or nothing."""
+    """Suggest the existing name nearest to the first part of a path that does not exist."""
     while not path.parent.is_dir() and path.parent != path:
         path = path.parent
     if not path.parent.is_dir():
         return ""
-    there = {name.lower(): name for name in sorted(os.listdir(path.parent), reverse=True)}
-    near = difflib.get_close_matches(path.name.lower(), there, n=1, cutoff=0.5)
-    return f"; did you mean '{_shown(path.parent / there[near[0]], base)}'?" if near else ""
+    names = {name.lower(): name for name in sorted(os.listdir(path.parent), reverse=True)}
+    near = difflib.get_close_matches(path.name.lower(), names, n=1, cutoff=0.5)
+    return f"; did you mean '{_label(path.parent / names[near[0]], base)}'?" if near else ""
 
 
-def _shown(path: Path, base: Path | None) -> str:
+def _label(path: Path, base: Path | None) -> str:
     inside = base is not None and path.is_relative_to(base) and path != base
     return (path.relative_to(base) if base is not None and inside else path).as_posix()
 

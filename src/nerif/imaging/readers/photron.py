@@ -1,4 +1,4 @@
-"""Photron recordings: a header (.cih, .cihx) and monochrome frames of 8, packed 12, or 16 bit (.mraw), one by one."""
+"""Photron recordings: a header (.cih, .cihx) and monochrome frames of 8, packed 12, or 16 bit (.mraw)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nerif.imaging.readers.frames import Frames
 __all__ = ["PhotronFrames"]
 
 NUMBERS = ("Color Bit", "EffectiveBit Depth", "Total Frame", "Image Height", "Image Width", "Record Rate(fps)")
-"""What a .cih header has to tell, besides its file format and on which side of 16 bit the effective ones are."""
+"""Positive numbers that a .cih header must have."""
 
 TAGS = {
     "Color Bit": "imageDataInfo/colorInfo/bit",
@@ -25,22 +25,23 @@ TAGS = {
     "Record Rate(fps)": "recordInfo/recordRate",
     "File Format": "imageFileInfo/fileFormat",
 }
-"""Where the same stands in the XML of a .cihx header."""
+"""Keys of a .cih header and their places in the XML of a .cihx header."""
 
 
 class PhotronFrames(Frames):
-    """A Photron recording; frame i was taken i / rate after the first."""
+    """A Photron recording; the time of frame i is i / rate."""
 
     def __init__(self, path: Path, name: str) -> None:
-        header_path = path if path.suffix.lower() != ".mraw" else _partner(path, name, (".cihx", ".cih"))
-        self._path = path if path.suffix.lower() == ".mraw" else _partner(path, name, (".mraw",))
-        self._name = str(Path(name).with_name(self._path.name).as_posix())
+        is_data = path.suffix.lower() == ".mraw"
+        header_path = _partner(path, name, (".cihx", ".cih")) if is_data else path
+        self._path = path if is_data else _partner(path, name, (".mraw",))
+        self._name = Path(name).with_name(self._path.name).as_posix()
         cih = _header(header_path, Path(name).with_name(header_path.name).as_posix())
         self._stored, self._frames = int(cih["Color Bit"]), int(cih["Total Frame"])
         self._height, self._width = int(cih["Image Height"]), int(cih["Image Width"])
-        self._bits = min(int(cih["EffectiveBit Depth"]), self._stored)
+        self.metadata_bits = min(int(cih["EffectiveBit Depth"]), self._stored)
         upper = self._stored == 16 and cih.get("EffectiveBit Side", "").lower() == "higher"
-        self._shift = self._stored - self._bits if upper else 0
+        self._shift = self._stored - self.metadata_bits if upper else 0
         self.times = np.arange(self._frames) / float(cih["Record Rate(fps)"])
 
     def __len__(self) -> int:
@@ -49,14 +50,10 @@ class PhotronFrames(Frames):
     def name(self, i: int) -> str:
         return f"{self._name} frame {i}"
 
-    @property
-    def known_bits(self) -> int | None:
-        return self._bits
-
     def load(self, i: int) -> np.ndarray:
         pixels = self._height * self._width
         if self._stored == 12:
-            # two pixels in three bytes, on and on through the file: a frame may begin in the middle of three
+            # two pixels in three bytes throughout the file: a frame may begin in the middle of three
             first, last = i * pixels // 2, -(-(i + 1) * pixels // 2)
             data = self._bytes(i, 3 * first, 3 * last - ((i + 1) * pixels) % 2)
             skip = i * pixels % 2
@@ -71,21 +68,21 @@ class PhotronFrames(Frames):
         data = np.fromfile(self._path, np.uint8, end - begin, offset=begin)
         if len(data) < end - begin:
             raise InputError(
-                f"expected {self._frames} frames as the header says, the file ends before this one "
-                f"does ({self._path.stat().st_size} bytes); copy it again",
+                f"expected {self._frames} frames by the header, the file of {self._path.stat().st_size} bytes ends "
+                "within this one or before; copy it again",
                 field=self.name(i),
             )
         return data
 
 
 def unpack12(data: np.ndarray) -> np.ndarray:
-    """Unpack pairs of 12-bit values, the first bits first, from threes of bytes."""
+    """Unpack pairs of 12-bit values, most significant bits first, from triples of bytes."""
     one, two, three = data.reshape(-1, 3).astype(np.uint16).T
     return np.stack([(one << 4) | (two >> 4), ((two & 15) << 8) | three], axis=-1).ravel()
 
 
 def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
-    """The file of the same name with one of these endings, in small or capital letters."""
+    """Return the file of the same name with one of these suffixes, in small or capital letters."""
     for suffix in suffixes:
         for other in sorted(path.parent.iterdir()):
             if other.stem == path.stem and other.suffix.lower() == suffix:
@@ -94,7 +91,7 @@ def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
 
 
 def _header(path: Path, name: str) -> dict[str, str]:
-    """What a header tells, under the names of a .cih."""
+    """Return the entries of a header by the keys of a .cih."""
     try:
         text = path.read_bytes().decode("utf-8", errors="ignore")
         cih = _from_xml(text) if path.suffix.lower() == ".cihx" else _from_lines(text)
@@ -106,7 +103,7 @@ def _header(path: Path, name: str) -> dict[str, str]:
     if kind.lower() != "mraw" or stored not in (8, 12, 16):
         raise InputError(
             f"expected a monochrome MRaw recording of 8, 12 or 16 bit, got {kind} of {stored} bit; "
-            "export it so, or as TIFF",
+            "export it in this format, or as TIFF",
             field=name,
         )
     if not positive:
@@ -122,10 +119,10 @@ def _from_lines(text: str) -> dict[str, str]:
 
 
 def _from_xml(text: str) -> dict[str, str]:
-    """The element <cih> inside the file; binary may stand around it."""
+    """The element <cih>, which binary data may surround."""
     begin, end = text.find("<cih>"), text.rfind("</cih>")
     if begin < 0 or end < 0:
-        raise ValueError("no <cih> in it")
+        raise ValueError("no element <cih>")
     root = ElementTree.fromstring(text[begin : end + len("</cih>")])
-    found = {key: root.findtext(tag) for key, tag in TAGS.items()}
-    return {key: value.strip() for key, value in found.items() if value is not None}
+    entries = {key: root.findtext(tag) for key, tag in TAGS.items()}
+    return {key: value.strip() for key, value in entries.items() if value is not None}

@@ -1,10 +1,10 @@
-"""Where the images of an experiment are: a folder with a folder a view, or a file views.toml that says it.
+"""The images of an experiment: a folder with one folder per view, or a file views.toml.
 
     experiment/
       cam1/target/*.tif  background/*.tif  reference/*.tif  flow/*.tif
       cam2/...
 
-A `views.toml` in the folder takes the place of that layout. What stands above the tables holds for every view:
+A `views.toml` in the folder replaces that layout. Entries above the tables hold for every view:
 
     reference = "reference.cihx"        # a file, a folder, a pattern; [0:50] behind it selects frames
     flow = "run1.cihx[100:200]"
@@ -13,14 +13,15 @@ A `views.toml` in the folder takes the place of that layout. What stands above t
     column = 0
     height = 512
     width = 512
-    flip = "horizontal"                 # what is seen through a mirror
+    flip = "horizontal"                 # seen through a mirror
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import overload
 
@@ -28,31 +29,30 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
-from nerif.common.files import check_known, read_toml
-from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
-from nerif.imaging.displacement.exposure import check_exposure, full_scale
-from nerif.imaging.masks import read_mask
+from nerif.common.files import check_known, read_toml, write_toml
 from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.exposure import check_exposure, full_scale
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
-from nerif.imaging.readers.open import open_frames
+from nerif.imaging.readers.open import open_frames, read_mask
 
-__all__ = ["SOURCES", "Images", "View", "find_targets", "find_views", "good_images", "pose_names"]
+__all__ = ["BEFORE", "SOURCES", "Images", "View", "find_views", "good_images", "read_sample", "write_crops"]
 
 SOURCES = ("target", "background", "reference", "flow", "mask", "region")
-"""What a view may have: target images, the target on the background, images without and with flow, drawn masks."""
+"""Images of a view: target, target on the background, without and with flow, and two drawn masks."""
 
 CROP = tuple(f.name for f in fields(Crop))
+BEFORE = "views.before.toml"
+"""Copy of a views.toml as it was before its first change, with its comments."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Where the images of one view are.
+    """The images of one view.
 
     Parameters
     ----------
-    name : of the view
-    folder : that the sources are relative to
-    sources : what open_frames takes, by the names of SOURCES
+    folder : base of relative sources
+    sources : arguments of open_frames, by the names of SOURCES
     crop : the view's part of each frame
     """
 
@@ -63,17 +63,11 @@ class View:
     _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[type[View], tuple[object, ...]]:
-        """What another process gets: where the images are, which it opens for itself."""
+        """State for another process, which opens the files itself."""
         return View, (self.name, self.folder, self.sources, self.crop)
 
     def open(self, source: str) -> Frames:
-        """Return the frames of a source, opened once.
-
-        Raises
-        ------
-        InputError
-            If the view has none, or they cannot be read.
-        """
+        """Return the frames of a source, opened once."""
         if source not in self.sources:
             raise InputError(
                 f"no {source} images; expected {self.folder / self.name / source}/ or a line "
@@ -86,32 +80,26 @@ class View:
 
     @property
     def full_scale(self) -> float:
-        """Grey value of a full sensor, as far as the images without and with flow tell."""
+        """Grey value of a saturated pixel, by the images without and with flow."""
         return full_scale(self.open("reference"), self.open("flow"))
 
-    def drawn(self, source: str, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"] | None:
-        """Return the mask that was drawn for the view, "mask" or "region", or None."""
+    def mask(self, source: str, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"] | None:
+        """Return the drawn mask of the view, "mask" or "region", or None."""
         return read_mask(self.folder / self.sources[source], shape) if source in self.sources else None
 
     def check_alike(self) -> None:
-        """Check that the images without and with flow are of one size and bit depth.
-
-        Raises
-        ------
-        InputError
-            If they are not.
-        """
+        """Check that the images without and with flow have one size and bit depth."""
         reference, flow = self.open("reference"), self.open("flow")
         ours, theirs = reference.layout, flow.layout
-        depths = [reference.known_bits, flow.known_bits]
-        if None in depths:  # as far as the files tell
+        depths = [reference.metadata_bits, flow.metadata_bits]
+        if None in depths:
             depths = [8 * ours.dtype.itemsize, 8 * theirs.dtype.itemsize]
         sizes = (size_in_words(ours.shape), size_in_words(theirs.shape))
-        for expected, got in (sizes, (f"{depths[0]} bit", f"{depths[1]} bit")):
-            if expected != got:
+        for expected, actual in (sizes, (f"{depths[0]} bit", f"{depths[1]} bit")):
+            if expected != actual:
                 raise InputError(
                     f"{theirs.example}: expected {expected} as in its reference {ours.example}, "
-                    f"got {got}; record both alike",
+                    f"got {actual}; record both with the same settings",
                     field=f"view '{self.name}'",
                 )
 
@@ -121,18 +109,7 @@ class View:
 
 
 def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
-    """Find the views of an experiment.
-
-    Parameters
-    ----------
-    folder : of the experiment
-    only : names of the views wanted; all if empty
-
-    Raises
-    ------
-    InputError
-        If the folder is missing, holds no view, or `only` names one that is not there.
-    """
+    """Find the views of an experiment: those named in `only`, or all."""
     if not folder.is_dir():
         raise InputError("no such folder; expected one with a folder for each view", field=folder)
     file = folder / "views.toml"
@@ -151,7 +128,7 @@ def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
 
 
 def _from_folders(folder: Path) -> list[View]:
-    """Each folder that holds something named as one of SOURCES is a view."""
+    """Each folder with an entry named as one of SOURCES is a view."""
     views = []
     for inner in sorted((p for p in folder.iterdir() if p.is_dir()), key=_natural):
         entries = {
@@ -166,7 +143,7 @@ def _from_folders(folder: Path) -> list[View]:
 
 
 def _natural(path: Path) -> tuple[list[float], str]:
-    """Sort key by which cam2 comes before cam10, and 9deg before 10.5deg."""
+    """Sort key: cam2 before cam10, and 9deg before 10.5deg."""
     return [float(n) for n in re.findall(r"\d+(?:\.\d+)?", path.name)], path.name
 
 
@@ -176,21 +153,45 @@ def _from_file(file: Path) -> list[View]:
     if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
         raise InputError("expected a table [views.NAME] for each view", field=file)
     views = []
-    for name, own in tables.items():
-        entries = {**table, **own}
+    for name, entries in tables.items():
+        entries = {**table, **entries}
         check_known(entries, (*SOURCES, *CROP), str(file))
         for key, value in entries.items():
-            wanted = str if key in (*SOURCES, "flip") else int
-            if not isinstance(value, wanted) or isinstance(value, bool):
-                raise InputError(f"'{key}' of view '{name}': expected {wanted.__name__}, got {value!r}", field=file)
+            kind = str if key in (*SOURCES, "flip") else int
+            if not isinstance(value, kind) or isinstance(value, bool):
+                raise InputError(f"'{key}' of view '{name}': expected {kind.__name__}, got {value!r}", field=file)
         crop = {k: v for k, v in entries.items() if k in CROP}
         sources = {k: v for k, v in entries.items() if k in SOURCES}
         views.append(View(name, file.parent, sources, Crop(**crop) if crop else None))
     return views
 
 
+def write_crops(folder: Path, crops: Mapping[str, Crop]) -> Path:
+    """Write the crops of views, by name, into views.toml in the folder of an experiment, and return its path.
+
+    Other views keep theirs; a folder without the file gets one that lists all views. Before its first change a file is
+    copied to views.before.toml.
+    """
+    views, file = find_views(folder), folder / "views.toml"
+    check_known(crops, [view.name for view in views], "crops", "view")
+    if file.is_file():
+        table = read_toml(file)
+        if not (folder / BEFORE).exists():
+            shutil.copyfile(file, folder / BEFORE)
+    else:
+        table = {"views": {view.name: dict(view.sources) for view in views}}
+    default = asdict(Crop())
+    for name, crop in crops.items():
+        sources = {k: v for k, v in table["views"][name].items() if k not in CROP}
+        # a value that holds for all views has to be overridden, even by the default
+        entries = {k: v for k, v in asdict(crop).items() if v != default[k] or k in table}
+        table["views"][name] = sources | entries
+    write_toml(file, table)
+    return file
+
+
 class Images(Sequence[np.ndarray]):
-    """Some images of a view, its part of each frame, read whenever one is asked for."""
+    """Some images of a view, cropped, read on access."""
 
     def __init__(self, view: View, frames: Frames, indices: Sequence[int]) -> None:
         self._view, self._frames, self._indices = view, frames, indices
@@ -209,89 +210,31 @@ class Images(Sequence[np.ndarray]):
         return self._view.cropped(self._frames[index], self._frames.name(index))
 
 
-def good_images(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Images:
-    """Look for the images of a source that can be used; what is wrong with the others is said.
-
-    Parameters
-    ----------
-    most : number of images to look at, evenly spread; 0 for all
-
-    Raises
-    ------
-    InputError
-        If none can be used.
-    """
+def read_sample(view: View, source: str, most: int = 0) -> Iterator[tuple[int, str, np.ndarray | InputError]]:
+    """Yield number, name and cropped image (or its error) of `most` evenly spread images of a source; 0 for all."""
     frames = view.open(source)
     count = len(frames)
-    chosen = np.linspace(0, count - 1, min(most or count, count)).round().astype(int).tolist()
-    good, bad = [], []
-    for i, found in read_each(frames, chosen):
-        if isinstance(found, InputError):
-            bad.append(str(found))
-            say(f"left out: {found}")
+    numbers = np.linspace(0, count - 1, min(most or count, count)).round().astype(int).tolist()
+    for i, image in read_each(frames, numbers):
+        name = frames.name(i)
+        try:
+            yield i, name, image if isinstance(image, InputError) else view.cropped(image, name)
+        except InputError as error:
+            yield i, name, error
+
+
+def good_images(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Images:
+    """Return the usable images out of `most` evenly spread ones of a source (0: all); report what is wrong."""
+    frames, numbers, errors = view.open(source), [], []
+    for i, name, image in read_sample(view, source, most):
+        if isinstance(image, InputError):
+            errors.append(image)
+            say(f"left out: {image}")
             continue
-        good.append(i)
-        exposure = check_exposure(view.cropped(found, frames.name(i)), full_scale(frames), frames.name(i))
-        if exposure:
+        numbers.append(i)
+        if exposure := check_exposure(image, full_scale(frames), name):
             say(f"note: {exposure}")
-    if not good:
-        looked = f"{len(chosen)}" if len(chosen) == count else f"{len(chosen)} looked at out of {count}"
-        raise InputError(f"none of its {looked} {source} images can be used; {bad[0]}", field=f"view '{view.name}'")
-    return Images(view, frames, good)
-
-
-def find_targets(
-    view: View,
-    target: CalibrationTarget,
-    say: Callable[[str], None],
-    on_image: Callable[[], None] = lambda: None,
-    on_background: CalibrationTarget | None = None,
-) -> ViewImages:
-    """Find the target in all images of a view; say which images were of no use.
-
-    `on_background` is the target that lay on the background, if that was another one (a larger print, say).
-
-    Poses are named by the last number in the name of an image, so that pose_007.png of one camera and cam2-7.tif of
-    another are the same pose; by the number of the frame in a stack or recording.
-    """
-    found: dict[str, dict[str, Detection]] = {"target": {}, "background": {}}
-    size = (0, 0)
-    for source in ("target", "background"):
-        if source not in view.sources:
-            if source == "target":
-                view.open(source)  # says what is missing
-            continue
-        frames = view.open(source)
-        keys = pose_names(frames)
-        for i, image in read_each(frames, range(len(frames))):
-            if isinstance(image, InputError):
-                say(f"left out: {image}")
-                continue
-            image = view.cropped(image, frames.name(i))
-            if size not in ((0, 0), image.shape):
-                raise InputError(
-                    f"expected an image of {size[0]} x {size[1]} px as the others of view "
-                    f"'{view.name}', got {image.shape[0]} x {image.shape[1]}",
-                    field=frames.name(i),
-                )
-            size = (image.shape[0], image.shape[1])
-            used = on_background or target if source == "background" else target
-            detection = used.detect(image)
-            on_image()
-            if detection is None:
-                say(f"left out: {frames.name(i)}: no {used.kind} of {used.columns} x {used.rows} found")
-            else:
-                found[source][keys[i]] = detection
-    return ViewImages(view.name, size, found["target"], found["background"])
-
-
-def pose_names(frames: Frames) -> list[str]:
-    """Return the names of the poses that images of a target show: see find_targets."""
-    return _pose_keys([frames.name(i) for i in range(len(frames))])
-
-
-def _pose_keys(names: list[str]) -> list[str]:
-    """The last number in each name, if these differ; else the position."""
-    numbers = [re.findall(r"\d+", Path(name).stem if " frame " not in name else name) for name in names]
-    last = [str(int(n[-1])) if n else "" for n in numbers]
-    return last if len(set(last)) == len(last) and all(last) else [str(i) for i in range(len(names))]
+    if not numbers:
+        total = f"{len(errors)}" if len(errors) == len(frames) else f"{len(errors)} checked out of {len(frames)}"
+        raise InputError(f"none of its {total} {source} images can be used; {errors[0]}", field=f"view '{view.name}'")
+    return Images(view, frames, numbers)

@@ -83,7 +83,7 @@ def velocity_between(first: Volume, second: Volume, seconds: float, window: int 
     start, end = (volume.values.float().cpu().numpy() for volume in (first, second))
     vectors = correlate(start, end, window, passes, central=True)
     movement = torch.from_numpy(vectors.movement).double()
-    movement[~torch.from_numpy(vectors.found)] = torch.nan
+    movement[~torch.from_numpy(vectors.valid)] = torch.nan
     axes = torch.meshgrid(*(torch.from_numpy(a) for a in vectors.axes), indexing="ij")
     lower = torch.tensor(grid.box.lower, dtype=torch.float64)
     points = lower + (torch.stack(axes[::-1], dim=-1) + 0.5) * spacing

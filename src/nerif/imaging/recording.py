@@ -1,0 +1,292 @@
+"""From the images of a recording to the measurement of one instant.
+
+The reference images of a view are evaluated once (ViewReference); the flow images of each instant are compared with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
+from nerif.data.measurement import Measurement
+from nerif.geometry import Box, Camera
+from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.imaging.displacement.displacement import DisplacementMap, DisplacementSettings, Reference
+from nerif.imaging.masks import MaskSettings, flow_mask
+from nerif.imaging.readers.exposure import check_exposure
+from nerif.imaging.readers.views import View, good_images
+from nerif.imaging.workers import cores, work
+
+__all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "join_views", "measure_instant"]
+
+PixelMask = Bool[np.ndarray, "row column"]
+ViewMeasurement = tuple[Camera, DisplacementMap, PixelMask | None]
+"""Camera, displacement and flow mask (or None) of a view."""
+
+WORTH_PROCESSES = 2**22  # pixels of all images together
+
+
+def silent(line: str) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The gas around the flow, and the light."""
+
+    n_ambient: float = AMBIENT_INDEX
+    """Refractive index around the flow."""
+    wavelength_nm: float = 532.0
+    """Wavelength of the light, nm."""
+    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
+    """Faces of the box on which the index is ambient."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The parts of a measurement that are common to all views: the box to reconstruct, and its surroundings."""
+
+    box: Box
+    surroundings: Surroundings = Surroundings()
+
+
+def join_views(views: Iterable[ViewMeasurement], scene: Scene, images: bool = False) -> Measurement:
+    """Return one measurement of all views; smaller images are padded.
+
+    With images a pixel is valid where either the displacement or the image is; the other is NaN there.
+
+    Parameters
+    ----------
+    views : may be a generator, which keeps one view in memory at a time
+    images : whether to include the image pairs
+    """
+    cameras: list[Camera] = []
+    maps: dict[str, list[np.ndarray]] = {}
+    any_mask = False
+    for camera, result, mask in views:
+        cameras.append(camera)
+        any_mask |= mask is not None
+        arrays = {"displacement": result.displacement, "sigma": result.sigma, "valid": result.valid}
+        arrays["flow_mask"] = np.ones(result.valid.shape, dtype=bool) if mask is None else mask
+        if images and result.pair is not None:
+            arrays["displacement"] = np.where(result.valid[..., None], result.displacement, np.float32(np.nan))
+            arrays["valid"] = result.valid | np.isfinite(result.pair.flow)
+            arrays |= {"reference": result.pair.reference, "flow": result.pair.flow, "image_sigma": result.pair.sigma}
+        for name, array in arrays.items():
+            maps.setdefault(name, []).append(array)
+    size = tuple(max(v.shape[k] for v in maps["valid"]) for k in range(2))
+
+    def stack(name: str) -> torch.Tensor:
+        arrays = maps[name]
+        kind = arrays[0].dtype
+        padded = np.full((len(arrays), *size, *arrays[0].shape[2:]), np.nan if kind.kind == "f" else 0, dtype=kind)
+        for view in padded:
+            array = arrays.pop(0)  # free it once copied
+            view[: array.shape[0], : array.shape[1]] = array
+        return torch.from_numpy(padded)
+
+    return Measurement(
+        cameras=tuple(cameras),
+        displacement=stack("displacement"),
+        box=scene.box,
+        n_ambient=scene.surroundings.n_ambient,
+        sigma=stack("sigma"),
+        valid=stack("valid"),
+        maps={name: stack(name) for name in ("reference", "flow", "image_sigma") if name in maps},
+        flow_mask=stack("flow_mask") if any_mask else None,
+        wavelength_nm=scene.surroundings.wavelength_nm,
+        ambient_faces=scene.surroundings.ambient_faces,
+    )
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Images of all views, and the settings to evaluate them.
+
+    Parameters
+    ----------
+    views : of views.find_views
+    cameras : calibrated, by the names of the views (importers.import_cameras, cameras_file.read_cameras)
+    method : of the displacements
+    masks : of the flow, or None; drawn masks take precedence
+    references : most reference images to use; 0 for all
+    images : whether a measurement of one flow image includes the images
+    """
+
+    views: tuple[View, ...]
+    cameras: Mapping[str, CalibratedCamera]
+    scene: Scene
+    method: DisplacementSettings = field(default_factory=DisplacementSettings)
+    masks: MaskSettings | None = None
+    references: int = 100
+    images: bool = True
+
+    def __post_init__(self) -> None:
+        for view in self.views:
+            if view.name not in self.cameras:
+                raise InputError(
+                    f"no camera named '{view.name}', only {', '.join(self.cameras)}; "
+                    "rename the view's folder, or choose --views",
+                    field="calibration",
+                )
+        if self.references < 0:
+            raise InputError(f"expected 0 or more, got {self.references}", field="references")
+
+    def processes(self, tasks: int, images: int) -> int:
+        """Return the number of processes for tasks with `images` images in total: 1 if these are small."""
+        sizes = [c.image_size for c in self.cameras.values() if c.image_size is not None]
+        pixels = images * max((height * width for height, width in sizes), default=WORTH_PROCESSES)
+        return min(cores(), tasks) if pixels >= WORTH_PROCESSES else 1
+
+
+@dataclass(frozen=True)
+class ViewReference:
+    """A view with its camera and its evaluated reference images.
+
+    Parameters
+    ----------
+    masks : settings of the flow mask by threshold, or None
+    region : where the background is visible, or None
+    drawn_mask : drawn flow mask, or None
+    images : whether a displacement map includes the images
+    """
+
+    view: View
+    camera: Camera
+    reference: Reference
+    masks: MaskSettings | None = None
+    region: PixelMask | None = None
+    drawn_mask: PixelMask | None = None
+    images: bool = True
+
+    @classmethod
+    def of(
+        cls, recording: Recording, view: View, averages: int = 1, say: Callable[[str], None] = silent
+    ) -> ViewReference:
+        """Evaluate the reference images of a view.
+
+        Parameters
+        ----------
+        averages : number of flow images whose displacements will be averaged
+        say : called with a line about each unusable image
+        """
+        view.check_alike()
+        images = good_images(view, "reference", say, recording.references)
+        shape = (images[0].shape[0], images[0].shape[1])
+        camera = camera_of(view, recording.cameras[view.name], shape)
+        reference = Reference.of(images, recording.method, view.full_scale, averages)
+        region, drawn_mask = view.mask("region", shape), view.mask("mask", shape)
+        return cls(view, camera, reference, recording.masks, region, drawn_mask, recording.images)
+
+    def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
+        """Return camera, mean displacement over flow images of these numbers, and flow mask."""
+        frames, images = self.view.open("flow"), []
+        for i in numbers:
+            images.append(self.view.cropped(frames[i], frames.name(i)))
+            if exposure := check_exposure(images[-1], self.reference.full_scale, frames.name(i)):
+                say(f"note: {exposure}")
+        result = self.reference.measure(images, self.region, self.images)
+        if not result.valid.any():
+            method = self.reference.settings
+            raise InputError(
+                f"no valid pixel (noise above {method.max_sigma:g} px or correlation below "
+                f"{method.min_correlation:g} everywhere); do the images show the same pattern, in focus?",
+                field=frames.name(numbers[0]),
+            )
+        mask = self.drawn_mask
+        if mask is None and self.masks is not None:
+            d = np.where(result.valid[..., None], result.displacement, np.nan)
+            mask = flow_mask(d, result.sigma, self.masks)
+        return self.camera, result, mask
+
+
+def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) -> Camera:
+    """Return the camera of a view's images, which may be a crop of those it was calibrated with."""
+    name = f"view '{view.name}'"
+    if calibrated.background is None:
+        raise InputError(
+            "its camera has no background plane, which displacements need; calibrate it with a "
+            "target laid on the background, or give nerif calibrate --background-distance",
+            field=name,
+        )
+    crop, frame = view.crop, view.open("flow").shape
+    turned = crop is not None and bool(crop.flip or crop.rotate)
+    if calibrated.image_size is None and crop is not None and (turned or frame != shape):
+        raise InputError(
+            "its images are cropped or turned (views.toml), and its camera has no image size, so that the crop of the "
+            f"calibration is unknown; add it: nerif calibrate FILE --image-size {shape[0]} {shape[1]} (the crop) or "
+            f"{frame[0]} {frame[1]} (the whole frame)",
+            field=name,
+        )
+    if calibrated.image_size in (None, shape):
+        return calibrated.camera(image_size=shape)
+    if crop is not None and calibrated.image_size == frame and not turned:
+        return calibrated.camera().view(crop.row, crop.column, *shape)
+    raise InputError(
+        f"its images have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
+        f"with {calibrated.image_size}; calibrate with the same crop, or with the whole frame and no flip",
+        field=name,
+    )
+
+
+def measure_instant(
+    recording: Recording,
+    numbers: Sequence[int] = (0,),
+    say: Callable[[str], None] = silent,
+    on_view: Callable[[int], None] = lambda count: None,
+    processes: int | None = None,
+) -> tuple[Measurement, dict[str, str]]:
+    """Return the measurement of one instant, and the source of the noise by the name of the view.
+
+    Parameters
+    ----------
+    numbers : of the flow images, whose displacements are averaged
+    say : called with a line about each view and image that is left out
+    on_view : called with the number of views evaluated
+    processes : 1 for this one only; by default one per core if the images are large
+    """
+    views = recording.views
+    results: dict[int, ViewMeasurement] = {}
+    errors = []
+    tasks = [(view, tuple(numbers)) for view in views]
+    if processes is None:
+        processes = recording.processes(len(views), len(views))
+    for count, (i, (result, lines)) in enumerate(work(_measure_view, recording, tasks, processes), 1):
+        for line in lines:
+            say(line)
+        if isinstance(result, InputError):
+            errors.append(str(result))
+            say(f"view '{views[i].name}' left out: {result}")
+        else:
+            results[i] = result
+        on_view(count)
+    if not results:
+        raise InputError(f"no view could be used; the first: {errors[0]}", field="displacement")
+    order = sorted(results)
+    noise = {views[i].name: results[i][1].noise_source for i in order}
+    images = recording.images and len(numbers) == 1
+    return join_views((results.pop(i) for i in order), recording.scene, images), noise
+
+
+def _measure_view(
+    recording: Recording, task: tuple[View, Sequence[int]]
+) -> tuple[ViewMeasurement | InputError, list[str]]:
+    """Measurement of one view at one instant, or the error; and the lines to report."""
+    view, numbers = task
+    lines: list[str] = []
+    try:
+        count = len(view.open("flow"))
+        if not 0 <= min(numbers) <= max(numbers) < count:
+            raise InputError(
+                f"expected numbers within the {count} flow images of view '{view.name}', got "
+                f"{min(numbers)} to {max(numbers)}",
+                field="frame, average",
+            )
+        return ViewReference.of(recording, view, len(numbers), lines.append).measure(numbers, lines.append), lines
+    except InputError as error:
+        return error, lines

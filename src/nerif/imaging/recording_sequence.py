@@ -1,0 +1,236 @@
+"""From the flow images of a recording to a sequence of measurements, in parallel and resumable."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_file import from_dataset
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.geometry import Camera, Lens
+from nerif.imaging.readers.views import View
+from nerif.imaging.recording import Recording, Scene, ViewReference, join_views, silent
+from nerif.imaging.workers import work
+
+__all__ = ["RecordingReference", "frame_numbers", "instants_of", "measure_recording"]
+
+ROUNDING = 1e-9  # relative to the largest of the numbers compared
+
+
+@dataclass(frozen=True)
+class RecordingReference:
+    """All views with their evaluated reference images."""
+
+    views: tuple[ViewReference, ...]
+    scene: Scene
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        say: Callable[[str], None] = silent,
+        on_view: Callable[[int], None] = lambda count: None,
+        processes: int | None = None,
+    ) -> RecordingReference:
+        """Evaluate the reference images of all views."""
+        views, recording = recording.views, replace(recording, images=False)  # a sequence has no images
+        if processes is None:
+            processes = recording.processes(len(views), len(views))
+        references: dict[int, ViewReference] = {}
+        for i, (reference, lines) in work(_reference, recording, views, processes):
+            for line in lines:
+                say(line)
+            if isinstance(reference, InputError):
+                raise reference
+            references[i] = reference
+            on_view(len(references))
+        return cls(tuple(references[i] for i in sorted(references)), recording.scene)
+
+    def measure(self, number: int) -> tuple[Measurement, list[str]]:
+        """Return the measurement of one flow image, and the errors of the views that are left out."""
+        results, errors = [], []
+        for reference in self.views:
+            try:
+                results.append(reference.measure([number]))
+            except InputError as error:
+                errors.append(f"view '{reference.view.name}': {error}")
+        if not results:
+            raise InputError(errors[0])
+        return join_views(results, self.scene), errors
+
+
+def _reference(recording: Recording, view: View) -> tuple[ViewReference | InputError, list[str]]:
+    lines: list[str] = []
+    try:
+        return ViewReference.of(recording, view, 1, lines.append), lines
+    except InputError as error:
+        return error, lines
+
+
+def frame_numbers(text: str, views: Sequence[View]) -> range:
+    """Return the flow images of "all" or FIRST:LAST (LAST excluded), which every view must have."""
+    counts = {view.name: len(view.open("flow")) for view in views}
+    shortest = min(counts, key=lambda name: counts[name])
+    if text == "all":
+        return range(counts[shortest])
+    try:
+        first, last = (int(word) for word in text.split(":"))
+        if not 0 <= first < last:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"expected all, or FIRST:LAST such as 0:400, got '{text}'", field="frames") from None
+    if last > counts[shortest]:
+        raise InputError(
+            f"expected numbers within the {counts[shortest]} of view '{shortest}', got '{text}'", field="frames"
+        )
+    return range(first, last)
+
+
+def instants_of(numbers: range, view: View, frame_rate: float) -> tuple[float, ...]:
+    """Return the times of frames, s, by the frame rate (1/s) or, if it is 0, by the recording."""
+    if frame_rate > 0:
+        return tuple(i / frame_rate for i in numbers)
+    times = view.open("flow").times
+    if times is None:
+        raise InputError("expected frames per second, as the images have no times; got none", field="frame_rate")
+    return tuple(float(times[i]) for i in numbers)
+
+
+def measure_recording(
+    recording: Recording,
+    numbers: range,
+    times: Sequence[float],
+    out: Path,
+    settings: dict[str, Any] | None = None,
+    force: bool = False,
+    say: Callable[[str], None] = silent,
+    on_step: Callable[[int], None] = lambda count: None,
+    processes: int | None = None,
+) -> MeasurementSequence:
+    """Measure the frames that a store does not have yet, and report what could not be measured.
+
+    Parameters
+    ----------
+    numbers : of the flow images
+    times : of these, s
+    out : Zarr store, created if it does not exist
+    settings : written to the store; a store with other settings or cameras is not continued
+    force : replace the store
+    say : called with a line about everything that is left out
+    on_step : called with the number of views with evaluated references plus that of finished frames
+    processes : 1 for this one only; by default one per core if the images are large
+    """
+    settings = json.loads(json.dumps({**(settings or {}), "frames": [numbers.start, numbers.stop]}, default=str))
+    sequence = _existing(out, settings) if out.exists() and not force else None
+    reference = RecordingReference.of(recording, say, on_step, processes)
+    if sequence is not None:
+        _check_cameras(out, [view.camera for view in reference.views])
+        count = sum(map(sequence.is_written, range(len(numbers))))
+        say(f"{out}: {count} of {len(numbers)} frames exist already")
+    else:
+        sequence = _create(reference, numbers, times, out, settings, force)
+    todo = [i for i in range(len(numbers)) if not sequence.is_written(i)]
+    count, incomplete = len(numbers) - len(todo), 0
+    if processes is None:
+        processes = recording.processes(len(todo), len(todo) * len(reference.views))
+    for i, lines in work(_measure_frame, (reference, sequence, numbers), todo, processes):
+        count += 1
+        on_step(len(reference.views) + count)
+        incomplete += bool(lines)
+        for line in lines:
+            say(f"frame {numbers[todo[i]]}: left out: {line}")
+    say(f"{out}: {len(numbers)} frames of {len(reference.views)} views, {incomplete} of them incomplete")
+    return sequence
+
+
+def _existing(out: Path, settings: dict[str, Any]) -> MeasurementSequence:
+    import zarr
+
+    sequence = MeasurementSequence.read(out)
+    if zarr.open_group(out, mode="r").attrs.get("displacement") != settings:
+        raise InputError("exists already with other settings; give another --out, or --force", field=out)
+    return sequence
+
+
+def _check_cameras(out: Path, cameras: Sequence[Camera]) -> None:
+    """Refuse to continue a store with other cameras."""
+    import xarray as xr
+
+    with xr.open_dataset(out, engine="zarr", chunks=None, consolidated=False, decode_times=False) as dataset:
+        stored = {c.name: c for c in from_dataset(dataset.isel(time=0, row=slice(1), column=slice(1)))["cameras"]}
+    differences = [f"views ({', '.join(stored)})"] if set(stored) != {camera.name for camera in cameras} else []
+    for camera in cameras if not differences else ():
+        reference = _camera_numbers(stored[camera.name])
+        for what, value in _camera_numbers(camera).items():
+            tolerance = ROUNDING * float(value.nan_to_num().abs().max())
+            if not torch.allclose(value, reference[what], rtol=0, atol=tolerance, equal_nan=True):
+                differences.append(f"{what} of view '{camera.name}'")
+    if differences:
+        raise InputError(
+            f"expected the cameras of the existing store, got other {differences[0]}; after a new calibration "
+            "give another --out, or --force",
+            field=out,
+        )
+
+
+def _camera_numbers(camera: Camera) -> dict[str, Tensor]:
+    """Everything about a camera that a measurement stores."""
+    lens = camera.lens if camera.lens is not None and camera.lens.wide else Lens()
+    sigma = torch.full((6,), torch.nan) if camera.pose_sigma is None else camera.pose_sigma
+    groups: dict[str, Any] = {
+        "image size": camera.image_size,
+        "projection": [camera.projection.shows_depth],
+        "intrinsics": camera.intrinsics,
+        "rotation": camera.rotation,
+        "translation": camera.translation,
+        "distortion": camera.distortion,
+        "background": [*camera.plane.normal.tolist(), camera.plane.offset],
+        "lens": [lens.diameter, torch.nan if lens.focus is None else lens.focus],
+        "pose_sigma": sigma,
+    }
+    return {what: torch.as_tensor(value, dtype=torch.float64) for what, value in groups.items()}
+
+
+def _create(
+    reference: RecordingReference,
+    numbers: range,
+    times: Sequence[float],
+    out: Path,
+    settings: dict[str, Any],
+    force: bool,
+) -> MeasurementSequence:
+    """A new store with the first frame that has all views."""
+    import zarr
+
+    first_error = None
+    for index, number in enumerate(numbers):
+        try:
+            measurement, errors = reference.measure(number)
+        except InputError as error:
+            first_error, errors = first_error or error, [str(error)]
+        if not errors:
+            sequence = MeasurementSequence.create(out, times, measurement, force)
+            zarr.open_group(out, mode="r+").attrs["displacement"] = settings
+            sequence.write_frame(index, measurement)
+            return sequence
+        first_error = first_error or InputError(errors[0])
+    raise InputError(f"no frame in which every view could be used; {first_error}; choose --views")
+
+
+def _measure_frame(common: tuple[RecordingReference, MeasurementSequence, range], index: int) -> list[str]:
+    """Measure and write one frame; return the errors of views that are left out."""
+    reference, sequence, numbers = common
+    try:
+        measurement, errors = reference.measure(numbers[index])
+        sequence.write_frame(index, measurement)
+    except InputError as error:
+        return [str(error)]
+    return errors
