@@ -82,8 +82,8 @@ def test_faces_of_the_box_are_named_as_those_of_the_reduced_one():
 
 def test_moving_an_axis_there_and_back_leaves_it_where_it_was():
     start = about()
-    there = start.moved((0.5, -0.2), (0.01, 0.02))
-    still = there.moved((0.0, 0.0), (0.0, 0.0))
+    there = start.move((0.5, -0.2), (0.01, 0.02))
+    still = there.move((0.0, 0.0), (0.0, 0.0))
     assert (still.matrix - there.matrix).abs().max() < 1e-12
     lean = torch.tensor(there.direction, dtype=torch.float64) @ start.matrix.T
     assert (lean[:2] / lean[2]).tolist() == pytest.approx([0.01, 0.02])
@@ -94,4 +94,4 @@ def test_what_a_file_keeps_is_what_comes_back():
     from dataclasses import asdict
 
     symmetry = about("axis+2")
-    assert Symmetry.kept(asdict(symmetry)) == symmetry
+    assert Symmetry.from_entries(asdict(symmetry)) == symmetry

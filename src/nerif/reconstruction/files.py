@@ -145,10 +145,10 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
             lower, upper = about["reduced_box"]
             grid = Grid(Box(tuple(lower), tuple(upper)), tuple(about["shape"]))
             parts = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
-            return SymmetricVoxels(parts, Symmetry.kept(about["symmetry"])), box, n_ambient
+            return SymmetricVoxels(parts, Symmetry.from_entries(about["symmetry"])), box, n_ambient
         shape = NetworkShape.of(about["network"])
         symmetry = about.get("symmetry")
-        network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.kept(symmetry))
+        network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.from_entries(symmetry))
         network.load_state_dict(tensors)
         network.eval().requires_grad_(False)
         return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient

@@ -71,7 +71,7 @@ def find_axis(
 
     def about(t: Float[Tensor, " 4"]) -> Symmetry:
         a, b, c, d = t.tolist()
-        return axisymmetric.moved((a, b), (c, d))
+        return axisymmetric.move((a, b), (c, d))
 
     def operators(t: Float[Tensor, " 4"]) -> list[SymmetricOperator]:
         symmetry = about(t)

@@ -102,7 +102,7 @@ class Result:
     def meridian(self) -> Meridian | None:
         """The quantities of a symmetric flow over (r, h); None for other flows."""
         axis = self.metrics.get("axis") if self.volumes else None
-        return Meridian.of(self.volumes, Symmetry.kept(axis["symmetry"])) if axis else None
+        return Meridian.of(self.volumes, Symmetry.from_entries(axis["symmetry"])) if axis else None
 
     @property
     def method(self) -> str:
