@@ -73,8 +73,7 @@ class Case:
         volumes, figures = self.volumes(method)
         velocity = velocity_between(volumes[0], volumes[1], SECONDS, self.window)
         truth = self.ring.velocity(velocity.points.reshape(-1, 3)).reshape(velocity.points.shape)
-        found = float(velocity.found.double().mean())
-        return figures | {"error": velocity.rms_error(truth) / VOXEL, "found": found}
+        return figures | {"error": velocity.rms_error(truth) / VOXEL, "found": float(velocity.valid.double().mean())}
 
 
 def main() -> None:
