@@ -38,10 +38,10 @@ docs: .venv/.dev
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
 
 study: .venv/.dev
-	$(BIN)/python benchmarks/study -o out/study
+	$(BIN)/python -m benchmarks run study --out out/study --data out/study --resume
 
 study-quick: .venv/.dev
-	$(BIN)/python benchmarks/study --quick -o out/study-quick
+	$(BIN)/python -m benchmarks run study --quick --out out/study-quick --data out/study-quick --resume
 
 .venv/.run: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "nerif needs Python 3.11 or newer; try make PYTHON=python3.11")'

@@ -1,12 +1,12 @@
-"""What others do with one camera: inverse Abel transforms of a displacement map, by PyAbel and by a quadrature.
+"""Inverse Abel transforms of a displacement map, by PyAbel and by a quadrature; peers of one_camera.py.
 
-Rays are taken for parallel, as these methods have it: row by row, with F the index excess integrated along a ray at the
+Rays are assumed parallel, as in these methods: row by row, with F the index excess integrated along a ray at the
 distance y from the axis and L the distance of the background from it,
 
     u = -(L m / n_ambient) dF/dy,      n(r) - n_ambient = -(1 / pi) integral_r^inf dF/dy / sqrt(y^2 - r^2) dy
 
-with m px per mm on the background; mm on the axis per px are another number where the camera sees perspectively. In the
-form "projection" u is integrated to F, which is transformed; in the form "derivative" dF/dy is used as it is.
+with m px per mm on the background (not the inverse of the mm per px on the axis, in perspective). In the form
+"projection" u is integrated to F, which is transformed; in the form "derivative" dF/dy is used directly.
 """
 
 from __future__ import annotations
@@ -22,38 +22,27 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter
 
-from nerif.common.conventions import InputError
+from benchmarks.runner import peer
 from nerif.geometry import Camera, Grid
 
-__all__ = ["ORDERS", "PEERS", "SMOOTHING", "HalfView", "ParallelView", "Peer", "Revolution", "attempts", "pyabel"]
-
 Array = np.ndarray
+Inversion = Callable[["HalfView", float], Float[Array, "row n"]]
 
 SMOOTHING = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of the Gaussian that a displacement map is smoothed by along rows and columns, px."""
 
 ORDERS = {1: "linear", 3: "cubic"}
-"""How a map is read between pixels."""
+"""Interpolation of a map between pixels."""
 
 
 def pyabel() -> Any:
-    """Return the package PyAbel.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
-    try:
-        import abel
-    except ImportError:
-        raise InputError("PyAbel is not installed; pip install -c constraints.txt -e '.[benchmarks]'") from None
-    return abel
+    """Return the package PyAbel."""
+    return peer("abel", "PyAbel")
 
 
 @dataclass(frozen=True)
 class ParallelView:
-    """How a camera shows a flow around a vertical axis, its rays taken for parallel.
+    """View of a flow around a vertical axis, its rays assumed parallel.
 
     Parameters
     ----------
@@ -78,8 +67,7 @@ class ParallelView:
         point = torch.tensor(centre, dtype=torch.float64)
         column, row = camera.project(point).tolist()
         depth, behind = float(camera.local(point)[2]), camera.depth(camera.plane)
-        there = camera.centre + behind * camera.rotation[2]
-        scale = 1 / float(camera.pixel_size(there))
+        scale = 1 / float(camera.pixel_size(camera.centre + behind * camera.rotation[2]))
         return cls(column, row, float(camera.pixel_size(point)), behind - depth, scale, centre)
 
     def heights(self, rows: int) -> Float[Array, " row"]:
@@ -88,7 +76,7 @@ class ParallelView:
 
 
 class HalfView:
-    """F and dF/dy of every row, the two halves as one, by cubic splines between pixels.
+    """F and dF/dy of every row, averaged over both halves, by cubic splines between pixels.
 
     Parameters
     ----------
@@ -122,31 +110,16 @@ class HalfView:
         return 0.5 * self.view.pixel * (both - both[:, -1:])
 
 
-def three_point(half: HalfView, _: float) -> Float[Array, "row n"]:
-    """Dasch, Appl. Opt. 31 (1992) 1146."""
-    return pyabel().dasch.three_point_transform(half.projection(), basis_dir=None, dr=half.view.pixel)
+def by_pyabel(transform: str, parameter: str = "", **settings: Any) -> Inversion:
+    """Return a transform of F by PyAbel, such as "dasch.three_point_transform", and the name of its parameter there."""
 
+    def invert(half: HalfView, value: float) -> Float[Array, "row n"]:
+        module, name = transform.split(".")
+        parameters = {parameter: int(value) if parameter == "hold_order" else value} if parameter else {}
+        function = getattr(getattr(pyabel(), module), name)
+        return function(half.projection(), dr=half.view.pixel, **settings, **parameters)
 
-def onion_peeling(half: HalfView, _: float) -> Float[Array, "row n"]:
-    """Dasch, Appl. Opt. 31 (1992) 1146."""
-    return pyabel().dasch.onion_peeling_transform(half.projection(), basis_dir=None, dr=half.view.pixel)
-
-
-def hansen_law(half: HalfView, order: float) -> Float[Array, "row n"]:
-    """Hansen & Law, J. Opt. Soc. Am. A 2 (1985) 510."""
-    return pyabel().hansenlaw.hansenlaw_transform(half.projection(), dr=half.view.pixel, hold_order=int(order))
-
-
-def basex(half: HalfView, strength: float) -> Float[Array, "row n"]:
-    """Dribinski et al., Rev. Sci. Instrum. 73 (2002) 2634."""
-    return pyabel().basex.basex_transform(
-        half.projection(), reg=strength, basis_dir=None, dr=half.view.pixel, verbose=False
-    )
-
-
-def daun(half: HalfView, strength: float) -> Float[Array, "row n"]:
-    """Daun et al., Appl. Opt. 45 (2006) 4638."""
-    return pyabel().daun.daun_transform(half.projection(), reg=strength, degree=1, dr=half.view.pixel, verbose=False)
+    return invert
 
 
 def quadrature(half: HalfView, _: float) -> Float[Array, "row n"]:
@@ -156,14 +129,14 @@ def quadrature(half: HalfView, _: float) -> Float[Array, "row n"]:
     for i in range(slope.shape[1] - 1):
         y = np.arange(i, slope.shape[1], dtype=np.float64)
         root = np.sqrt(y**2 - i**2)
-        logarithm = np.log(np.maximum(y + root, 1))  # on the axis dF/dy is 0, and so is what stands before it
+        logarithm = np.log(np.maximum(y + root, 1))  # on the axis, where its factor dF/dy is 0
         rise = np.diff(slope[:, i:])
         n[:, i] = rise @ np.diff(root) + (slope[:, i:-1] - rise * y[:-1]) @ np.diff(logarithm)
     return -n / math.pi
 
 
 def daun_of_slope(half: HalfView, strength: float) -> Float[Array, "row n"]:
-    """The least squares of Daun et al., the data being dF/dy between the nodes."""
+    """Least squares of Daun et al. with dF/dy between the nodes as data."""
     slope = half.slope(0.5)
     nodes = slope.shape[1] + 1
     forward = pyabel().daun.daun_transform(np.eye(nodes), degree=1, direction="forward", verbose=False)
@@ -178,20 +151,18 @@ def daun_of_slope(half: HalfView, strength: float) -> Float[Array, "row n"]:
 
 @dataclass(frozen=True)
 class Peer:
-    """A method in one of the two forms.
+    """A method in one of the two forms, projection or derivative.
 
     Parameters
     ----------
-    name : of the method
-    form : projection or derivative
     invert : from a half view and a parameter to the index excess at r = 0, 1, ... px
-    parameter : what the parameter is called; empty for none
-    values : of the parameter, that are tried
+    parameter : its name; empty for none
+    values : of the parameter
     """
 
     name: str
     form: str
-    invert: Callable[[HalfView, float], Float[Array, "row n"]]
+    invert: Inversion
     parameter: str = ""
     values: tuple[float, ...] = (0.0,)
 
@@ -204,26 +175,30 @@ class Peer:
 STRENGTHS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 
 PEERS = (
-    Peer("three-point", "projection", three_point),
-    Peer("onion peeling", "projection", onion_peeling),
-    Peer("Hansen-Law", "projection", hansen_law, "hold order", (0.0, 1.0)),
-    Peer("BASEX", "projection", basex, "reg", STRENGTHS),
-    Peer("Daun", "projection", daun, "reg", STRENGTHS),
+    Peer("three-point", "projection", by_pyabel("dasch.three_point_transform", basis_dir=None)),
+    Peer("onion peeling", "projection", by_pyabel("dasch.onion_peeling_transform", basis_dir=None)),
+    Peer(
+        "Hansen-Law", "projection", by_pyabel("hansenlaw.hansenlaw_transform", "hold_order"), "hold order", (0.0, 1.0)
+    ),
+    Peer(
+        "BASEX",
+        "projection",
+        by_pyabel("basex.basex_transform", "reg", basis_dir=None, verbose=False),
+        "reg",
+        STRENGTHS,
+    ),
+    Peer("Daun", "projection", by_pyabel("daun.daun_transform", "reg", degree=1, verbose=False), "reg", STRENGTHS),
     Peer("quadrature", "derivative", quadrature),
     Peer("Daun", "derivative", daun_of_slope, "reg", STRENGTHS),
 )
+"""Dasch, Appl. Opt. 31 (1992) 1146 (three-point, onion peeling); Hansen & Law, J. Opt. Soc. Am. A 2 (1985) 510;
+Dribinski et al., Rev. Sci. Instrum. 73 (2002) 2634 (BASEX); Daun et al., Appl. Opt. 45 (2006) 4638."""
 
 
 def attempts(
     peer: Peer, displacement: Float[Array, "row column 2"], view: ParallelView, n_ambient: float
 ) -> Iterator[tuple[str, Float[Array, "row n"]]]:
-    """Yield what a method finds with each of its options: the options in words, and the index excess.
-
-    Parameters
-    ----------
-    displacement : (row, column, 2), px
-    view : ParallelView
-    """
+    """Yield each set of options of a method, in words, and the index excess."""
     for smoothing in SMOOTHING:
         half = HalfView(displacement, view, n_ambient, smoothing)
         for value in peer.values:
@@ -232,7 +207,7 @@ def attempts(
 
 
 class Revolution:
-    """A map over rows and radii, turned around the axis onto a grid; ambient beyond the last pixel.
+    """Revolution of a map over rows and radii around the axis onto a grid; ambient beyond the last pixel.
 
     Parameters
     ----------
@@ -251,14 +226,14 @@ class Revolution:
         self.outward = _interpolation(radii, np.sqrt(unique) / view.pixel, order)
         self.upward = _interpolation(rows, view.horizon - (z - view.centre[2]) / view.pixel, order)
 
-    def __call__(self, found: Float[Array, "row n"]) -> Float[Array, "z y x"]:
+    def __call__(self, index_map: Float[Array, "row n"]) -> Float[Array, "z y x"]:
         """Return the volume of a map."""
-        values = self.upward @ found @ self.outward.T
+        values = self.upward @ index_map @ self.outward.T
         return values[:, self.places.ravel()].reshape(self.shape)
 
 
 def _interpolation(nodes: int, at: Float[Array, " m"], order: int) -> Float[Array, "m n"]:
-    """The matrix of interpolation between the nodes 0, 1, 2, ...; rows of 0 beyond them."""
+    """Matrix of interpolation between the nodes 0, 1, 2, ...; rows of 0 beyond them."""
     matrix = make_interp_spline(np.arange(nodes), np.eye(nodes), k=order)(at)
     matrix[(at < 0) | (at > nodes - 1)] = 0.0
     return matrix

@@ -1,38 +1,51 @@
-"""How well a rig is found from target images alone: nine rendered cameras with mild distortion, none quite in place.
+"""Calibration of a rendered rig.
 
-    python benchmarks/calibration.py --write benchmarks/results/calibration.md
-
-The rig: 640 x 512 px, lens of 50 mm on a 20 mm sensor, 700 mm to the middle, backgrounds 500 mm behind it; each
-camera is turned by about a degree, moved by some mm, its principal point off by some px, its background oblique.
-Errors are taken against the rig rendered: angle of rotation, largest component of the translation, largest distance
-between the planes anywhere in the image. `stated` is what nerif calibrate itself says of rotation and position.
+Nine cameras with mild distortion, calibrated from target images alone: 640 x 512 px, lens of 50 mm on a 20 mm sensor,
+700 mm to the middle, backgrounds 500 mm behind it. Each camera is turned by about a degree and displaced by
+millimetres, its principal point is off by pixels and its background is oblique. Errors are taken against the rendered
+rig, median and worst over the cameras: angle of rotation, largest component of the translation, position, largest
+distance between the background planes in the image. Stated: standard deviations by `nerif calibrate`.
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bench import Table, add_write
+from benchmarks.runner import Settings
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate
 from nerif.imaging.calibration.target_images import find_targets
 from nerif.imaging.readers.views import find_views
 from nerif.simulation.experiment import Experiment, background_scale, world_axes
 
-COLUMNS = ("camera", "images", "rms [px]", "rotation [deg]", "stated", "translation [mm]", "stated", "position [mm]",
-           "plane [mm]", "plane, rms [mm]")  # fmt: skip
+ERRORS = {"rotation": "deg", "rotation_stated": "deg", "translation": "mm", "translation_stated": "mm",
+"position": "mm",
+          "plane": "mm"}  # fmt: skip
+COLUMNS = {
+    "cameras": "{views}", "pixels": "{pixels}", "poses": "{poses}", "images": "{images}", "rms [px]": "{rms:.4f}",
+    **{f"{name.replace('_', ', ')} [{unit}]": f"{{{name}:.4f}}; {{{name}_worst:.4f}}" for name, unit in ERRORS.items()},
+    "rendered [s]": "{rendered:.0f}", "targets [s]": "{detected:.0f}", "calibrated [s]": "{adjusted:.0f}",
+}  # fmt: skip
+
+
+def cases(quick: bool) -> Iterator[Settings]:
+    yield {
+        "views": 2 if quick else 9, "arc": 20.0 if quick else 170.0, "pixels": 200 if quick else 640, "sensor": 20.0,
+        "poses": 6 if quick else 40, "backgrounds": 1 if quick else 5, "target": "charuco", "seed": 0,
+    }  # fmt: skip
 
 
 def rig(views: int, arc: float, pixels: int, sensor: float, seed: int) -> tuple[Camera, ...]:
-    """Cameras on a ring, none quite where it should be."""
+    """Return cameras on a ring with random errors of pose, lens and background."""
     rng = np.random.default_rng(seed)
     ring = Ring(views=views, arc=(0.0, arc), pixel_pitch=sensor / pixels, image_size=(pixels * 4 // 5, pixels))
 
@@ -47,83 +60,51 @@ def rig(views: int, arc: float, pixels: int, sensor: float, seed: int) -> tuple[
         k[1, 2] += rng.normal(0, 0.005 * pixels)
         k[0, 0] *= 1 + rng.normal(0, 0.01)
         k[1, 1] = k[0, 0] * (1 + rng.normal(0, 0.001))
-        cameras.append(
-            replace(
-                camera,
-                rotation=rotation,
-                translation=-rotation @ (camera.centre + torch.from_numpy(rng.normal(0, 5, 3))),
-                intrinsics=k,
-                background=Plane(turn(0.03) @ camera.plane.normal, -500.0 + float(rng.normal(0, 5))),
-                distortion=torch.tensor([-0.15, 0.1, 0.0005, -0.0004, 0.0], dtype=torch.float64),
-            )
-        )
+        changes: dict[str, Any] = {"rotation": rotation, "intrinsics": k}
+        changes["translation"] = -rotation @ (camera.centre + torch.from_numpy(rng.normal(0, 5, 3)))
+        changes["background"] = Plane(turn(0.03) @ camera.plane.normal, -500.0 + float(rng.normal(0, 5)))
+        changes["distortion"] = torch.tensor([-0.15, 0.1, 0.0005, -0.0004, 0.0], dtype=torch.float64)
+        cameras.append(replace(camera, **changes))
     return tuple(cameras)
 
 
-def between_planes(camera: Camera, normal: np.ndarray, offset: float) -> np.ndarray:
-    """Distance (mm) of a plane from the true background where the camera sees it."""
+def between_planes(camera: Camera, plane: Any) -> np.ndarray:
+    """Return the distances (mm) of a plane from the true background over the image."""
     height, width = camera.image_size
     pixels = torch.cartesian_prod(torch.linspace(0, width - 1, 9), torch.linspace(0, height - 1, 9)).double()
-    rays = camera.rays(pixels)
-    points = rays.end_points.numpy()
-    return points @ normal - offset
+    return camera.rays(pixels).end_points.numpy() @ np.array(plane.normal) - plane.offset
 
 
-def main() -> None:
-    """Run and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--views", type=int, default=9)
-    parser.add_argument("--arc", type=float, default=170.0, help="from the first camera to the last, degrees")
-    parser.add_argument("--pixels", type=int, default=640, help="width of the images")
-    parser.add_argument("--sensor", type=float, default=20.0, help="width of the sensor, mm")
-    parser.add_argument("--poses", type=int, default=40, help="target poses free in space")
-    parser.add_argument("--backgrounds", type=int, default=5, help="images of the target on each background")
-    parser.add_argument("--target", default="charuco")
-    parser.add_argument("--seed", type=int, default=0)
-    add_write(parser)
-    arguments = parser.parse_args()
-
-    cameras = rig(arguments.views, arguments.arc, arguments.pixels, arguments.sensor, arguments.seed)
+def measure(
+    folder: Path, views: int, arc: float, pixels: int, sensor: float, poses: int, backgrounds: int, target: str,
+    seed: int,
+) -> dict[str, Any]:  # fmt: skip
+    cameras = rig(views, arc, pixels, sensor, seed)
     experiment = Experiment(
-        target=arguments.target, columns=12, rows=9, poses=arguments.poses, backgrounds=arguments.backgrounds,
-        references=1, seed=arguments.seed,
+        target=target, columns=12, rows=9, poses=poses, backgrounds=backgrounds, references=1, seed=seed
     )  # fmt: skip
-    with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        experiment.write_targets(Path(folder), cameras)
-        rendered = time.perf_counter() - start
-        start = time.perf_counter()
-        target = experiment.target_for(cameras)
-        laid = target.scaled(background_scale(cameras))
-        views = find_views(Path(folder))
-        found = [find_targets(view, target, print, on_background=laid) for view in views]
-        detected = time.perf_counter() - start
-        start = time.perf_counter()
-        result = calibrate(found, CalibrationSettings(world="0", axes=world_axes(cameras)))
-        adjusted = time.perf_counter() - start
-    table = Table(
-        "Calibration of a rendered rig",
-        COLUMNS,
-        arguments.write,
-        f"; {target.kind} of {target.columns} x {target.rows}, pitch {target.pitch:.1f} mm; rendered in "
-        f"{rendered:.0f} s, targets found in {detected:.0f} s, adjusted in {adjusted:.0f} s; rms {result.rms():.4f} px",
-    )
-    worst = np.zeros(3)
+    times = [time.perf_counter()]
+    with tempfile.TemporaryDirectory(dir=folder) as images:
+        experiment.write_targets(Path(images), cameras)
+        times.append(time.perf_counter())
+        board = experiment.target_for(cameras)
+        large = board.scaled(background_scale(cameras))
+        corners = [find_targets(view, board, print, on_background=large) for view in find_views(Path(images))]
+        times.append(time.perf_counter())
+        result = calibrate(corners, CalibrationSettings(world="0", axes=world_axes(cameras)))
+        times.append(time.perf_counter())
     by_name = {c.name: c for c in cameras}
+    errors: dict[str, list[float]] = {name: [] for name in ERRORS}
     for i, name in enumerate(result.names):
         camera, pose, plane = by_name[name], result.poses[i], result.backgrounds[i]
-        rotation = np.degrees(Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude())
-        translation = np.abs(pose.translation - camera.translation.numpy()).max()
-        position = np.linalg.norm(pose.inverse.translation - camera.centre.numpy())
-        assert plane is not None
-        off = between_planes(camera, np.array(plane.normal), plane.offset)
-        worst = np.maximum(worst, (rotation, translation, np.abs(off).max()))
-        used = sum(e.used for e in result.errors if e.camera == name)
-        cells = [name, str(used), f"{result.rms(name):.4f}", f"{rotation:.4f}", f"{result.sigma_rotation[i]:.4f}"]
-        cells += [f"{translation:.3f}", f"{result.sigma_translation[i]:.3f}", f"{position:.3f}"]
-        table.row([*cells, f"{np.abs(off).max():.3f}", f"{np.sqrt((off**2).mean()):.3f}"])
-    table.text("", f"Worst: rotation {worst[0]:.4f} deg, translation {worst[1]:.3f} mm, plane {worst[2]:.3f} mm.")
-
-
-if __name__ == "__main__":
-    main()
+        rotation = Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude()
+        errors["rotation"].append(float(np.degrees(rotation)))
+        errors["rotation_stated"].append(float(result.sigma_rotation[i]))
+        errors["translation"].append(float(np.abs(pose.translation - camera.translation.numpy()).max()))
+        errors["translation_stated"].append(float(result.sigma_translation[i]))
+        errors["position"].append(float(np.linalg.norm(pose.inverse.translation - camera.centre.numpy())))
+        errors["plane"].append(float(np.abs(between_planes(camera, plane)).max()))
+    metrics = {name: float(np.median(values)) for name, values in errors.items()}
+    metrics |= {f"{name}_worst": max(values) for name, values in errors.items()}
+    metrics |= {"rms": result.rms(), "images": sum(e.used for e in result.errors)}
+    return metrics | dict(zip(("rendered", "detected", "adjusted"), np.diff(times).tolist(), strict=True))

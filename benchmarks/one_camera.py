@@ -1,34 +1,26 @@
-"""One camera and a flow with an axis: inverse Abel transforms, each with its best options, beside nerif.
+"""One camera and a flow with an axis.
 
-    python benchmarks/one_camera.py --write benchmarks/results/one-camera-cpu.md
-
-A camera sees a jet, a plume and an underexpanded jet through rays that are nearly parallel, or spread by a half field
-of view of 5 or 10 degrees. The transforms (abel_peers.py; they need PyAbel: pip install -c constraints.txt -e
-'.[benchmarks]') are given the axis and the geometry, and of their smoothing, regularisation and interpolation whatever
-comes nearest to the truth, draw by draw of the noise: more than a user has. nerif is given the same axis, and never the
-truth.
-
-L2 and L2 of the variation are over the volume that a map turns into around the axis, from 10 to 90 % of the height of
-the box: the simulated flow ends where the box does, which only a method that knows the box can tell.
+A jet, a plume and an underexpanded jet seen through rays that are nearly parallel, or spread by a half field of view
+of 5 or 10 degrees. The inverse Abel transforms (abel_peers.py, most of them PyAbel's) know axis and geometry; of
+their smoothing, regularisation and interpolation they get those nearest to the truth, for each draw of noise: more
+than a user has. NeRIF, Tikhonov and TV have the same axis and never the truth. L2 (L2 of the variation) are over the
+volume of revolution of a map, from 10 to 90 % of the height of the box: the simulated flow ends where the box does,
+which only a method that knows the box allows for.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import statistics
-import sys
-from dataclasses import dataclass
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-from abel_peers import ORDERS, PEERS, ParallelView, Peer, Revolution, attempts, pyabel
-from bench import N_AMBIENT, Table, add_write
+from benchmarks.abel_peers import ORDERS, PEERS, ParallelView, Peer, Revolution, attempts
+from benchmarks.runner import N_AMBIENT, Settings, Unavailable
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.analysis.metrics import volume_errors
-from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.base import Field
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Grid, Ring
@@ -41,150 +33,80 @@ from nerif.simulation.simulate import add_noise, simulate
 BOX = Box.cube(50.0)
 EVALUATED = Box((-25.0, -25.0, -20.0), (25.0, 25.0, 20.0))
 BACKGROUND, SENSOR = 500.0, 4.0  # axis to background, width of the sensor, mm
-OURS = ("NeRIF", "Tikhonov", "TV")
+NERIF = ("NeRIF", "Tikhonov", "TV")
+TITLES = [peer.title for peer in PEERS]
+COLUMNS = {
+    "phantom": "{phantom}", "noise": "{noise:g}", "half field of view": "{half_angle:g}°", "best peer": "{best}",
+    **{title: f"{{{title} l2:.3%}} ({{{title} variation:.1%}})" for title in (*TITLES, *NERIF)},
+    "L2, best peer over best of nerif": "{ratio:.2f}", "not run": "{unavailable}",
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Score:
-    """How near a method came.
-
-    Parameters
-    ----------
-    l2, variation : L2, and L2 of the variation
-    options : with which, in words
-    """
-
-    l2: float
-    variation: float
-    options: str = ""
+def cases(quick: bool) -> Iterator[Settings]:
+    size = {"pixels": 24, "voxels": 24, "seconds": 3.0} if quick else {"pixels": 100, "voxels": 100, "seconds": 20.0}
+    for phantom in ("gaussian-jet",) if quick else AXISYMMETRIC:
+        for half_angle in (5.0,) if quick else (1.0, 5.0, 10.0):
+            for noise in (0.05,) if quick else (0.02, 0.05, 0.15):
+                for seed in (0,) if quick else (0, 1, 2):
+                    yield {
+                        "phantom": phantom, "noise": noise, "half_angle": half_angle, **size, "device": "cpu",
+                        "seed": seed,
+                    }  # fmt: skip
 
 
 def camera_of(half_angle: float, pixels: int) -> Camera:
-    """Return a camera with a half field of view (degrees) so far away that it sees the box whole."""
+    """Return a camera with a half field of view (degrees) at the distance from which it sees the whole box."""
     tangent, edge = math.tan(math.radians(half_angle)), BOX.edges[0] / 2
     ring = Ring(
-        views=1,
-        arc=(0.0, 0.0),
-        focal_length=SENSOR / 2 / tangent,
-        pixel_pitch=SENSOR / pixels,
-        image_size=(pixels, pixels),
-        distance=edge + 1.04 * edge / tangent,
-        background_distance=BACKGROUND,
-    )
+        views=1, arc=(0.0, 0.0), focal_length=SENSOR / 2 / tangent, pixel_pitch=SENSOR / pixels,
+        image_size=(pixels, pixels), distance=edge + 1.04 * edge / tangent, background_distance=BACKGROUND,
+    )  # fmt: skip
     return ring.cameras()[0]
 
 
-def scored(truth: Volume, test: Any, options: str) -> Score:
-    """Return the score of a volume of index excess."""
-    errors = volume_errors(truth.values.numpy(), test, N_AMBIENT)
-    return Score(errors["l2"], errors["l2_variation"], options)
+def best_of(peer: Peer, measurement: Measurement, truth: Volume) -> tuple[float, float, str]:
+    """Return L2, L2 of the variation and options of a transform with the options nearest to the truth."""
+    view = ParallelView.of(measurement.cameras[0], BOX.centre)
+    maps = list(attempts(peer, measurement.displacements[0].numpy(), view, N_AMBIENT))
+    scores = []
+    for order, reading in ORDERS.items():
+        volume = Revolution(view, maps[0][1].shape, truth.grid, order)
+        for options, index_map in maps:
+            errors = volume_errors(truth.values.numpy(), volume(index_map), N_AMBIENT)
+            scores.append((errors["l2"], errors["l2_variation"], f"{options}, {reading}"))
+    return min(scores)
 
 
-def best_of(peer: Peer, measurement: Measurement, truth: Volume) -> Score:
-    """Return the score of a method with the options that come nearest to the truth."""
-    camera = measurement.cameras[0]
-    displacement, view = measurement.displacements[0].numpy(), ParallelView.of(camera, BOX.centre)
-    found = list(attempts(peer, displacement, view, N_AMBIENT))
-    best: list[Score] = []
-    for order, read in ORDERS.items():
-        turned = Revolution(view, found[0][1].shape, truth.grid, order)
-        best += (scored(truth, turned(map_), f"{options}, {read}") for options, map_ in found)
-    return min(best, key=lambda score: score.l2)
-
-
-def methods(time_limit: float, voxels: int, seed: int, device: str) -> dict[str, Reconstructor]:
-    """Return nerif's methods, held to the axis of the box."""
+def measure(
+    folder: Path, phantom: str, noise: float, half_angle: float, pixels: int, voxels: int, seconds: float,
+    device: str, seed: int,
+) -> dict[str, Any]:  # fmt: skip
+    field, grid = make_phantom(phantom, BOX), Grid.of_resolution(EVALUATED, voxels)
+    truth = Volume(field.sample(grid), grid)
+    measurement = add_noise(simulate(field, [camera_of(half_angle, pixels)], BOX, N_AMBIENT), noise, seed)
+    metrics: dict[str, Any] = {"unavailable": ""}
+    for peer in PEERS:
+        try:
+            l2, variation, options = best_of(peer, measurement, truth)
+            metrics |= {f"{peer.title} l2": l2, f"{peer.title} variation": variation, f"{peer.title} options": options}
+        except Unavailable as error:
+            metrics["unavailable"] = str(error)
     axis: dict[str, Any] = {"symmetry": "axis", "device": device}
-    return {
-        "NeRIF": NeRIF(time_limit=time_limit, seed=seed, **axis),
+    methods: dict[str, Reconstructor] = {
+        "NeRIF": NeRIF(time_limit=seconds, seed=seed, **axis),
         "Tikhonov": Tikhonov(voxels=voxels, **axis),
         "TV": TotalVariation(voxels=voxels, **axis),
     }
+    for name, method in methods.items():
+        errors = evaluate_volume(method(measurement).field, truth, N_AMBIENT, device)
+        metrics |= {f"{name} l2": errors["l2"], f"{name} variation": errors["l2_variation"]}
+    return metrics
 
 
-def ours(measurement: Measurement, asked: argparse.Namespace, seed: int) -> dict[str, Field]:
-    """Return the fields that nerif's methods find."""
-    found = methods(asked.time_limit, asked.voxels, seed, asked.device)
-    return {name: method(measurement).field for name, method in found.items() if name in asked.methods}
-
-
-def scores(clean: Measurement, truth: Volume, noise: float, seed: int, asked: argparse.Namespace) -> dict[str, Score]:
-    """Return the scores of all methods that are asked for, of one draw of noise."""
-    measurement = add_noise(clean, noise, seed)
-    found: dict[str, Score] = {}
-    if "peers" in asked.only:
-        found |= {peer.title: best_of(peer, measurement, truth) for peer in PEERS}
-    if "ours" in asked.only:
-        for name, field in ours(measurement, asked, seed).items():
-            errors = evaluate_volume(field, truth, N_AMBIENT, asked.device)
-            found[name] = Score(errors["l2"], errors["l2_variation"])
-    return found
-
-
-def median_of(draws: list[Score]) -> Score:
-    """Return the medians of several draws, with the options of the first."""
-    l2, variation = (statistics.median(values) for values in zip(*((s.l2, s.variation) for s in draws), strict=True))
-    return Score(l2, variation, draws[0].options)
-
-
-def cells(found: dict[str, Score]) -> list[str]:
-    """Return the cells of a row behind what was seen."""
-    peers = {name: score for name, score in found.items() if name not in OURS}
-    mine = [score for name, score in found.items() if name in OURS]
-    row = []
-    if peers:
-        best = min(peers, key=lambda name: peers[name].l2)
-        row.append(f"{best}; {peers[best].options}")
-    row += [f"{score.l2:.3%} ({score.variation:.1%})" for score in found.values()]
-    if peers and mine:
-        row.append(f"{peers[best].l2 / min(score.l2 for score in mine):.2f}")
-    return row
-
-
-def options() -> argparse.ArgumentParser:
-    """Return the options."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--phantom", nargs="+", default=list(AXISYMMETRIC), choices=list(AXISYMMETRIC))
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.02, 0.05, 0.15], help="share of the rms")
-    parser.add_argument("--half-angle", type=float, nargs="+", default=[1.0, 5.0, 10.0], help="degrees")
-    parser.add_argument("--pixels", type=int, default=100, help="of an edge of the image")
-    parser.add_argument("--seeds", type=int, default=3, help="of noise and training, whose median is shown")
-    parser.add_argument("--only", nargs="+", default=["peers", "ours"], choices=["peers", "ours"])
-    parser.add_argument("--methods", nargs="+", default=list(OURS), choices=OURS, help="of ours")
-    parser.add_argument("--time-limit", type=float, default=30.0, help="seconds for NeRIF")
-    parser.add_argument("--voxels", type=int, default=100, help="of Tikhonov and TV, along an edge")
-    parser.add_argument("--truth-voxels", type=int, default=100, help="of the truth, along an edge")
-    parser.add_argument("--device", default="cpu")
-    add_write(parser)
-    return parser
-
-
-def main() -> None:
-    """Run and print the table."""
-    asked = options().parse_args()
-    if "peers" in asked.only:
-        try:
-            pyabel()
-        except InputError as error:
-            sys.exit(f"one_camera: {error}; or --only ours")
-    grid = Grid.of_resolution(EVALUATED, asked.truth_voxels)
-    names = [peer.title for peer in PEERS] * ("peers" in asked.only) + [
-        name for name in OURS if "ours" in asked.only and name in asked.methods
-    ]
-    columns = ["phantom", "noise", "half field of view", *["best peer"] * ("peers" in asked.only), *names]
-    columns += ["L2, best peer over best of ours"] * (len(set(asked.only)) > 1)
-    title = f"One camera of {asked.pixels}² px, L2 (L2 of the variation), medians of {asked.seeds}"
-    table = Table(title, columns, asked.write)
-    for phantom in asked.phantom:
-        field = make_phantom(phantom, BOX)
-        truth = Volume(field.sample(grid), grid)
-        for half_angle in asked.half_angle:
-            clean = simulate(field, [camera_of(half_angle, asked.pixels)], BOX, N_AMBIENT)
-            for noise in asked.noise:
-                draws = [scores(clean, truth, noise, seed, asked) for seed in range(asked.seeds)]
-                found = {name: median_of([draw[name] for draw in draws]) for name in draws[0]}
-                table.row([phantom, f"{noise:g}", f"{half_angle:g}°", *cells(found)])
-
-
-if __name__ == "__main__":
-    main()
+def derive(rows: list[dict[str, Any]]) -> None:
+    for row in rows:
+        peers = {title: row[f"{title} l2"] for title in TITLES if f"{title} l2" in row}
+        if peers:
+            best = min(peers, key=lambda title: peers[title])
+            row["best"] = f"{best}; {row[f'{best} options']}"
+            row["ratio"] = peers[best] / min(row[f"{name} l2"] for name in NERIF)

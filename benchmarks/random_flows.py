@@ -1,24 +1,18 @@
-"""Flows drawn from a number alone, smooth and sharp, to set by them what is then tested on others."""
+"""Random flows, smooth and sharp, each from an integer; test cases of the verdict (measurements.py)."""
 
 from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from bench import N_AMBIENT
 from nerif.common.conventions import Points, Values, Vectors
-from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.turbulence import inertial_scalar
-from nerif.geometry import Box, Ring
-from nerif.simulation.simulate import simulate
-
-__all__ = ["Bodies", "RandomFlow", "random_flow"]
+from nerif.geometry import Box
 
 CONTRAST = 2.2e-4
 EDGE = 50.0  # mm
@@ -72,83 +66,36 @@ class Bodies(Field):
         return window * value, window[..., None] * (gradient + value[..., None] * fall)
 
 
-@dataclass(frozen=True)
-class RandomFlow:
-    """A flow, and how it is to be seen.
-
-    Parameters
-    ----------
-    number : from which all was drawn
-    truth : field
-    box : Box, mm
-    cloudy : whether it is a mottled Gaussian, and not bodies within fronts
-    views, pixels : how many, and along an edge of each
-    turn : of the ring of cameras, degrees
-    noise : of the rms displacement
-    f_number : 0 for pinholes
-    steps : of NeRIF
-    """
-
-    number: int
-    truth: Bodies
-    box: Box
-    cloudy: bool
-    views: int
-    pixels: int
-    turn: float
-    noise: float
-    f_number: float
-    steps: int
-
-    def measured(self) -> Measurement:
-        """Simulate what is measured of it."""
-        size, last = (self.pixels, self.pixels), 180 * (1 - 1 / self.views)
-        arc = (self.turn, self.turn + last)
-        ring = Ring(views=self.views, arc=arc, image_size=size, pixel_pitch=4.0 / self.pixels)
-        return simulate(self.truth, ring.cameras(self.f_number), self.box, N_AMBIENT, self.noise, seed=self.number)
+def random_flow(seed: int) -> tuple[Bodies, bool]:
+    """Return a random flow, and whether it is a mottled Gaussian rather than bodies within fronts."""
+    rng, box = random.Random(104_729 * seed + 7), Box.cube(EDGE)
+    cloudy = rng.random() < 0.5
+    longest = rng.uniform(0.2, 0.6)
+    if cloudy:
+        shortest = longest * math.exp(rng.uniform(math.log(0.05), math.log(0.5)))
+        scalar = inertial_scalar(box, seed, max(shortest, 0.02), longest, rng.uniform(1.0, 4.0))
+        places = _places(box, rng, rng.choice((1, 1, 2, 4)), (0.06, 0.12))
+        wrinkling = rng.choice((0.0, 0.4, 1.2))
+        return Bodies(box, scalar, *places, front=0.0, fade=1.0, wrinkling=wrinkling, thickness=1.0), True
+    shortest = longest * math.exp(rng.uniform(math.log(0.1), math.log(0.7)))
+    scalar = inertial_scalar(box, seed, max(shortest, 0.03), longest, rng.uniform(1.5, 4.0))
+    places = _places(box, rng, rng.choice((1, 1, 2, 3, 5)), (0.09, 0.2))
+    thickness = math.exp(rng.uniform(math.log(0.05), math.log(0.3)))
+    wrinkling = rng.choice((0.0, 0.1, 0.3))
+    return Bodies(box, scalar, *places, front=1.0, fade=0.0, wrinkling=wrinkling, thickness=thickness), False
 
 
-def random_flow(number: int) -> RandomFlow:
-    """Draw flow, rig and noise from a number."""
-    drawn = random.Random(104_729 * number + 7)
-    box = Box.cube(EDGE)
-    cloudy = drawn.random() < 0.5
-    field = _cloud(box, drawn, number) if cloudy else _fronts(box, drawn, number)
-    views, pixels = drawn.randint(5, 14), drawn.choice((36, 48))
-    noise = math.exp(drawn.uniform(math.log(0.02), math.log(0.2)))
-    f_number = drawn.choice((0.0, 0.0, 0.0, 5.6, 8.0, 16.0))
-    steps = round(math.exp(drawn.uniform(math.log(150), math.log(900))))
-    return RandomFlow(number, field, box, cloudy, views, pixels, drawn.uniform(0, 30), noise, f_number, steps)
-
-
-def _cloud(box: Box, drawn: random.Random, seed: int) -> Bodies:
-    longest = drawn.uniform(0.2, 0.6)
-    shortest = longest * math.exp(drawn.uniform(math.log(0.05), math.log(0.5)))
-    scalar = inertial_scalar(box, seed, max(shortest, 0.02), longest, drawn.uniform(1.0, 4.0))
-    where = _places(box, drawn, drawn.choice((1, 1, 2, 4)), (0.06, 0.12))
-    return Bodies(box, scalar, *where, front=0.0, fade=1.0, wrinkling=drawn.choice((0.0, 0.4, 1.2)), thickness=1.0)
-
-
-def _fronts(box: Box, drawn: random.Random, seed: int) -> Bodies:
-    longest = drawn.uniform(0.2, 0.6)
-    shortest = longest * math.exp(drawn.uniform(math.log(0.1), math.log(0.7)))
-    scalar = inertial_scalar(box, seed, max(shortest, 0.03), longest, drawn.uniform(1.5, 4.0))
-    where = _places(box, drawn, drawn.choice((1, 1, 2, 3, 5)), (0.09, 0.2))
-    thin = math.exp(drawn.uniform(math.log(0.05), math.log(0.3)))
-    return Bodies(box, scalar, *where, front=1.0, fade=0.0, wrinkling=drawn.choice((0.0, 0.1, 0.3)), thickness=thin)
-
-
-def _places(box: Box, drawn: random.Random, count: int, sizes: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres, shapes and amplitudes of bodies that stay off the sides; one in three reaches through bottom and top."""
-    generator = torch.Generator().manual_seed(drawn.randrange(1 << 30))
+def _places(box: Box, rng: random.Random, count: int, sizes: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres, shapes and amplitudes of bodies clear of the sides; one in three reaches through bottom and top."""
+    generator = torch.Generator().manual_seed(rng.randrange(1 << 30))
     centres, shapes = [], []
     for _ in range(count):
-        radius = [drawn.uniform(*sizes) * EDGE * min(1.0, 1.6 / count**0.5) for _ in range(3)]
+        radius = [rng.uniform(*sizes) * EDGE * min(1.0, 1.6 / count**0.5) for _ in range(3)]
         room = [0.5 * EDGE - 1.7 * max(radius[:2])] * 2 + [0.3 * EDGE]
-        if drawn.random() < 1 / 3:
+        if rng.random() < 1 / 3:
             radius[2] = 0.8 * EDGE
-        centre = [c + drawn.uniform(-1, 1) * max(r, 0.0) * 0.8 for c, r in zip(box.centre, room, strict=True)]
-        angle = drawn.uniform(0, math.pi)
+        centre = [c + rng.uniform(-1, 1) * max(r, 0.0) * 0.8 for c, r in zip(box.centre, room, strict=True)]
+        angle = rng.uniform(0, math.pi)
         turn = torch.tensor(
             [[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]]
         ).double()

@@ -1,167 +1,123 @@
-"""Frame by frame from nothing, and frame by frame from the one before: error, seconds.
+"""A film of a flame, frame by frame.
 
-    python benchmarks/sequence.py --write benchmarks/results/sequence-cpu.md
-    python benchmarks/sequence.py --device cuda --preset best --pixels 200 --write benchmarks/results/sequence-gpu.md
-
-A flame filmed from 9 and from 4 views. Seconds are those of a whole frame: training, sampling the volume, comparing
-with the views, writing. Errors and seconds are means over the last frames; warm starts reach them from a first frame
-with the most steps of those from nothing, so what they forget or pile up on the way counts. "Faster" is the time in
-which frames from nothing reach the same error (on the line between the two nearest, in logarithms; a bound where all of
-them are worse or better), over the time taken. "Change" is the difference of one frame from the next in the truth,
-of its variation. Truth and reconstruction meet only in the errors.
-Needs the extra `sequence`.
+9 and 4 views; every frame from nothing (cold), or from the frame before (warm). Seconds are those of a whole frame:
+training, sampling the volume, comparing with the views, writing. Errors and seconds are means over the last frames;
+warm frames begin with the best of the cold ones, so that what they accumulate counts. Faster: the time in which cold
+frames reach the same error (linear in logarithms between the two nearest; a bound outside of them), over the time
+taken. Change: difference between frames of the truth, of its variation. Needs the extra `sequence`.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import tempfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from bench import N_AMBIENT, Table, add_write
+from benchmarks.runner import N_AMBIENT, Settings
 from nerif.analysis.metrics import volume_errors
-from nerif.cli.commands.simulate import Simulate, instants
+from nerif.cli.commands.simulate import Simulate
 from nerif.cli.commands.simulate import run as simulate
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Ring
-from nerif.reconstruction.device import keep_freed_memory
-from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.neural.presets import preset as settings_of
 from nerif.simulation.simulate import Simulation
 from nerif.workflow.sequence.frames import reconstruct_frames
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.store import DONE, Frame, SequenceStore
 
-COLUMNS = (
-    "views", "s between frames", "change", "how", "steps a frame", "seconds a frame", "L2", "L2 of variation", "CC",
-    "faster",
-)  # fmt: skip
+COLUMNS = {
+    "views": "{views}", "s between frames": "{interval:g}", "change": "{change:.0%}", "start": "{start}",
+    "rate": "{rate:g}", "steps a frame": "{steps}", "seconds a frame": "{time:.2f}", "L2": "{l2:.3%}",
+    "L2 of variation": "{l2_variation:.2%}", "CC": "{cc:.5f}", "faster": "{faster}",
+}  # fmt: skip
+
+
+def cases(quick: bool) -> Iterator[Settings]:
+    size = {"frames": 9, "compared": 3, "pixels": 64, "noise": 0.05, "voxels": 64, "preset": "fast", "device": "auto"}
+    size |= {"frames": 2, "compared": 1, "pixels": 12, "voxels": 12} if quick else {}
+    cold, warm = ([5], [5]) if quick else ([250, 500, 1000], [80, 160, 320])
+    for views, interval in [(3, 1e-4)] if quick else itertools.product((9, 4), (2.5e-5, 5e-5, 1e-4)):
+        case = {"views": views, "interval": interval, **size}
+        for steps in cold:
+            yield case | {"start": "cold", "rate": 0.0, "steps": steps, "first": 0}
+        for steps in warm:
+            yield case | {"start": "warm", "rate": 0.7, "steps": steps, "first": max(cold)}
 
 
 def film(folder: Path, views: int, frames: int, pixels: int, interval: float, noise: float, voxels: int) -> Path:
-    """Simulate a film and return its path; the truth lies beside it."""
-    out = folder / f"film{views}-{interval:g}.zarr"
-    ring = Ring(views=views, image_size=(pixels, pixels), pixel_pitch=0.02 * 200 / pixels)
-    times = f"0:{(frames - 1) * interval}:{frames}"
-    assert len(instants(times)) == frames
-    simulation = Simulation(noise=noise, truth_voxels=voxels)
-    simulate(Simulate(out=out, times=times, simulation=simulation, ring=ring))
+    """Simulate a film once for all cases; the truth lies beside it."""
+    out = folder / f"film-{views}-{frames}-{pixels}-{interval:g}-{noise:g}-{voxels}.zarr"
+    if not out.exists():
+        ring = Ring(views=views, image_size=(pixels, pixels), pixel_pitch=0.02 * 200 / pixels)
+        simulation = Simulation(noise=noise, truth_voxels=voxels)
+        simulate(Simulate(out=out, times=f"0:{(frames - 1) * interval}:{frames}", simulation=simulation, ring=ring))
     return out
 
 
-def run(
-    film: Path, out: Path, cold: NeRIF, voxels: int, compared: int, first: SequenceStore | None = None, **changes: float
-) -> tuple[float, float, float, float]:
-    """Reconstruct a film; seconds a frame, and mean L2, L2 of the variation and CC of the last frames."""
-    sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
-    steps, rate = (changes.get(k, 0) for k in ("warm_steps", "warm_rate"))
-    settings = SequenceSettings(
-        chunk=len(sequence), warm_steps=int(steps) or 1, warm_rate=rate or 0.7, voxels=voxels,
-        quantities=("index_excess",),
-    )  # fmt: skip
+def begin(path: Path, out: Path, steps: int, settings: SequenceSettings, preset: str, device: str) -> SequencePlan:
+    """Return a plan of frames from nothing, its store written."""
+    sequence = MeasurementSequence.read(path)
+    cold = replace(settings_of(preset), device=device, max_steps=steps)
     cold = replace(cold, network=cold.resolved_by(sequence.fullest()).network, wave_pixels=0)
-    plan = SequencePlan(film, out, cold, settings)
-    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
-    last = range(len(sequence) - compared, len(sequence))
-    if first is not None:
-        store.write_frame(0, Frame(first.field(0), [first.volume(0, "index_excess")], [], 0.0, 0))
-        reconstruct_frames(plan, 0, len(sequence))
-    else:
-        for i in last:
-            reconstruct_frames(plan, i, i + 1)
-    assert all(store.status[i] == DONE for i in last), store.reasons
-    errors = [
-        volume_errors(
-            truth.volume(i, "index_excess").values.numpy(), store.volume(i, "index_excess").values.numpy(), N_AMBIENT
-        )
-        for i in last
-    ]
-    seconds = float(np.mean([store.array("seconds")[i] for i in last]))
-    l2, variation, cc = (float(np.mean([e[k] for e in errors])) for k in ("l2", "l2_variation", "cc"))
-    return seconds, l2, variation, cc
+    plan = SequencePlan(path, out, cold, settings)
+    grid = VolumeSequence(path.with_name(path.stem + ".truth.zarr")).grid
+    SequenceStore.begin(out, sequence, grid, settings.quantities, cold.network, plan.attributes)
+    return plan
 
 
-def first_frame(film: Path, out: Path, cold: NeRIF, voxels: int) -> SequenceStore:
-    """The frame that the warm starts begin with: from nothing."""
-    sequence, truth = MeasurementSequence.read(film), VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
-    settings = SequenceSettings(chunk=len(sequence), voxels=voxels, quantities=("index_excess",))
-    cold = replace(cold, network=cold.resolved_by(sequence.fullest()).network, wave_pixels=0)
-    plan = SequencePlan(film, out, cold, settings)
-    store = SequenceStore.begin(out, sequence, truth.grid, settings.quantities, cold.network, plan.kept)
-    reconstruct_frames(plan, 0, 1)
-    return store
+def measure(
+    folder: Path, views: int, interval: float, frames: int, compared: int, pixels: int, noise: float, voxels: int,
+    preset: str, device: str, start: str, rate: float, steps: int, first: int,
+) -> dict[str, Any]:  # fmt: skip
+    path = film(folder, views, frames, pixels, interval, noise, voxels)
+    settings = SequenceSettings(chunk=frames, voxels=voxels, quantities=("index_excess",))
+    if start == "warm":
+        settings = replace(settings, warm_steps=steps, warm_rate=rate)
+    last = range(frames - compared, frames)
+    truth = VolumeSequence(path.with_name(path.stem + ".truth.zarr"))
+
+    def values(i: int) -> np.ndarray:
+        return truth.volume(i, "index_excess").values.numpy()
+
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        plan = begin(path, Path(temporary) / "out.zarr", first or steps, settings, preset, device)
+        store = SequenceStore(plan.out)
+        if start == "warm":
+            cold = first_frame(path, folder, first, settings, preset, device)
+            store.write_frame(0, Frame(cold.field(0), [cold.volume(0, "index_excess")], [], 0.0, 0))
+            reconstruct_frames(plan, 0, frames)
+        else:
+            for i in last:
+                reconstruct_frames(plan, i, i + 1)
+        assert all(store.status[i] == DONE for i in last), store.reasons
+        errors = [volume_errors(values(i), store.volume(i, "index_excess").values.numpy(), N_AMBIENT) for i in last]
+        seconds = float(np.mean([store.array("seconds")[i] for i in last]))
+    changes = [volume_errors(values(i + 1), values(i), N_AMBIENT)["l2_variation"] for i in range(frames - 1)]
+    means = {name: float(np.mean([e[name] for e in errors])) for name in ("l2", "l2_variation", "cc")}
+    return {"time": seconds, "change": float(np.mean(changes)), **means}
 
 
-def change(film: Path) -> float:
-    """How far each frame is from the next, in the truth: relative to its variation."""
-    truth = VolumeSequence(film.with_name(film.stem + ".truth.zarr"))
-    frames = [truth.volume(i, "index_excess").values.numpy() for i in range(len(truth))]
-    return float(np.mean([volume_errors(b, a, N_AMBIENT)["l2_variation"] for a, b in itertools.pairwise(frames)]))
+def first_frame(
+    path: Path, folder: Path, steps: int, settings: SequenceSettings, preset: str, device: str
+) -> SequenceStore:
+    """Return the store of the frame that warm starts begin with, reconstructed once for all of them."""
+    out = folder / f"first-{path.stem}-{steps}.zarr"
+    if not out.exists():
+        reconstruct_frames(begin(path, out, steps, settings, preset, device), 0, 1)
+    return SequenceStore(out)
 
 
-def faster(seconds: float, error: float, cold: list[tuple[float, float]]) -> str:
-    """How many times longer frames from nothing, (seconds, error), take to the same error."""
-    if len(cold) < 2:
-        return "-"
-    cold = sorted(cold, key=lambda c: -c[1])
-    errors, times = np.log([c[1] for c in cold])[::-1], np.log([c[0] for c in cold])[::-1]
-    sign = ">" if error < cold[-1][1] else "<" if error > cold[0][1] else ""
-    return f"{sign} {np.exp(np.interp(np.log(error), errors, times)) / seconds:.1f}"
-
-
-def main() -> None:
-    """Run and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--views", type=int, nargs="+", default=[9, 4])
-    parser.add_argument("--frames", type=int, default=9)
-    parser.add_argument("--compared", type=int, default=3, help="last frames that errors and seconds are means of")
-    parser.add_argument(
-        "--interval", type=float, nargs="+", default=[2.5e-5, 5e-5, 1e-4], help="s, between frames (it rises at 15 m/s)"
-    )
-    parser.add_argument("--pixels", type=int, default=64)
-    parser.add_argument("--noise", type=float, default=0.05)
-    parser.add_argument("--voxels", type=int, default=64)
-    parser.add_argument("--preset", default="fast", choices=list(PRESETS))
-    parser.add_argument("--device", default="auto")
-    parser.add_argument("--cold", type=int, nargs="*", default=[250, 500, 1000], help="steps of a frame from nothing")
-    parser.add_argument("--warm", type=int, nargs="*", default=[80, 160, 320], help="steps of a frame from the last")
-    parser.add_argument("--warm-rate", type=float, nargs="*", default=[0.7])
-    add_write(parser)
-    arguments = parser.parse_args()
-    keep_freed_memory()
-    table = Table("A film of a flame", COLUMNS, arguments.write)
-    base = replace(preset(arguments.preset), device=arguments.device)
-    best = max([*arguments.cold, 1])
-    kinds: list[tuple[str, int, NeRIF, dict[str, float]]] = []
-    kinds += [("from nothing", n, replace(base, max_steps=n), {}) for n in arguments.cold]
-    for n, rate in itertools.product(arguments.warm, arguments.warm_rate):
-        changes = {"warm_steps": n, "warm_rate": rate}
-        kinds.append((f"from the one before, rate {rate:g}", n, replace(base, max_steps=best), changes))
-    with tempfile.TemporaryDirectory() as folder:
-        for views, interval in itertools.product(arguments.views, arguments.interval):
-            path = film(
-                Path(folder), views, arguments.frames, arguments.pixels, interval, arguments.noise, arguments.voxels
-            )
-            first = first_frame(
-                path, Path(folder) / "first.zarr", replace(base, max_steps=best), arguments.voxels
-            ) if arguments.warm else None  # fmt: skip
-            about, from_nothing = [str(views), f"{interval:g}", f"{change(path):.0%}"], []
-            for name, steps, cold, changes in kinds:
-                seconds, l2, variation, cc = run(
-                    path, Path(folder) / "out.zarr", cold, arguments.voxels, arguments.compared,
-                    first if "warm_steps" in changes else None, **changes,
-                )  # fmt: skip
-                if not changes:
-                    from_nothing.append((seconds, l2))
-                gain = faster(seconds, l2, from_nothing) if changes else "1"
-                cells = [*about, name, str(steps), f"{seconds:.2f}", f"{l2:.3%}", f"{variation:.2%}"]
-                table.row([*cells, f"{cc:.5f}", gain])
-
-
-if __name__ == "__main__":
-    main()
+def derive(rows: list[dict[str, Any]]) -> None:
+    for row in rows:
+        group = [r for r in rows if (r["views"], r["interval"]) == (row["views"], row["interval"])]
+        cold = sorted((r["l2"], r["time"]) for r in group if r["start"] == "cold" and "l2" in r)
+        if row["start"] == "warm" and len(cold) > 1 and "l2" in row:
+            errors, times = np.log(cold).T
+            sign = ">" if row["l2"] < cold[0][0] else "<" if row["l2"] > cold[-1][0] else ""
+            row["faster"] = f"{sign} {np.exp(np.interp(np.log(row['l2']), errors, times)) / row['time']:.1f}".strip()

@@ -57,7 +57,7 @@ def observable() -> Figure:
     cameras, box = paper_rig(24)
     field = make_phantom("gaussians", box, 0)
     measurement = add_noise(predict(field, cameras, box, 1.00027), 0.05, seed=1)
-    rig = Refinement.asked(measurement, ("cameras",), mm=0.5, deg=0.03)
+    rig = Refinement.for_measurement(measurement, ("cameras",), mm=0.5, deg=0.03)
     found, centre = covariance(rig, measurement, field, voxels=VOXELS), torch.tensor(box.centre, dtype=torch.float64)
     kinds = movements(tuple(cameras), centre)
     left = []

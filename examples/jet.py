@@ -2,10 +2,10 @@
 
     python examples/jet.py jet_reference.tif jet_flow.tif --out jet
 
-The images are of github.com/alexlib/OpticFlow-BOS (MIT). Where camera and background stood is not known: distances
-and scale below are plausible ones, so that the index is known up to a factor, and lengths up to another. The right half
-is held out and predicted from the left; then the whole image is reconstructed, from displacements and from the grey
-values themselves. Shock cells are told by their spacing, beside that of the displacement alone.
+The images are of github.com/alexlib/OpticFlow-BOS (MIT). The positions of camera and background are unknown: distances
+and scale below are plausible values, so the index is determined up to one factor and lengths up to another. The right
+half is withheld and predicted from the left; then the whole image is reconstructed, from displacements and from grey
+values. The spacing of the shock cells is compared with that of the displacement.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.report.meridian_figure import draw_centre_line, draw_section
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 
 HARMONICS = 3  # of a cell
 DRAWS = 200  # of the bootstrap
@@ -63,20 +64,20 @@ def spacing(h: np.ndarray, signal: np.ndarray, shortest: float, longest: float) 
         return values - a @ np.linalg.lstsq(a, values, rcond=None)[0]
 
     def best(values: np.ndarray, start: float) -> float:
-        found = least_squares(lambda x: left(x[0], values), [start], bounds=([shortest], [longest]), x_scale=start)
-        return float(found.x[0])
+        fit = least_squares(lambda x: left(x[0], values), [start], bounds=([shortest], [longest]), x_scale=start)
+        return float(fit.x[0])
 
     tried = np.linspace(shortest, longest, 400)
     length = best(signal, min(tried, key=lambda t: np.square(left(t, signal)).sum()))
     rest = left(length, signal)
     slow = signal - np.polyval(np.polyfit(h, signal, 2), h)
     block = max(1, round(BLOCK * length / (h[1] - h[0])))
-    random, drawn = np.random.default_rng(0), []
+    random, lengths = np.random.default_rng(0), []
     for _ in range(DRAWS):
         first = random.integers(0, len(h) - block, -(-len(h) // block))
         noise = np.concatenate([rest[i : i + block] for i in first])[: len(h)]
-        drawn.append(best(signal - rest + noise, length))
-    return Spacing(length, float(np.std(drawn)), 1 - float(np.var(rest) / np.var(slow)))
+        lengths.append(best(signal - rest + noise, length))
+    return Spacing(length, float(np.std(lengths)), 1 - float(np.var(rest) / np.var(slow)))
 
 
 def measure(folder: Path, rig: SimpleRig, background_distance: float) -> Measurement:
@@ -90,14 +91,14 @@ def measure(folder: Path, rig: SimpleRig, background_distance: float) -> Measure
 
 def correlations(directory: Path) -> dict[str, tuple[float, float]]:
     """Return how predicted and measured displacements correlate over each half that a result shows, u and v."""
-    shown = ResultDirectory(directory).reprojection()
-    measurement, found = shown.measurement, {}
+    reprojection = ResultDirectory(directory).reprojection()
+    measurement, scores = reprojection.measurement, {}
     usable = measurement.usable_for(measurement.observations[0]) & measurement.sees_box
     for view, name in enumerate(measurement.names):
-        pairs = torch.stack([measurement.displacements, shown.maps["deflection"]])[:, view, usable[view]]
+        pairs = torch.stack([measurement.displacements, reprojection.maps["deflection"]])[:, view, usable[view]]
         u, v = (float(torch.corrcoef(pairs[..., c])[0, 1]) for c in range(2))
-        found[name] = (u, v)
-    return found
+        scores[name] = (u, v)
+    return scores
 
 
 def cells(out: Path, measurement: Measurement, shortest: float, longest: float) -> None:
@@ -105,18 +106,18 @@ def cells(out: Path, measurement: Measurement, shortest: float, longest: float) 
     for name in ("displacements", "images"):
         meridian = ResultDirectory(out / name).read().meridian
         assert meridian is not None
-        told = spacing(meridian.h, meridian.quantities["index_excess"][:, 0], shortest, longest)
-        print(f"shock cells by the field from {name}: {told.length:.2f} +- {told.sigma:.2f} mm "
-              f"({told.explained:.0%} of what varies on the axis)")  # fmt: skip
+        estimate = spacing(meridian.h, meridian.quantities["index_excess"][:, 0], shortest, longest)
+        print(f"shock cells by the field from {name}: {estimate.length:.2f} +- {estimate.sigma:.2f} mm "
+              f"({estimate.explained:.0%} of what varies on the axis)")  # fmt: skip
     axis, camera = ResultDirectory(out / "displacements").metrics()["axis"]["symmetry"], measurement.cameras[0]
     h = np.linspace(measurement.box.lower[2], measurement.box.upper[2], camera.image_size[0])
     points = torch.tensor(axis["point"]) + torch.from_numpy(h)[:, None] * torch.tensor(axis["frame"][2])
     column, row = camera.project(points.to(camera.intrinsics)).round().long().unbind(-1)
     beside = round(ON_AXIS * camera.image_size[1] / 2)
-    seen = measurement.displacements[0].nan_to_num()
-    rows = [float(seen[r, c - beside : c + beside + 1, 1].mean()) for r, c in zip(row, column, strict=True)]
-    told = spacing(h, np.array(rows), shortest, longest)
-    print(f"shock cells by the displacement along the axis: {told.length:.2f} +- {told.sigma:.2f} mm")
+    displacement = measurement.displacements[0].nan_to_num()
+    rows = [float(displacement[r, c - beside : c + beside + 1, 1].mean()) for r, c in zip(row, column, strict=True)]
+    estimate = spacing(h, np.array(rows), shortest, longest)
+    print(f"shock cells by the displacement along the axis: {estimate.length:.2f} +- {estimate.sigma:.2f} mm")
 
 
 def draw(out: Path) -> Path:
@@ -138,7 +139,7 @@ def draw(out: Path) -> Path:
                 axes.imshow(image, vmin=-limit, vmax=limit, cmap="RdBu_r")
                 axes.set_title(f"{'uv'[c]} {title}")
                 axes.label_outer()
-        grid[1, 1].set_xlabel("right half not seen")
+        grid[1, 1].set_xlabel("right half withheld")
         section, line = right.subplots(2, 1, height_ratios=(1.9, 1.0))
         meridian = whole.meridian
         assert meridian is not None
@@ -160,26 +161,28 @@ def main() -> None:
     parser.add_argument("--mm-per-px", type=float, default=0.1, help="in the plane of the axis; a guess")
     parser.add_argument("--seconds", type=float, default=90.0, help="of each reconstruction")
     parser.add_argument("--cells", type=float, nargs=2, default=(10.0, 40.0), help="mm between which a cell is sought")
-    asked = parser.parse_args()
-    folder = asked.out / "images_taken"
-    for kind, path in (("reference", asked.reference), ("flow", asked.flow)):
+    arguments = parser.parse_args()
+    folder = arguments.out / "images_taken"
+    for kind, path in (("reference", arguments.reference), ("flow", arguments.flow)):
         (folder / "camera" / kind).mkdir(parents=True, exist_ok=True)
         shutil.copy(path, folder / "camera" / kind / path.name)
-    rig = SimpleRig(distance=asked.distance, mm_per_px=asked.mm_per_px)
-    measurement = measure(folder, rig, asked.background_distance)
-    measurement.write(asked.out / "jet.nc")
-    method = NeRIF(symmetry="axis", open_faces=("z-", "z+"), time_limit=asked.seconds, source="displacements")
+    rig = SimpleRig(distance=arguments.distance, mm_per_px=arguments.mm_per_px)
+    measurement = measure(folder, rig, arguments.background_distance)
+    measurement.write(arguments.out / "jet.nc")
+    method = NeRIF(symmetry="axis", open_faces=("z-", "z+"), time_limit=arguments.seconds, source="displacements")
     for name, settings, run in (
         ("half", method, Run(withhold=("right",))),
         ("displacements", method, Run()),
         ("images", replace(method, source="images"), Run(withhold=("none",))),
     ):
         print(f"-- {name}")
-        reconstruct_into(asked.out / name, asked.out / "jet.nc", settings, run, force=True, monitor=Monitor(print))
-    for name, (u, v) in correlations(asked.out / "half").items():
+        reconstruct_into(
+            arguments.out / name, arguments.out / "jet.nc", settings, run, force=True, monitor=Monitor(print)
+        )
+    for name, (u, v) in correlations(arguments.out / "half").items():
         print(f"{name}: predicted against measured displacement, correlation u {u:.3f}, v {v:.3f}")
-    cells(asked.out, measurement, *asked.cells)
-    print(f"{draw(asked.out)}: measured, predicted, section, axis")
+    cells(arguments.out, measurement, *arguments.cells)
+    print(f"{draw(arguments.out)}: measured, predicted, section, axis")
 
 
 if __name__ == "__main__":

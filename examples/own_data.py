@@ -2,7 +2,7 @@
 
     python examples/own_data.py mine.nc
 
-Here the arrays are made up (two cameras that see a hot column). Put yours in their place; docs/conventions.md tells the
+Here the arrays are made up (two cameras that see a hot column). Put yours in their place; docs/conventions.md defines
 frames and signs, and `nerif info mine.nc` shows whether the file holds what you mean.
 """
 

@@ -2,7 +2,7 @@
 
     python examples/particles.py out/particles
 
-Images and flow are made up here, so that there is a truth to compare with. With images of your own, start from a
+Images and flow are simulated, so the truth is available for comparison. With images of your own, start from a
 Measurement of emission for each instant (docs/formats.md).
 """
 
@@ -38,32 +38,32 @@ seconds, voxel = 1e-3, 0.1
 ring = VortexRing.within(box, arguments.displacement * voxel / seconds)
 before = Particles.draw(box, round(arguments.per_pixel * arguments.pixels**2), seed=0)
 after = ring.advect(before, seconds)
-seen = [images(particles, cameras, seed=i) for i, particles in enumerate((before, after))]
-for name, measurement in zip(("before", "after"), seen, strict=True):
+measurements = [images(particles, cameras, seed=i) for i, particles in enumerate((before, after))]
+for name, measurement in zip(("before", "after"), measurements, strict=True):
     measurement.write(arguments.out / f"{name}.nc")
 
 # Voxels of about a pixel; of the truth nothing is used.
 voxels = round(max(box.edges) / voxel)
 grid = Grid.of_resolution(box, voxels)
 method = MART(voxels=voxels, basis="linear")
-volumes = [method(measurement).volume(grid) for measurement in seen]
+volumes = [method(measurement).volume(grid) for measurement in measurements]
 velocity = velocity_between(*volumes, seconds, arguments.window)
 
 # How good it is.
 quality = quality_factor(volumes[0].values, before.volume(grid).values)
 truth = ring.velocity(velocity.points.reshape(-1, 3)).reshape(velocity.points.shape)
 error = velocity.rms_error(truth) / voxel
-print(f"Q {quality:.3f}, rms error {error:.3f} voxel a component, found at {velocity.valid.double().mean():.0%}")
+print(f"Q {quality:.3f}, rms error {error:.3f} voxel a component, valid at {velocity.valid.double().mean():.0%}")
 
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
-left.imshow(seen[0].maps["radiance"][0].numpy(), cmap="gray")
+left.imshow(measurements[0].maps["radiance"][0].numpy(), cmap="gray")
 left.set_title("one of four images")
 extent = (box.lower[1], box.upper[1], box.lower[2], box.upper[2])
 middle.imshow(volumes[0].values[:, :, grid.shape[2] // 2].numpy(), cmap="gray", origin="lower", extent=extent)
 middle.set_title("middle of the volume")
 plane = velocity.points.shape[2] // 2
 _, y, z = velocity.points[:, :, plane].numpy().transpose(2, 0, 1)
-for values, colour, name in ((truth, "0.7", "truth"), (velocity.values, "tab:blue", "found")):
+for values, colour, name in ((truth, "0.7", "truth"), (velocity.values, "tab:blue", "reconstructed")):
     _, v, w = values[:, :, plane].numpy().transpose(2, 0, 1)
     right.quiver(y, z, v, w, color=colour, angles="xy", scale_units="xy", scale=float(truth.norm(dim=-1).max()),
                  label=name)  # fmt: skip

@@ -17,7 +17,7 @@ def detection(
     camera: Camera, target: CalibrationTarget, pose: Pose, noise: float, rng: np.random.Generator
 ) -> Detection:
     """The points of a target inside the image of a camera."""
-    pixels = camera.project(torch.from_numpy(pose.moved(target.points))).numpy()
+    pixels = camera.project(torch.from_numpy(pose.apply(target.points))).numpy()
     height, width = camera.image_size
     inside = np.flatnonzero((pixels > 0).all(axis=1) & (pixels < (width - 1, height - 1)).all(axis=1))
     return Detection(inside, pixels[inside] + noise * rng.standard_normal((len(inside), 2)), target.points[inside])

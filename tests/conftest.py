@@ -23,8 +23,8 @@ from jaxtyping import install_import_hook
 
 CHECKED = ("common.conventions", "geometry", "fields", "data", "physics", "imaging", "simulation", "analysis", "report")
 CHECKED += ("forward.path_integral", "forward.ray_tracing", "workflow.sequence")
-# what Numba compiles stays as it is written; schedule and watch hold no array, and are asked many times a step
-UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "schedule", "watch")
+# what Numba compiles stays as it is written; schedule holds no array, and is asked many times a step
+UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "schedule")
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 SOLVERS = [p for p in (SOURCE / "reconstruction").rglob("[!_]*.py") if p.stem not in UNCHECKED]
 CHECKED += tuple(".".join(p.relative_to(SOURCE).with_suffix("").parts) for p in SOLVERS)
@@ -36,7 +36,7 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
 from nerif.reconstruction.neural import schedule
-from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.simulation.simulate import simulate
 
@@ -98,7 +98,7 @@ def checked_steps() -> Iterator[None]:
         return run_checked_once
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Training, "run", checked_once(Training.run))
+        patch.setattr(Trainer, "run", checked_once(Trainer.run))
         patch.setattr(VoxelReconstructor, "__call__", checked_once(VoxelReconstructor.__call__))
         yield
 

@@ -129,5 +129,13 @@ def test_jet(tmp_path):
 
 
 def test_examples_are_all_tested():
-    tested = {"own_data.py", "from_images.py", "knocked_camera.py", "particles.py", "spray.py", "jet.py"}
+    tested = {
+        "nerif_in_one_page.py",
+        "own_data.py",
+        "from_images.py",
+        "knocked_camera.py",
+        "particles.py",
+        "spray.py",
+        "jet.py",
+    }
     assert {p.name for p in EXAMPLES.glob("*.py")} == tested

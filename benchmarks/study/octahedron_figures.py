@@ -10,13 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.study.resolution import SIZE, Resolution
 from nerif.plotting.drawing import COLOURS, colour_range
-from study.resolution import SIZE, Resolution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-__all__ = ["draw_distribution", "draw_edge_spread"]
 
 
 def draw_edge_spread(axes: Axes, resolution: Resolution, label: str = "", colour: str = COLOURS["blue"]) -> Axes:
@@ -34,8 +32,7 @@ def draw_edge_spread(axes: Axes, resolution: Resolution, label: str = "", colour
 def draw_distribution(axes: Axes, resolution: Resolution, limits: tuple[float, float] | None = None) -> Axes:
     """Draw the resolution on the eight faces, unfolded side by side: x+ y+ first, those of z+ above.
 
-    The colour bar is in lp/unit; a patch that is finer than the samples can tell is grey. The triangles drawn around
-    the patches are the whole faces.
+    The colour bar is in lp/unit; a patch finer than the samples resolve is grey. The outlines are the whole faces.
     """
     from matplotlib import colormaps
     from matplotlib.collections import PolyCollection
@@ -49,10 +46,10 @@ def draw_distribution(axes: Axes, resolution: Resolution, limits: tuple[float, f
     axes.add_collection(PolyCollection(list(outlines), facecolors="none", edgecolors=COLOURS["grey"], linewidths=0.8))
     values = resolution.local_lp_per_unit.numpy()
     low, high = limits or colour_range(values)
-    drawn = PolyCollection(list(patches), array=values, edgecolors="face")
-    drawn.set_cmap(colormaps["viridis"].with_extremes(bad="0.7"))
-    drawn.set_clim(low, high)
-    axes.add_collection(drawn)
+    collection = PolyCollection(list(patches), array=values, edgecolors="face")
+    collection.set_cmap(colormaps["viridis"].with_extremes(bad="0.7"))
+    collection.set_clim(low, high)
+    axes.add_collection(collection)
     for face, sign in zip(outlines, signs.int().tolist(), strict=True):
         name = " ".join(f"{axis}{'+' if s > 0 else '-'}" for axis, s in zip("xyz", sign, strict=True))
         middle, tip = face[:, 0].mean(), face[2, 1]
@@ -67,7 +64,7 @@ def draw_distribution(axes: Axes, resolution: Resolution, limits: tuple[float, f
     axes.set_ylabel("up the faces [mm]")
     beyond = (bool((values < low).any()), bool((values > high).any()))
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
-    bar = axes.figure.colorbar(drawn, ax=axes, shrink=0.9, pad=0.02, extend=extend)
+    bar = axes.figure.colorbar(collection, ax=axes, shrink=0.9, pad=0.02, extend=extend)
     bar.set_label("resolution, MTF at 10 % [lp/unit]")
     return axes
 

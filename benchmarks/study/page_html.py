@@ -11,8 +11,6 @@ from markdown_it import MarkdownIt
 
 from nerif.report.html import ASSETS
 
-__all__ = ["render"]
-
 STYLE = """
 body { max-width: 1240px; padding-top: 18px; }
 h1 { margin: .2em 0 .5em; } h2 { margin: 2.4em 0 .5em; padding-top: .5em; border-top: 2px solid var(--line); }
@@ -38,7 +36,7 @@ figcaption { color: var(--soft); font-size: .9rem; margin-top: .3em; }
 @media (max-width: 900px) { #claims + p + .scroll td:nth-child(3) { min-width: 12em; } }
 @media print { nav { display: none; } h2 { break-after: avoid; } figure, tr { break-inside: avoid; } }
 """
-"""What the page has beside the style sheet of a report."""
+"""Beyond the style sheet of a report."""
 
 
 def render(text: str, images: Mapping[str, str]) -> str:
@@ -46,8 +44,8 @@ def render(text: str, images: Mapping[str, str]) -> str:
 
     Parameters
     ----------
-    text : Markdown; raw HTML in it is shown as it stands
-    images : what to put in the place of the addresses of its images, data: URIs
+    text : Markdown; raw HTML in it is shown literally
+    images : data: URIs by the addresses of its images
     """
     parser: Any = MarkdownIt("commonmark", {"html": False}).enable("table")
     parser.validateLink = lambda address: address.startswith(("https://arxiv.org/", "figures/"))
@@ -73,7 +71,7 @@ def render(text: str, images: Mapping[str, str]) -> str:
 
 
 def _dress(body: str, contents: str) -> str:
-    """Wide tables scroll by themselves, figures get their captions, verdicts their colours; contents after the head."""
+    """Let wide tables scroll; add captions of figures, colours of verdicts, and contents after the head."""
     body = body.replace("<table>", '<div class="scroll" tabindex="0"><table>').replace("</table>", "</table></div>")
     body = re.sub(
         r"<p>(<img [^>]*>)</p>\s*<p><em>(.*?)</em></p>", r"<figure>\1<figcaption>\2</figcaption></figure>", body

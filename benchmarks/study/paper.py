@@ -1,21 +1,6 @@
-"""What the paper reports, to stand beside what is measured here.
-
-Source: He et al., arXiv:2409.14722, Tables III (correlation) and IV (L2), Sec. IV and Apps. A and D.
-"""
+"""The paper's results: He et al., arXiv:2409.14722, Tables III (correlation) and IV (L2), Sec. IV and Apps. A and D."""
 
 from __future__ import annotations
-
-__all__ = [
-    "COLUMNS",
-    "CORRELATION",
-    "L2",
-    "MEMORY_GB",
-    "MINUTES",
-    "MTF_CUTOFF",
-    "NETWORK_LOSS",
-    "RESOLUTION",
-    "paper_value",
-]
 
 COLUMNS = ("NeRIF 0", "NeRIF 0.1", "NeRIF 0.15", "Tikhonov", "Landweber")
 """Method and noise of the columns of both tables; the voxel methods were run without noise."""
@@ -42,14 +27,13 @@ L2: dict[str, tuple[float, ...]] = {
 }
 """By phantom, |n_gt - n_rec| / |n_gt - 1|."""
 
-RESOLUTION = 61.58  # line pairs per unit, a unit being a quarter of the edge of the phantom's box
-MTF_CUTOFF = 0.1
+RESOLUTION = 61.58  # line pairs per unit, at an MTF of 10 %; a unit is a quarter of the edge of the phantom's box
 MINUTES = {"NeRIF": 20, "Tikhonov": 600, "Landweber": 600}  # "just over 20 minutes", "over 10 hours"
 MEMORY_GB = {"NeRIF": 10, "Tikhonov": 184, "Landweber": 184}  # on the GPU; the matrix alone, over 400 GB in between
 NETWORK_LOSS = {"multi-head": 0.07, "plain": 0.8}  # mean loss, App. A
 
 
 def paper_value(table: dict[str, tuple[float, ...]], phantom: str, method: str, noise: float) -> float | None:
-    """Return what the paper has for a phantom, method and noise, or None."""
+    """Return the paper's value for a phantom, method and noise, or None."""
     column = f"NeRIF {noise:g}" if method == "NeRIF" else method if noise == 0 else ""
     return table[phantom][COLUMNS.index(column)] if phantom in table and column in COLUMNS else None

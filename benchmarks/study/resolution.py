@@ -5,7 +5,7 @@ along N and g the true step sqrt(3) amplitude / unit,
 
     ESF(t) = N . grad n(t) / g
 
-and the resolution is that of its modulation transfer function (nerif.analysis.resolution). How the profiles are taken:
+and the resolution is that of its modulation transfer function (benchmarks.study.mtf). The profiles:
 
 - All have one half length L, so that places can be compared. They stand on the part of a face where they end a margin
   (0.05 units) before the planes x, y, z = 0, beyond which the gradient steps again: |x|, |y|, |z| >= L / sqrt(3) +
@@ -14,7 +14,7 @@ and the resolution is that of its modulation transfer function (nerif.analysis.r
 - Where the whole phantom is blurred, the steps beyond the ends come in as well: 2 % at sigma = L / 4, 5 % (single
   patches 8 %) at L / 3.
 - Profiles are averaged over a patch, or over all faces, before they are differentiated; the scatter of neighbouring
-  patches shows how much noise is left.
+  patches shows how much noise remains.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.analysis.resolution import COARSEST, MTF
+from benchmarks.study.mtf import COARSEST, MTF
 from nerif.common.conventions import InputError
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.phantoms import Octahedron
-
-__all__ = ["SIZE", "Resolution", "measure_resolution"]
+from nerif.geometry import Camera
 
 SIZE = 1.5  # units from the centre of the octahedron to its corners
 MARGIN = 0.05  # units
@@ -44,7 +44,7 @@ class Resolution:
 
     Parameters
     ----------
-    unit : mm
+    unit : mm; a quarter of the shortest edge of the box
     half_length : L of the profiles, mm
     distance : (t,) from the face, outward, mm
     edge_spread : (t,) ESF averaged over all faces, 1; the truth is -1 inside and 0 outside
@@ -63,12 +63,11 @@ class Resolution:
 
     @property
     def lp_per_mm(self) -> float:
-        """Of the profile averaged over all faces, line pairs per mm."""
+        """Of the profile averaged over all faces."""
         return float(self.mtf.resolution)
 
     @property
     def lp_per_unit(self) -> float:
-        """Line pairs per unit of the paper, a quarter of the shortest edge of the box."""
         return self.lp_per_mm * self.unit
 
     @property
@@ -78,12 +77,11 @@ class Resolution:
 
     @property
     def local_lp_per_unit(self) -> Float[Tensor, " k"]:
-        """Line pairs per unit at every patch."""
         return self.local_lp_per_mm * self.unit
 
     @property
     def coarsest(self) -> float:
-        """What the window alone has, lp/unit; nothing coarser can be found."""
+        """Resolution of the window alone, a lower bound, lp/unit."""
         return COARSEST / self.half_length * self.unit
 
     @property
@@ -99,47 +97,32 @@ class Resolution:
 
 @torch.no_grad()
 def measure_resolution(
-    field: Field,
-    phantom: Octahedron,
-    half_length: float = 0.4,
-    patches: int = 4,
-    points: int = 4,
-    samples: int = 256,
-    device: torch.device | str = "cpu",
-) -> Resolution:
+    field: Field, phantom: Octahedron, half_length: float = 0.4, patches: int = 4, points: int = 4,
+    samples: int = 256, device: torch.device | str = "cpu",
+) -> Resolution:  # fmt: skip
     """Measure the spatial resolution of a reconstruction of the octahedron.
 
     Parameters
     ----------
-    field : the reconstruction
-    phantom : what was to be reconstructed
     half_length : L, units
     patches : every face is split into patches^2 triangles of equal size
     points : every such triangle has points^2 profiles, evenly spread
     samples : per unit, along a profile; their Nyquist frequency is samples / 2 lp/unit
-    device : where the field is
-
-    Raises
-    ------
-    InputError
-        If no place of a face has room for a profile of that length, or a count is not positive.
     """
     longest = math.sqrt(3) * (SIZE / 3 - MARGIN)
     if not 0 < half_length < longest:
-        raise InputError(
-            f"half_length: expected 0 to {longest:.2f} units, got {half_length}; it must fit the octahedron"
-        )
+        raise InputError(f"expected 0 to {longest:.2f} units, got {half_length}", field="half_length")
     if min(patches, points) < 1 or samples * half_length < 4:
+        counts = f"{patches}, {points} and {samples * half_length:g}"
         raise InputError(
-            "expected patches and points of at least 1 and at least 4 samples in half_length, "
-            f"got {patches}, {points} and {samples * half_length:g}"
+            f"expected patches and points >= 1 and 4 samples in half_length, got {counts}", field="samples"
         )
     unit = phantom.unit
     triangles = _split(_inner_faces(phantom, half_length), patches)
     places = _split(triangles, points).mean(dim=1)
     normals = (places - places.new_tensor(phantom.box.centre)).sign() / math.sqrt(3)
     count = round(samples * half_length)
-    # half a sample off the face, so that rounding does not decide on which side of the step one lies
+    # half a sample off the face, so that rounding does not decide the side of the step
     distance = (torch.arange(-count, count, dtype=torch.float64) + 0.5) * (unit / samples)
 
     true_step = math.sqrt(3) * phantom.amplitude / unit
@@ -163,7 +146,7 @@ def measure_resolution(
 
 
 def _inner_faces(phantom: Octahedron, half_length: float) -> Float[Tensor, "8 3 3"]:
-    """Corners (mm) of what remains of each face where profiles of that half length (units) have room."""
+    """Corners (mm) of the part of each face where profiles of that half length (units) fit."""
     least = half_length / math.sqrt(3) + MARGIN
     corners = torch.full((3, 3), least, dtype=torch.float64)
     corners.fill_diagonal_(SIZE - 2 * least)
@@ -179,3 +162,49 @@ def _split(triangles: Float[Tensor, "k 3 3"], n: int) -> Float[Tensor, "m 3 3"]:
     along = torch.tensor(upright + turned, dtype=triangles.dtype) / n
     weights = torch.cat([1 - along.sum(-1, keepdim=True), along], dim=-1)  # of the three corners
     return torch.einsum("pcb,kbx->kpcx", weights, triangles).reshape(-1, 3, 3)
+
+
+def to_plain(resolution: Resolution) -> dict[str, Any]:
+    """Return a Resolution as numbers and lists for JSON."""
+    return {
+        "lp_per_mm": resolution.lp_per_mm,
+        "lp_per_unit": resolution.lp_per_unit,
+        "coarsest_lp_per_unit": resolution.coarsest,
+        "finest_lp_per_unit": float(resolution.mtf_per_unit.frequency[-1]),
+        "unit_mm": resolution.unit,
+        "half_length_mm": resolution.half_length,
+        "distance_mm": resolution.distance.tolist(),
+        "edge_spread": resolution.edge_spread.tolist(),
+        "frequency_lp_per_mm": resolution.mtf.frequency.tolist(),
+        "mtf": resolution.mtf.transfer.tolist(),
+        "patches_mm": resolution.patches.tolist(),
+        "local_lp_per_mm": resolution.local_lp_per_mm.tolist(),
+    }
+
+
+def from_plain(plain: dict[str, Any]) -> Resolution:
+    """Return the Resolution of `to_plain`; None is NaN."""
+
+    def numbers(name: str) -> Tensor:
+        values = plain[name]
+        if values and not isinstance(values[0], list):
+            values = [math.nan if v is None else v for v in values]
+        return torch.tensor(values, dtype=torch.float64)
+
+    return Resolution(
+        unit=plain["unit_mm"],
+        half_length=plain["half_length_mm"],
+        distance=numbers("distance_mm"),
+        edge_spread=numbers("edge_spread"),
+        mtf=MTF(numbers("frequency_lp_per_mm"), numbers("mtf")),
+        patches=numbers("patches_mm"),
+        local_lp_per_mm=numbers("local_lp_per_mm"),
+    )
+
+
+def pixels_per_unit(camera: Camera, phantom: Octahedron) -> float:
+    """Return pixels per unit of the phantom at the centre of the box: the geometric mean along columns and rows."""
+    centre = camera.rotation.new_tensor(phantom.box.centre)
+    across = camera.rotation[:2] * (phantom.unit / 2)  # right and down in the image, mm
+    spans = (camera.project(centre + across) - camera.project(centre - across)).norm(dim=-1)
+    return float(spans.prod().sqrt())

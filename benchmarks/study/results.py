@@ -1,4 +1,4 @@
-"""The records of a study as the page asks for them: by phantom, noise and method, or by section."""
+"""Records of the study by phantom, noise and method, or by section."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+from benchmarks.study.plan import NOISES, PHANTOMS, SECTIONS, Case
 from nerif.reconstruction.neural.neural import NeRIF
-from study.cases import NOISES, PHANTOMS, SECTIONS, Case
-
-__all__ = ["NoResult", "Record", "Results", "finite", "first_at", "metric", "score", "typical"]
 
 Record = dict[str, Any]
 Cell = tuple[str, float, str]
@@ -19,7 +17,7 @@ Cell = tuple[str, float, str]
 
 
 class NoResult(Exception):
-    """A claim or a table asks for a result that the study does not have; the message says why."""
+    """A claim or a table needs a result that the study lacks, and why."""
 
 
 @dataclass(frozen=True)
@@ -28,20 +26,19 @@ class Results:
 
     Parameters
     ----------
-    pairs : every case of the study with its record; None where there is none yet
-    sections : asked for
+    pairs : every case with its record; None where there is none yet
+    sections : of the page
     """
 
     pairs: tuple[tuple[Case, Record | None], ...]
     sections: tuple[str, ...] = tuple(SECTIONS)
 
     def __post_init__(self) -> None:
-        named = ((case, None if record is None else {**record, "key": case.key}) for case, record in self.pairs)
-        object.__setattr__(self, "pairs", tuple(named))
+        pairs = ((case, None if record is None else {**record, "key": case.key}) for case, record in self.pairs)
+        object.__setattr__(self, "pairs", tuple(pairs))
 
     @property
     def done(self) -> int:
-        """Number of reconstructions that came to their end."""
         return sum(record is not None and "failed" not in record for _, record in self.pairs)
 
     @property
@@ -50,7 +47,7 @@ class Results:
         return [(case, str(record["failed"])) for case, record in self.pairs if record and "failed" in record]
 
     def rows(self, section: str) -> list[tuple[str, Case, Record | None]]:
-        """Return label, case and record of what a section shows; a failed record is None, too."""
+        """Return label, case and record of a section; None for a failed record."""
         return [
             (case.labels[section], case, None if record and "failed" in record else record)
             for case, record in self._of(section)
@@ -58,49 +55,48 @@ class Results:
 
     def cell(self, phantom: str, noise: float, method: str) -> Record | None:
         """Return a record of the tables, or None."""
-        known = (record for _, case, record in self.rows("tables") if _cell(case) == (phantom, noise, method))
-        return next(known, None)
+        records = (record for _, case, record in self.rows("tables") if _cell(case) == (phantom, noise, method))
+        return next(records, None)
 
     def failed_cell(self, phantom: str, noise: float, method: str) -> bool:
         """Whether a reconstruction of the tables failed."""
-        cells = [_cell(case) for case, _ in self.failed if "tables" in case.labels]
-        return (phantom, noise, method) in cells
+        return (phantom, noise, method) in [_cell(case) for case, _ in self.failed if "tables" in case.labels]
 
     def cells(
         self, methods: Iterable[str], noises: Iterable[float] = NOISES, phantoms: Iterable[str] = PHANTOMS
     ) -> dict[Cell, Record]:
-        """Return the records of the tables by (phantom, noise, method); NoResult where one is not there."""
-        wanted = [(p, noise, method) for method in methods for p in phantoms for noise in noises]
+        """Return records of the tables by (phantom, noise, method); NoResult where one is missing."""
+        keys = [(p, noise, method) for method in methods for p in phantoms for noise in noises]
         cases = {_cell(case): (case, record) for case, record in self.pairs if "tables" in case.labels}
-        return dict(zip(wanted, self._require([cases.get(cell) for cell in wanted], "tables"), strict=True))
+        return dict(zip(keys, self._require([cases.get(key) for key in keys], "tables"), strict=True))
 
     def one(self, phantom: str, noise: float, method: str) -> Record:
-        """Return one record of the tables; NoResult where it is not there."""
+        """Return one record of the tables; NoResult where it is missing."""
         return next(iter(self.cells((method,), (noise,), (phantom,)).values()))
 
     def labelled(self, section: str) -> dict[str, Record]:
-        """Return the records of a section by label; NoResult where one is not there."""
+        """Return the records of a section by label; NoResult where one is missing."""
         pairs = self._of(section)
         records = self._require(pairs or [None], section)
         return dict(zip((case.labels[section] for case, _ in pairs), records, strict=True))
 
     def _of(self, section: str) -> list[tuple[Case, Record | None]]:
-        """Return what a section shows, those in order whose labels are numbers."""
+        """Return the pairs of a section, in order where the labels are numbers."""
         pairs = [(case, record) for case, record in self.pairs if section in case.labels]
         return sorted(pairs, key=lambda pair: _order(section, pair[0]))
 
     def _require(self, pairs: Sequence[tuple[Case, Record | None] | None], section: str) -> list[Record]:
-        found = [pair for pair in pairs if pair is not None]
-        records = [record for _, record in found if record is not None and "failed" not in record]
+        present = [pair for pair in pairs if pair is not None]
+        records = [record for _, record in present if record is not None and "failed" not in record]
         if len(records) == len(pairs):
             return records
-        for case, record in found:
+        for case, record in present:
             if record is not None and "failed" in record:
                 raise NoResult(f"{case.key} failed: {record['failed']}")
-        if len(found) < len(pairs):
-            raise NoResult(f"the section “{SECTIONS[section]}” was not asked for")
+        if len(present) < len(pairs):
+            raise NoResult(f"the section “{SECTIONS[section]}” was left out")
         if len(pairs) == 1:
-            raise NoResult(f"{found[0][0].key} is not done yet")
+            raise NoResult(f"{present[0][0].key} is not done yet")
         raise NoResult(f"{len(records)} of {len(pairs)} reconstructions done")
 
 
@@ -115,17 +111,17 @@ def _order(section: str, case: Case) -> int:
 
 
 def finite(value: object) -> float | None:
-    """Return a number that is one, or None."""
+    """Return a finite number, or None."""
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
 def metric(record: Record | None, name: str) -> float | None:
-    """Return a metric of a record; None where there is no record, or no number in it."""
+    """Return a metric; None where there is no record, or no number in it."""
     return None if record is None else finite(record["metrics"].get(name))
 
 
 def score(record: Record, name: str) -> float:
-    """Return a metric of a record; NoResult where it is not a number, as of a run that diverged."""
+    """Return a metric; NoResult where it is not a number, as of a run that diverged."""
     value = finite(record["metrics"].get(name))
     if value is None:
         raise NoResult(f"{name} of {record['key']} is not a number (the run ended with: {record['outcome']})")
@@ -142,6 +138,6 @@ def first_at(record: Record, name: str, level: float) -> dict[str, float] | None
 
 
 def typical(records: Iterable[Record], name: str) -> float | None:
-    """Return the median of a value of records, such as seconds; None where there is none."""
+    """Return the median of a value over records; None where there is none."""
     values = [v for v in (finite(record.get(name)) for record in records) if v is not None]
     return median(values) if values else None

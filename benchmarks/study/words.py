@@ -1,14 +1,14 @@
-"""Numbers and tables in words, as the page of a study has them."""
+"""Numbers and tables as text of the study's page."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
-__all__ = ["NOTHING", "bare", "cc", "duration", "factor", "listed", "markdown_table", "memory", "share"]
+from benchmarks.runner import table
 
 NOTHING = "–"
-"""What is not there."""
+"""Missing value."""
 
 
 def share(value: float | None) -> str:
@@ -21,8 +21,13 @@ def cc(value: float | None) -> str:
     return NOTHING if value is None else f"{value:z.4f}"
 
 
+def count(value: float | None) -> str:
+    """Return a number of epochs."""
+    return NOTHING if value is None else f"{value:.3g}"
+
+
 def duration(seconds: float | None) -> str:
-    """Return a time in the unit that suits it."""
+    """Return a time in hours, minutes or seconds."""
     if seconds is None:
         return NOTHING
     for unit, length in (("h", 3600.0), ("min", 60.0)):
@@ -44,19 +49,18 @@ def factor(value: float) -> str:
 
 
 def listed(names: Iterable[str], most: int = 6) -> str:
-    """Return names with commas and an and; how many more where there are many."""
-    known = list(names)
-    if len(known) > most:
-        known = [*known[: most - 1], f"{len(known) - most + 1} others"]
-    return " and ".join([", ".join(known[:-1]), known[-1]] if len(known) > 1 else known)
+    """Return names with commas and an "and"; beyond `most` only their number."""
+    words = list(names)
+    if len(words) > most:
+        words = [*words[: most - 1], f"{len(words) - most + 1} others"]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def bare(text: object) -> str:
-    """Return text of unknown origin so that Markdown shows it as it is, in one line."""
+    """Return text in one line that Markdown shows literally."""
     return re.sub(r"([\\`*_{}\[\]<>#|~])", r"\\\1", " ".join(str(text).split())).replace("&", "&amp;")
 
 
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """Return a table in Markdown, its first `left` columns to the left and the others to the right."""
-    rule = ["---"] * left + ["--:"] * (len(head) - left)
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *rows))
+def numbers_table(head: list[str], rows: list[list[str]]) -> str:
+    """Return a table whose columns after the first are aligned to the right."""
+    return table(head, rows, left=1)

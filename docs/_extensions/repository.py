@@ -95,7 +95,7 @@ def make_pages(app: Any) -> None:
 
     for path in sorted((root / "benchmarks" / "results").rglob("*.md")):
         page(path.relative_to(root).as_posix(), relink(path.read_text(), path.parent, docs, modules))
-    for path in [*sorted((root / "benchmarks").glob("*.py")), *sorted((root / "examples").glob("*.py"))]:
+    for path in [*sorted((root / "benchmarks").glob("[!_]*.py")), *sorted((root / "examples").glob("*.py"))]:
         inside = path.relative_to(root)
         source = f"```{{literalinclude}} /{os.path.relpath(path, docs)}\n```\n"
         page(f"{inside.with_suffix('.md')}", f"# {inside}\n\n{source}")

@@ -1,6 +1,6 @@
 """nerif: refractive index, density and temperature fields in 3-D from background-oriented schlieren images.
 
-The nouns and verbs of a notebook are here by name (nerif.Measurement, nerif.simulate), loaded when first asked for;
+The nouns and verbs of a notebook are here by name (nerif.Measurement, nerif.simulate), loaded on first use;
 `__init__.pyi` lists them.
 """
 

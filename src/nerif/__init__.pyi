@@ -34,9 +34,9 @@ from .results.directory import ResultDirectory as ResultDirectory
 from .simulation.simulate import Simulation as Simulation
 from .simulation.simulate import add_noise as add_noise
 from .simulation.simulate import simulate as simulate
-from .workflow.pipeline import Run as Run
+from .workflow.job import Run as Run
 from .workflow.pipeline import reconstruct_into as reconstruct_into
-from .workflow.pipeline import write_report as write_report
+from .workflow.reports import write_report as write_report
 from .workflow.sequence.plan import SequenceSettings as SequenceSettings
 from .workflow.sequence.reconstruct import reconstruct_sequence as reconstruct_sequence
 

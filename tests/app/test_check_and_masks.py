@@ -90,7 +90,7 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     wait_for(browser, "return document.querySelector('.over polygon.flow') !== null")
     opened(browser, server, "displacement", LINE)  # a reload loses nothing
     wait_for(browser, "return document.querySelector('.over polygon.flow') !== null")
-    click(browser, "Put the masks in")
+    click(browser, "Apply the masks")
     (out,) = [word for word in text(browser, ".command code").split() if word.endswith(".masked.nc")]
     mask = written(folder / out).flow_mask
     assert bool(mask[0, 4:25, 6:30].all())

@@ -11,7 +11,7 @@ from nerif.app.form_view import _meant, _shown
 from nerif.app.forms import Form
 from nerif.app.pages.reconstruct import form_of
 from nerif.cli.commands.design import Design
-from nerif.cli.commands.methods import RECORDS
+from nerif.cli.commands.reconstruct import COMMANDS
 from nerif.cli.commands.settings import help_of, parse
 from nerif.common.conventions import InputError
 from nerif.geometry import Ring
@@ -31,7 +31,7 @@ def test_fields_are_those_of_the_record():
     assert all(f.help for f in FORM.fields)
 
 
-@pytest.mark.parametrize("method", list(RECORDS))
+@pytest.mark.parametrize("method", list(COMMANDS))
 def test_every_field_of_every_method_has_its_text(method):
     form = form_of(method, "auto")
     assert [f.name for f in form.fields if not f.help] == []
@@ -39,7 +39,7 @@ def test_every_field_of_every_method_has_its_text(method):
 
 
 def test_help_is_that_of_the_class_that_has_the_field():
-    assert help_of(RECORDS["tv"], "tensorboard") == "Write TensorBoard scalars to OUT/tensorboard."
+    assert help_of(COMMANDS["tv"], "tensorboard") == "Write TensorBoard scalars to OUT/tensorboard."
     assert help_of(Ring, "nothing") == ""
 
 

@@ -39,7 +39,7 @@ def test_a_run_is_done_and_its_words_are_kept(tmp_path):
     assert until(jobs, first.id, "done").code == 0
     assert jobs.log(first.id)[0].startswith("nerif ")
     assert until(jobs, second.id, "failed").code == 2
-    assert "unknown verb" in jobs.log(second.id)[-1]
+    assert "unknown command" in jobs.log(second.id)[-1]
     assert [job.title for job in jobs.all()] == ["two", "one"]
     jobs.remove(first.id)
     with refused("job"):

@@ -6,11 +6,10 @@ from typing import Any
 
 import pytest
 
-from benchmarks.study_records import Change, resolution, results
-from study.cases import Case
-from study.claim import Claim
-from study.claims import WHY, claims, worse_than_paper
-from study.paper import CORRELATION, L2, paper_value
+from benchmarks.study.claims import WHY, Claim, claims, worse_than_paper
+from benchmarks.study.paper import CORRELATION, L2, paper_value
+from benchmarks.study.plan import Case
+from tests.benchmarks.study_records import Change, resolution, results
 
 
 def claim(start: str, change: Change = lambda case: {}) -> Claim:
@@ -31,7 +30,7 @@ def voxels(**changes: Any) -> Change:
 
 
 def on_phantom_2(value: float) -> Change:
-    """NeRIF as accurate as the paper wherever asked, but for Phantom 2's L2."""
+    """NeRIF as accurate as the paper, except for Phantom 2's L2."""
     return lambda case: {"l2": value} if case.phantom == "2" and case.method == "NeRIF" else {}
 
 
@@ -82,7 +81,7 @@ CASES = [
         section("sampling", "random", l2_variation=0.04),
     ),
     ("The spatial resolution", only("octahedron-nerif", resolution=resolution(62.0)), nerif()),
-    ("Asked of nerif itself", as_the_paper, only("2-0.1-nerif", l2=0.0043)),
+    ("Goal of nerif", as_the_paper, only("2-0.1-nerif", l2=0.0043)),
     ("Not in the paper: NeRIF beats total", nerif(), only("1-0-tv", l2=0.001)),
 ]
 
@@ -101,12 +100,12 @@ def test_every_claim_is_covered():
 
 @pytest.mark.parametrize("change", [lambda case: None, lambda case: {"failed": "RuntimeError: out of memory"}])
 def test_without_records_nothing_is_tested(change):
-    found = claims(results(change))
-    assert {c.verdict for c in found} == {"not tested"}
-    assert all(c.here for c in found)
+    verdicts = claims(results(change))
+    assert {c.verdict for c in verdicts} == {"not tested"}
+    assert all(c.here for c in verdicts)
 
 
-def test_reasons_are_told():
+def test_reasons_are_stated():
     failed = only("3-0.1-nerif", failed="RuntimeError: out of memory")
     assert claim("CC of NeRIF", failed).here == "3-0.1-nerif failed: RuntimeError: out of memory"
     waiting = claim("CC of NeRIF", lambda case: None if case.phantom == "7" else {})
@@ -116,25 +115,25 @@ def test_reasons_are_told():
     assert diverged.here == "cc of 3-0.1-nerif is not a number (the run ended with: diverged)"
 
 
-def test_a_section_that_was_not_asked_for_is_the_reason():
+def test_a_section_left_out_is_the_reason():
     whole = results()
     some = tuple(pair for pair in whole.pairs if "network" in pair[0].labels)
-    found = claims(type(whole)(some, ("network",)))
-    assert next(c for c in found if c.text.startswith("The multi-head")).verdict != "not tested"
-    assert next(c for c in found if c.text.startswith("CC of")).here.endswith("was not asked for")
+    verdicts = claims(type(whole)(some, ("network",)))
+    assert next(c for c in verdicts if c.text.startswith("The multi-head")).verdict != "not tested"
+    assert next(c for c in verdicts if c.text.startswith("CC of")).here.endswith("was left out")
 
 
-def test_too_short_a_run_tells_nothing_of_fifty_epochs():
+def test_a_run_too_short_for_fifty_epochs_is_not_tested():
     short = claim("NeRIF converges", lambda case: {"l2": 0.02, "epochs": 20.0} if case.method == "NeRIF" else {})
     assert short.verdict == "not tested"
     assert "too short" in short.here
 
 
 def test_cells_less_accurate_than_the_paper_are_listed():
-    found = claim(
-        "Asked of nerif", lambda case: as_the_paper(case) | ({"l2": 0.0043} if case.key == "2-0.1-nerif" else {})
+    verdicts = claim(
+        "Goal of nerif", lambda case: as_the_paper(case) | ({"l2": 0.0043} if case.key == "2-0.1-nerif" else {})
     )
-    assert found.here == "L2 in 20 of 21 cells, not Phantom 2 (noise 0.1); CC in 21 of 21 cells" + WHY
+    assert verdicts.here == "L2 in 20 of 21 cells, not Phantom 2 (noise 0.1); CC in 21 of 21 cells" + WHY
 
 
 def test_comparison_is_at_the_digits_of_the_paper():
@@ -144,7 +143,7 @@ def test_comparison_is_at_the_digits_of_the_paper():
     assert worse_than_paper("l2", 0.005856, 0.00585)
 
 
-def test_resolution_finer_than_the_profiles_tell_is_judged_by_what_they_tell():
+def test_resolution_finer_than_the_profiles_resolve_is_judged_by_their_limit():
     fine = claim("The spatial resolution", only("octahedron-nerif", resolution=resolution(None)))
     assert fine.verdict == "reproduced"
     assert fine.here.startswith("finer than 128 lp/unit; the pixels sample 25.00 lp/unit")

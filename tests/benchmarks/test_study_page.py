@@ -10,12 +10,14 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from benchmarks.study_records import ABOUT, MADE, page, pairs, results
+from benchmarks import runner, study
+from benchmarks.study.page import markdown, write_study
+from benchmarks.study.page_figures import page_figures
+from benchmarks.study.page_html import render
+from benchmarks.study.plan import FULL, QUICK, SECTIONS, Case, study_cases
+from benchmarks.study.results import Results
 from nerif.plotting.drawing import style
-from study.cases import QUICK, SECTIONS, Case, cases
-from study.page import markdown, write_page
-from study.page_figures import page_figures
-from study.page_html import render
+from tests.benchmarks.study_records import ORIGIN, page, pairs, record, records, results
 
 NAN = re.compile(r"\bnan\b", re.IGNORECASE)
 
@@ -24,12 +26,12 @@ def rows_of(text: str, heading: str) -> list[list[str]]:
     """Cells of the first table after a heading."""
     lines = text.split(f"{heading}\n")[1].split("\n")
     start = next(i for i, line in enumerate(lines) if line.startswith("| ---"))
-    found = []
+    rows = []
     for line in lines[start + 1 :]:
         if not line.startswith("|"):
             break
-        found.append([cell.strip() for cell in line.strip("|").split(" | ")])
-    return found
+        rows.append([cell.strip() for cell in line.strip("|").split(" | ")])
+    return rows
 
 
 def test_every_section_is_there_with_its_labels():
@@ -78,15 +80,14 @@ def test_what_is_not_there_yet_and_what_failed_show_as_such():
 
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_alone(name):
-    found = [pair for pair in pairs() if name in pair[0].labels]
-    text = markdown(found, {**ABOUT, "sections": (name,)})
+    text = markdown(Results(tuple(pair for pair in pairs() if name in pair[0].labels), (name,)), FULL, records())
     assert re.findall("^## (.*)$", text, re.MULTILINE) == ["Claims", SECTIONS[name], "Left out", "Made by"]
     assert not NAN.search(text)
 
 
 @pytest.mark.parametrize("change", [lambda case: None, lambda case: {"failed": "killed"}])
 def test_a_page_without_any_result_has_every_section_and_no_figure(change, tmp_path):
-    write_page(tmp_path, pairs(change), ABOUT)
+    write_study(tmp_path / "study.md", results(change), QUICK, [])
     text = (tmp_path / "study.md").read_text()
     assert all(f"## {heading}" in text for heading in SECTIONS.values())
     assert "![" not in text
@@ -102,7 +103,7 @@ def test_values_that_are_no_numbers_show_as_nothing():
         assert page_figures(results(lambda case, v=value: dict.fromkeys(nothing, v))) is not None
 
 
-def test_forward_models_show_where_they_are_known():
+def test_forward_models_are_on_the_page():
     assert "curved rays [px]" not in page()
     forward = {"lever_arm": {"rms_px": 0.00123, "relative": 0.001}, "paraxial": {"rms_px": 0.0456, "relative": 0.04}}
     text = page(lambda case: {"forward": forward} if case.key == "2-0-nerif" else {})
@@ -112,7 +113,7 @@ def test_forward_models_show_where_they_are_known():
 
 @pytest.mark.slow
 def test_written_page_needs_nothing_else(tmp_path):
-    path = write_page(tmp_path, pairs(), ABOUT)
+    path = write_study(tmp_path / "study.md", results(), QUICK, records())
     assert path == tmp_path / "study.html"
     text = path.read_text()
     for address in re.findall(r'(?:src|href)="([^"]*)"', text):
@@ -148,44 +149,52 @@ def test_every_figure_is_whole():
             for axes in figure.axes:
                 assert axes.has_data() or axes.get_legend() or axes.get_label() == "<colorbar>", spec.name
                 for words in (axes.get_xlabel(), axes.get_ylabel()):
-                    known = ("phantom", "views over 180°", "epochs (passes over all rays)")
-                    assert not words or words.endswith("]") or words in known, words
+                    labels = ("phantom", "views over 180°", "epochs (passes over all rays)")
+                    assert not words or words.endswith("]") or words in labels, words
 
 
-def test_lines_of_a_figure_can_be_told_apart():
+def test_lines_of_a_figure_differ():
     """No two of one panel share colour and dashes, or colour and mark."""
     with style(10):
         for spec in page_figures(results()):
             figure = Figure(figsize=spec.size, layout="constrained")
             spec.draw(figure)
             for axes in figure.axes:
-                drawn = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
-                looks = [(x.get_color(), x.get_linestyle(), x.get_marker(), x.get_markerfacecolor()) for x in drawn]
+                lines = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+                looks = [(x.get_color(), x.get_linestyle(), x.get_marker(), x.get_markerfacecolor()) for x in lines]
                 assert len(set(looks)) == len(looks), (spec.name, looks)
                 if spec.name == "speed":
-                    curves = looks[: sum(x.get_linestyle() != "None" for x in drawn)]
+                    curves = looks[: sum(x.get_linestyle() != "None" for x in lines)]
                     assert len({look[:2] for look in curves}) == len(curves) > 7
 
 
-def test_a_page_of_what_is_asked_for_by_name_has_the_cases_of_it():
-    for name in SECTIONS:
-        asked = cases(QUICK, (name,))
-        text = markdown([(case, None) for case in asked], {**ABOUT, "sections": (name,)})
-        assert f"**0 of {len(asked)} reconstructions are done" in text
-
-
-def test_each_record_is_shown_with_version_date_and_machine():
-    """Reconstructions made elsewhere, or by another version, stand in a row of their own."""
+def test_reconstructions_are_counted_and_their_origin_is_a_table():
+    """Origins that differ, such as another machine or version, stand in rows of their own."""
+    cases = study_cases(QUICK)
+    assert f"**0 of {len(cases)} reconstructions are done" in markdown(Results(tuple((c, None) for c in cases)), QUICK)
     heading = "## Made by"
-    assert rows_of(page(), heading) == [["0.1.0", "2.6.0", "2 cores", "2025-01-02", f"all {len(pairs())}"]]
-    other = {"nerif": "0.0.9", "torch": "2.5.0", "machine": "a laptop", "date": "2024-12-31"}
-    found = rows_of(page(lambda case: {"made": other} if case.key == "2-0-nerif" else {}), heading)
-    assert [*other.values(), "2-0-nerif"] in found
-    assert [row[:4] for row in found] == [list(MADE.values()), list(other.values())]
+    assert rows_of(page(), heading) == [[*ORIGIN.values(), f"all {len(pairs())}"]]
+    other = {**records()[0], "commit": "def", "nerif": "0.0.9"}
+    text = markdown(results(), QUICK, [other, *records()[1:]])
+    assert rows_of(text, heading)[0] == ["def", "0.0.9", *list(ORIGIN.values())[2:], other["settings"]["key"]]
+    assert len(rows_of(text, heading)) == 2
 
 
-def test_records_of_another_version_are_named_on_the_page():
-    text = page(not_used={"2-0-nerif": "0.0.9", "octahedron-tikhonov": "unknown"})
-    assert "Made by another version of nerif (0.0.9 and unknown) and so not used" in text
-    assert "2-0-nerif and octahedron-tikhonov." in text
-    assert "another version" not in page()
+def test_the_sections_of_a_page_are_those_whose_cases_are_there():
+    settings = [case for case in study.cases(True) if "sampling" in case["sections"].split()]
+    row = {**record(study_cases(QUICK)[0]), "seconds": 3.0}
+    made = [
+        {"settings": settings[0], **ORIGIN, "metrics": row},
+        {"settings": settings[1], **ORIGIN, "failed": "killed"},
+    ]
+    outcome = study.results_of(settings, made)
+    assert outcome.sections == ("sampling",)
+    assert (outcome.done, len(outcome.failed), len(outcome.pairs)) == (1, 1, 3)
+    assert outcome.rows("sampling")[0][2]["metrics"]["l2"] == row["metrics"]["l2"]
+    assert study.blocks(runner.rows_of(made))[1].startswith("1 of 2 reconstructions")
+
+
+def test_changes_of_settings_reach_the_cases():
+    (settings, *_) = runner.select(study, True, changes={"pixels": 12, "device": "cpu"})
+    assert study.scale_of(settings).pixels == 12
+    assert study_cases(study.scale_of(settings))[0].ring.image_size == (12, 12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 
@@ -11,14 +12,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from nerif.common.conventions import InputError
+from benchmarks.study.mtf import draw_mtf
+from benchmarks.study.octahedron_figures import draw_distribution, draw_edge_spread
+from benchmarks.study.resolution import Resolution, from_plain, measure_resolution, pixels_per_unit, to_plain
+from nerif.common.files import write_json
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Octahedron
-from nerif.geometry import Box, Grid
-from nerif.report.resolution_figure import draw_mtf
-from study.octahedron_figures import draw_distribution, draw_edge_spread
-from study.resolution import Resolution, measure_resolution
+from nerif.geometry import Box, Grid, Ring
+from refusals import refused
 
 PHANTOM = Octahedron(Box((-9.0, -12.0, -14.0), (11.0, 13.0, 16.0)))  # off the origin; one unit is 5 mm
 
@@ -69,15 +71,15 @@ def uneven() -> Resolution:
 @pytest.mark.parametrize(("sigma", "error"), [(0.005, 1e-3), (0.02, 1e-3), (0.06, 1e-3), (0.08, 2e-3), (0.13, 0.01)])
 def test_a_gaussian_edge(sigma, error):
     """The errors that the module states."""
-    found = measure(even(sigma))
-    assert found.lp_per_unit == pytest.approx(expected(sigma), rel=error)
-    assert found.lp_per_mm == pytest.approx(found.lp_per_unit / 5)
+    resolution = measure(even(sigma))
+    assert resolution.lp_per_unit == pytest.approx(expected(sigma), rel=error)
+    assert resolution.lp_per_mm == pytest.approx(resolution.lp_per_unit / 5)
     torch.testing.assert_close(
-        found.local_lp_per_unit, torch.full((72,), found.lp_per_unit).double(), rtol=1e-3, atol=0
+        resolution.local_lp_per_unit, torch.full((72,), resolution.lp_per_unit).double(), rtol=1e-3, atol=0
     )
-    seen = found.mtf.frequency < 2 * found.lp_per_mm
-    gauss = torch.exp(-2 * (math.pi * found.mtf.frequency * sigma * PHANTOM.unit) ** 2)
-    torch.testing.assert_close(found.mtf.transfer[seen], gauss[seen], rtol=0, atol=2e-3 if sigma < 0.1 else 0.05)
+    low = resolution.mtf.frequency < 2 * resolution.lp_per_mm
+    gauss = torch.exp(-2 * (math.pi * resolution.mtf.frequency * sigma * PHANTOM.unit) ** 2)
+    torch.testing.assert_close(resolution.mtf.transfer[low], gauss[low], rtol=0, atol=2e-3 if sigma < 0.1 else 0.05)
 
 
 @pytest.mark.parametrize(("sigma", "error"), [(0.05, 0.01), (0.1, 0.025)])
@@ -88,30 +90,28 @@ def test_the_whole_phantom_blurred_in_three_dimensions(sigma, error):
     phantom = Octahedron(box)
     sharp = phantom(grid.points(torch.float64).reshape(-1, 3)).reshape(grid.shape)
     field = VoxelField.through(torch.from_numpy(gaussian_filter(sharp.numpy(), sigma * 27.5)), grid)
-    found = measure_resolution(field, phantom, patches=2, points=2, samples=128)
-    assert found.lp_per_unit == pytest.approx(expected(sigma), rel=error)
-    assert float((found.local_lp_per_unit / expected(sigma) - 1).abs().max()) < error
+    resolution = measure_resolution(field, phantom, patches=2, points=2, samples=128)
+    assert resolution.lp_per_unit == pytest.approx(expected(sigma), rel=error)
+    assert float((resolution.local_lp_per_unit / expected(sigma) - 1).abs().max()) < error
 
 
 def test_the_phantom_itself_is_finer_than_the_samples():
-    found = measure(PHANTOM)
-    assert math.isnan(found.lp_per_mm)
-    assert found.local_lp_per_mm.isnan().all()
-    assert float(found.mtf_per_unit.frequency[-1]) == pytest.approx(128)  # half of 256 samples a unit
-    assert float(found.mtf.transfer.min()) > 0.99
-    inside = found.distance < 0
-    torch.testing.assert_close(found.edge_spread[inside], -torch.ones(int(inside.sum())).double(), atol=1e-6, rtol=0)
-    torch.testing.assert_close(
-        found.edge_spread[~inside], torch.zeros(int((~inside).sum())).double(), atol=1e-6, rtol=0
-    )
+    resolution = measure(PHANTOM)
+    assert math.isnan(resolution.lp_per_mm)
+    assert resolution.local_lp_per_mm.isnan().all()
+    assert float(resolution.mtf_per_unit.frequency[-1]) == pytest.approx(128)  # half of 256 samples a unit
+    assert float(resolution.mtf.transfer.min()) > 0.99
+    inside = resolution.distance < 0
+    expected_spread = torch.where(inside, -1.0, 0.0).double()
+    torch.testing.assert_close(resolution.edge_spread, expected_spread, atol=1e-6, rtol=0)
 
 
 def test_no_edge_is_no_resolution():
     for field in (Nothing(), Blurred(lambda p: torch.full_like(p[..., 0], 0.3), strength=0.05)):
-        found = measure(field)
-        assert found.lp_per_mm == 0
-        assert (found.local_lp_per_mm == 0).all()
-        assert found.mtf.transfer.isnan().all()
+        resolution = measure(field)
+        assert resolution.lp_per_mm == 0
+        assert (resolution.local_lp_per_mm == 0).all()
+        assert resolution.mtf.transfer.isnan().all()
 
 
 def test_a_weak_edge_is_as_sharp_as_a_strong_one():
@@ -151,9 +151,9 @@ def test_noise_is_averaged_out():
             noise = torch.randn(points.shape, generator=self.generator, dtype=points.dtype)
             return value, gradient + 0.2 * math.sqrt(3) * PHANTOM.amplitude / PHANTOM.unit * noise
 
-    found = measure(Noisy(), patches=4, points=4)
-    assert found.lp_per_unit == pytest.approx(expected(0.06), rel=0.05)
-    assert float(found.local_lp_per_unit.nanmedian()) == pytest.approx(expected(0.06), rel=0.15)
+    resolution = measure(Noisy(), patches=4, points=4)
+    assert resolution.lp_per_unit == pytest.approx(expected(0.06), rel=0.05)
+    assert float(resolution.local_lp_per_unit.nanmedian()) == pytest.approx(expected(0.06), rel=0.15)
 
 
 def test_patches_lie_on_the_faces(uneven):
@@ -173,13 +173,34 @@ def test_patches_lie_on_the_faces(uneven):
         assert float(local.abs().max()) < 2 * PHANTOM.unit
 
 
-def test_wrong_settings():
-    with pytest.raises(InputError, match=r"half_length: expected 0 to 0\.78 units, got 0\.8"):
-        measure(PHANTOM, half_length=0.8)
-    with pytest.raises(InputError, match="at least 4 samples"):
-        measure(PHANTOM, samples=2)
-    with pytest.raises(InputError, match="at least 1"):
-        measure(PHANTOM, patches=0)
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [({"half_length": 0.8}, "half_length"), ({"samples": 2}, "samples"), ({"patches": 0}, "samples")],
+)
+def test_wrong_settings(settings, field):
+    with refused(field):
+        measure(PHANTOM, **settings)
+
+
+@pytest.mark.parametrize("field", [even(0.1), PHANTOM, Nothing()], ids=["blurred", "sharp", "nothing"])
+def test_a_resolution_is_restored_from_a_json_file(field, tmp_path):
+    resolution = measure(field, patches=2, points=1)
+    write_json(tmp_path / "resolution.json", to_plain(resolution))
+    plain = json.loads((tmp_path / "resolution.json").read_text())
+    restored = from_plain(plain)
+    for before, after in ((vars(resolution), vars(restored)), (vars(resolution.mtf), vars(restored.mtf))):
+        for name, value in before.items():
+            if name != "mtf":
+                torch.testing.assert_close(after[name], value, rtol=0, atol=0, equal_nan=True)
+    assert plain["lp_per_unit"] == pytest.approx(resolution.lp_per_unit) or plain["lp_per_unit"] is None
+    assert plain["finest_lp_per_unit"] == pytest.approx(128)
+
+
+def test_pixels_of_a_unit():
+    ring = Ring(views=2, focal_length=50, pixel_pitch=0.02, image_size=(30, 40), distance=700, elevation=10)
+    centred = Octahedron(Box((-25.0, -30.0, -35.0), (25.0, 30.0, 35.0)))
+    for camera in ring.cameras():  # 50 / 700 of 12.5 mm, in pixels of 0.02 mm
+        assert pixels_per_unit(camera, centred) == pytest.approx(50 / 700 * 12.5 / 0.02)
 
 
 @pytest.mark.parametrize("field", [None, PHANTOM, Nothing()], ids=["uneven", "sharp", "nothing"])
@@ -196,10 +217,10 @@ def test_figures(field, uneven):
     labels = [label for axes in (edge, mtf, distribution) for label in (axes.get_xlabel(), axes.get_ylabel())]
     assert [label[label.index("[") :] for label in labels] == units
     assert "lp/unit" in figure.axes[3].get_ylabel()
-    said = [text.get_text() for text in mtf.get_legend().get_texts()]
-    assert len(said) == 3
+    labels = [text.get_text() for text in mtf.get_legend().get_texts()]
+    assert len(labels) == 3
     if field is None:
-        assert f"NeRIF: {uneven.lp_per_unit:.2f} lp/unit" in said
+        assert f"NeRIF: {uneven.lp_per_unit:.2f} lp/unit" in labels
 
 
 def test_unfolded_patches_lie_within_their_faces(uneven):

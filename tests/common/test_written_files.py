@@ -12,7 +12,6 @@ from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.results.directory import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
-from nerif.workflow.checkpointed import ASKED
 
 
 def put(path: Path, text: str = "mine") -> Path:
@@ -42,7 +41,7 @@ def result(tmp_path, said) -> ResultDirectory:
     found.write_metrics({"seconds": 1})
     written(found.path, REPORT, CALIBRATION)
     for folder in (found.member(1).path, found.member(2).path, found.cross_validation.path):
-        written(folder, ASKED, "field.safetensors")
+        written(folder, "asked.json", "field.safetensors")
     written(found.path / FIGURES, "views.pdf", "slices.pdf")
     assert not said
     return found
@@ -205,7 +204,7 @@ def test_images_that_were_not_rendered_are_not_rendered_over(tmp_path):
 
 def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
-    from nerif.data.measurement_sequence import MEASURED, check_store
+    from nerif.data.measurement_sequence import MEASUREMENTS, check_store
     from nerif.data.volume_sequence import FIELDS
 
     def store(name: str, attributes: dict, *arrays: str) -> Path:
@@ -215,14 +214,14 @@ def test_a_store_takes_the_place_of_one_of_its_kind_alone(tmp_path):
 
     fields, measured = store("f.zarr", {"box_lower_mm": [0]}, "density"), store("m.zarr", {}, "written", "displacement")
     check_store(fields, FIELDS)
-    check_store(measured, MEASURED)
+    check_store(measured, MEASUREMENTS)
     check_store(tmp_path / "none.zarr", FIELDS)
     folder, file = put(tmp_path / "photos.zarr" / "a.jpg").parent, put(tmp_path / "file.zarr")
-    for path, kind in ((measured, FIELDS), (fields, MEASURED), (folder, FIELDS), (file, MEASURED)):
+    for path, kind in ((measured, FIELDS), (fields, MEASUREMENTS), (folder, FIELDS), (file, MEASUREMENTS)):
         with pytest.raises(InputError, match="exists already, is not"):
             check_store(path, kind)
     put(fields / "notes.txt")
-    with pytest.raises(InputError, match=r"since notes\.txt in it is no part of the store"):
+    with pytest.raises(InputError, match=r"since notes\.txt in it is not part of the store"):
         check_store(fields, FIELDS)
 
 

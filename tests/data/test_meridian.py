@@ -22,16 +22,16 @@ def test_it_is_the_field_around_the_axis():
     box = Box.cube(50.0)
     phantom, grid = make_phantom("gaussian-jet", box, 0), Grid.of_resolution(box, 80)
     symmetry = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.01)
-    found = Meridian.of({"index_excess": Volume.of(phantom.sample(grid), grid, "index_excess", 1.00027)}, symmetry)
+    meridian = Meridian.of({"index_excess": Volume.of(phantom.sample(grid), grid, "index_excess", 1.00027)}, symmetry)
     import torch
 
-    h, r = torch.meshgrid(torch.from_numpy(found.h), torch.from_numpy(found.r), indexing="ij")
+    h, r = torch.meshgrid(torch.from_numpy(meridian.h), torch.from_numpy(meridian.r), indexing="ij")
     truth = phantom(symmetry.places(r, torch.zeros_like(r), h)).numpy()
-    known = np.isfinite(found.quantities["index_excess"])
-    apart = (found.quantities["index_excess"] - truth)[known]
-    assert known.mean() > 0.95
-    assert np.linalg.norm(apart) < 0.02 * np.linalg.norm(truth[known])
-    line = found.profile("index_excess", 3.1)
+    inside = np.isfinite(meridian.quantities["index_excess"])
+    error = (meridian.quantities["index_excess"] - truth)[inside]
+    assert inside.mean() > 0.95
+    assert np.linalg.norm(error) < 0.02 * np.linalg.norm(truth[inside])
+    line = meridian.profile("index_excess", 3.1)
     assert line[0] == pytest.approx(float(phantom(torch.tensor([[0.0, 0.0, 3.1]], dtype=torch.float64))), rel=0.02)
 
 
@@ -43,14 +43,14 @@ def of_numbers(axial: bool = True, **quantities: float) -> Meridian:
 
 
 def test_files_keep_the_digits_of_n(tmp_path):
-    found = of_numbers(n=1.000271234567, density=1.2)
-    found.write(tmp_path / "m.nc")
-    found.write_csv(tmp_path / "m.csv")
+    meridian = of_numbers(n=1.000271234567, density=1.2)
+    meridian.write(tmp_path / "m.nc")
+    meridian.write_csv(tmp_path / "m.csv")
     table = np.genfromtxt(tmp_path / "m.csv", delimiter=",", names=True)
     with xr.open_dataset(tmp_path / "m.nc") as data:
         assert data["density"].dtype == np.float32
-        np.testing.assert_array_equal(data["n"].values, found.quantities["n"])
-        np.testing.assert_allclose(table["n"], found.quantities["n"].ravel(), rtol=0, atol=1e-11)
+        np.testing.assert_array_equal(data["n"].values, meridian.quantities["n"])
+        np.testing.assert_allclose(table["n"], meridian.quantities["n"].ravel(), rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -62,9 +62,9 @@ def test_files_keep_the_digits_of_n(tmp_path):
     ],
 )
 def test_bands_are_those_of_the_percentiles_else_about_the_mean(quantity, others, line, low, high):
-    found = of_numbers(density=1.2, temperature=300, n=1.00027, **others)
+    meridian = of_numbers(density=1.2, temperature=300, n=1.00027, **others)
     for draw in (draw_profiles, draw_centre_line):
-        axes = draw(Figure().subplots(), found, quantity)
+        axes = draw(Figure().subplots(), meridian, quantity)
         band = axes.collections[0].get_paths()[0].get_extents()
         assert axes.get_lines()[0].get_ydata()[0] == pytest.approx(line, rel=1e-4)
         assert (band.y0, band.y1) == pytest.approx((low, high), rel=1e-4)

@@ -1,8 +1,8 @@
-"""Volumes on disk: .nc, .vti and .csv, value for value."""
+"""Files of volumes: written and read value for value, by nerif and by the readers of other programs."""
 
 from __future__ import annotations
 
-import csv
+import json
 
 import numpy as np
 import pytest
@@ -10,10 +10,11 @@ import torch
 import xarray as xr
 
 from nerif.common.conventions import InputError
-from nerif.data.exports import export
+from nerif.data.exports import FORMATS, export
 from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.data.volume_file import read_volume, read_volumes, write_netcdf
 from nerif.geometry import Box, Grid
+from nerif.physics.quantities import GasChanges, GasSettings, derive
 from refusals import refused
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))
@@ -22,34 +23,132 @@ VALUES = torch.arange(60, dtype=torch.float32).reshape(5, 3, 4) * 1e-6
 
 @pytest.fixture
 def volumes() -> list[Volume]:
-    attributes: dict[str, float | str] = {"n_ambient": 1.00027, "gas": "air"}
-    return [
-        Volume(VALUES, GRID, attributes=attributes),
-        Volume(VALUES * 1e6 + 0.5, GRID, "density", "kg m-3", attributes),
-    ]
+    """Index excess, n, density and temperature; one voxel with n < 1 and one too hot are masked."""
+    excess = -1e-4 * torch.rand(GRID.shape, generator=torch.Generator().manual_seed(1))
+    excess[1, 2, 3] = -3.0e-4  # n - 1 < 0
+    excess[4, 0, 1] = -2.69e-4  # n - 1 = 1e-6: 80,000 K
+    first = Volume(excess, GRID, attributes={"n_ambient": 1.00027})
+    return [derive(first, q, GasSettings("N2")) for q in ("index_excess", "n", "density", "temperature")]
 
 
-@pytest.mark.parametrize("ending", ["nc", "vti"])
-def test_round_trip(volumes, tmp_path, ending):
-    path = tmp_path / f"v.{ending}"
+def test_masked_voxels_are_counted_and_explained(volumes):
+    density, temperature = volumes[2:]
+    assert torch.isnan(density.values).nonzero().tolist() == [[1, 2, 3]]
+    assert torch.isnan(temperature.values).nonzero().tolist() == [[1, 2, 3], [4, 0, 1]]
+    assert (density.notes["masked_voxels"], temperature.notes["masked_voxels"]) == (1, 2)
+    assert "Gladstone-Dale" in density.notes["assumption"]
+    assert "101325 Pa" in temperature.notes["assumption"]
+    assert "N2" in temperature.notes["assumption"]
+
+
+def test_the_gas_is_that_of_the_run_unless_changed():
+    run = {"gas": {"composition": "CO2", "wavelength_nm": 633.0, "pressure_pa": 9e4}}
+    assert GasChanges().of(run) == GasSettings("CO2", 633.0, 9e4)
+    assert GasChanges(pressure_pa=8e4).of(run) == GasSettings("CO2", 633.0, 8e4)
+    assert GasChanges("N2").of({}) == GasSettings("N2")
+
+
+@pytest.mark.parametrize("ending", [".nc", ".vti"])
+def test_volumes_are_read_as_written(volumes, tmp_path, ending):
+    path = tmp_path / f"v{ending}"
     export(path, volumes)
-    excess, density = read_volume(path), read_volume(path, "density")
-    assert excess.quantity == "index_excess"
-    assert torch.equal(excess.values, VALUES)
-    assert torch.equal(density.values, volumes[1].values)
-    assert density.unit == "kg m-3"
-    assert excess.grid.shape == GRID.shape
-    assert excess.grid.box.lower == pytest.approx(GRID.box.lower)
-    assert excess.grid.box.upper == pytest.approx(GRID.box.upper)
-    assert excess.attributes["n_ambient"] == 1.00027
-    assert excess.attributes["gas"] == "air"
-    assert not list(tmp_path.glob("*.part"))
+    back = read_volumes(path)
+    assert list(back) == [v.quantity for v in volumes]
+    for v in volumes:
+        read = back[v.quantity]
+        assert torch.equal(read.values.nan_to_num(-1), v.values.nan_to_num(-1))
+        assert read.unit == v.unit
+        assert {k: read.notes[k] for k in v.notes} == v.notes
+        assert read.attributes["n_ambient"] == 1.00027
+        assert read.grid.shape == GRID.shape
+        assert [*read.grid.box.lower, *read.grid.box.upper] == pytest.approx([*GRID.box.lower, *GRID.box.upper])
+    assert torch.equal(read_volume(path).values, volumes[0].values)
+    assert torch.equal(read_volume(path, "density").values.nan_to_num(-1), volumes[2].values.nan_to_num(-1))
+
+
+def test_every_format_leaves_only_its_file(volumes, tmp_path):
+    for ending in FORMATS:
+        export(tmp_path / f"v{ending}", volumes)
+    assert {p.name for p in tmp_path.iterdir()} == {f"v{ending}" for ending in FORMATS}
+
+
+def test_netcdf_by_xarray(volumes, tmp_path):
+    export(tmp_path / "v.nc", volumes)
+    with xr.open_dataset(tmp_path / "v.nc") as data:
+        for v in volumes:
+            np.testing.assert_array_equal(data[v.quantity].values, v.values.numpy())
+            assert data[v.quantity].dims == ("z", "y", "x")
+            assert data[v.quantity].attrs["units"] == v.unit
+            assert data[v.quantity].attrs["long_name"]
+        assert data.attrs["Conventions"].startswith("CF-")
+        assert {"title", "source", "history", "references"} <= set(data.attrs)
+        assert data.attrs["gas"] == "N2"
+        for axis in "xyz":
+            assert data[axis].attrs["axis"] == axis.upper()
+            np.testing.assert_array_equal(data[axis].values, GRID.axis(axis).numpy())
+        assert data["temperature"].attrs["masked_voxels"] == 2
+        assert "ideal gas" in data["temperature"].attrs["assumption"]
+
+
+def test_vti_by_vtk(volumes, tmp_path):
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+    export(tmp_path / "v.vti", volumes)
+    reader = vtkXMLImageDataReader()
+    reader.SetFileName(str(tmp_path / "v.vti"))
+    reader.Update()
+    image = reader.GetOutput()
+    for v in volumes:
+        array = image.GetPointData().GetArray(v.quantity)
+        np.testing.assert_array_equal(vtk_to_numpy(array).reshape(GRID.shape), v.values.numpy())
+    for z, y, x in ((0, 0, 0), (4, 2, 3), (1, 2, 0)):  # by coordinates, not by position in memory
+        place = [float(GRID.axis(a)[i]) for a, i in zip("xyz", (x, y, z), strict=True)]
+        point = image.FindPoint(*place)
+        assert image.GetPoint(point) == pytest.approx(place)
+        assert image.GetPointData().GetArray("index_excess").GetValue(point) == float(volumes[0].values[z, y, x])
+    text = image.GetFieldData().GetAbstractArray("temperature.assumption").GetValue(0)
+    assert text == volumes[3].notes["assumption"]
+
+
+def test_npz_by_numpy(volumes, tmp_path):
+    export(tmp_path / "v.npz", volumes)
+    with np.load(tmp_path / "v.npz", allow_pickle=False) as data:
+        for v in volumes:
+            np.testing.assert_array_equal(data[v.quantity], v.values.numpy())
+        np.testing.assert_array_equal(data["y_mm"], GRID.axis("y").numpy())
+        about = json.loads(str(data["about"]))
+    assert (about["n_ambient"], about["density.units"]) == (1.00027, "kg m-3")
+
+
+def test_mat_by_scipy_and_pymatreader(volumes, tmp_path):
+    from pymatreader import read_mat
+    from scipy.io import loadmat
+
+    export(tmp_path / "v.mat", volumes)
+    data = loadmat(tmp_path / "v.mat")
+    assert data["density"].shape == (4, 3, 5)  # x, y, z
+    for v in volumes:
+        np.testing.assert_array_equal(data[v.quantity].transpose(2, 1, 0), v.values.numpy())
+    assert data["z_mm"].ravel().tolist() == GRID.axis("z").tolist()
+    about = read_mat(tmp_path / "v.mat")["about"]
+    assert about["gladstone_dale_m3_kg_1"] == pytest.approx(2.38e-4, rel=0.01)
+    assert "Gladstone-Dale" in about["density_assumption"]
+
+
+def test_csv_by_numpy(volumes, tmp_path):
+    export(tmp_path / "v.csv", volumes)
+    head = (tmp_path / "v.csv").read_text().splitlines()[0]
+    assert head == "x_mm,y_mm,z_mm,index_excess [1],n [1],density [kg m-3],temperature [K]"
+    table = np.loadtxt(tmp_path / "v.csv", delimiter=",", skiprows=1)
+    assert table.shape == (60, 7)
+    np.testing.assert_allclose(table[1, :4], [0.5, 3.0, -2.0, float(volumes[0].values[0, 0, 1])], rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended", "raw"])
 @pytest.mark.parametrize("compressor", ["None", "ZLib"])
 def test_images_as_vtk_writes_them(tmp_path, mode, compressor):
-    """Every way that VTK has of writing an image, with its corner not at index 0."""
+    """Every encoding of VTK; the extent does not begin at index 0."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonDataModel import vtkImageData
     from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
@@ -78,41 +177,24 @@ def test_images_as_vtk_writes_them(tmp_path, mode, compressor):
         read_volume(tmp_path / "i.vti")
 
 
-def test_csv(volumes, tmp_path):
-    export(tmp_path / "v.csv", volumes)
-    with (tmp_path / "v.csv").open() as file:
-        rows = list(csv.reader(file))
-    assert rows[0] == ["x_mm", "y_mm", "z_mm", "index_excess [1]", "density [kg m-3]"]
-    assert len(rows) == 61
-    second = [float(x) for x in rows[2]]
-    assert second == pytest.approx([0.5, 3.0, -2.0, 1e-6, 1.5])
-
-
-def test_n_becomes_index_excess(tmp_path):
-    n = Volume(VALUES.double() + 1.00027, GRID, "n", attributes={"n_ambient": 1.00027})
-    write_netcdf(tmp_path / "n.nc", [n])
-    back = read_volume(tmp_path / "n.nc")
-    assert back.quantity == "index_excess"
-    assert float((back.values - VALUES).abs().max()) < 1e-12
-
-
-def test_n_stays_n_where_nobody_said_the_ambient_index(tmp_path):
+@pytest.mark.parametrize("n_ambient", [1.00027, None])
+def test_n_becomes_index_excess_if_the_ambient_index_is_given(tmp_path, n_ambient):
     n = VALUES.double() + 1.00027
-    write_netcdf(tmp_path / "n.nc", [Volume(n, GRID, "n")])
+    write_netcdf(tmp_path / "n.nc", [Volume(n, GRID, "n", attributes={"n_ambient": n_ambient} if n_ambient else {})])
     back = read_volume(tmp_path / "n.nc")
-    assert (back.quantity, back.n_ambient) == ("n", None)
-    assert torch.equal(back.values, n)
+    assert (back.quantity, back.n_ambient) == ("index_excess" if n_ambient else "n", n_ambient)
+    assert float((back.values - (VALUES if n_ambient else n)).abs().max()) < 1e-12
 
 
 @pytest.mark.parametrize("value", [float("nan"), 0.00027, "air"])
-def test_ambient_index_that_cannot_be_one(tmp_path, value):
+def test_invalid_ambient_index(tmp_path, value):
     write_netcdf(tmp_path / "n.nc", [Volume(VALUES, GRID, attributes={"n_ambient": value})])
     with refused("attribute n_ambient"):
         read_volume(tmp_path / "n.nc")
 
 
-def test_a_volume_from_elsewhere(tmp_path):
-    """Coordinates are enough: the box is half a voxel wider on each side; dimensions may come in any order."""
+def test_volumes_of_other_programs_and_parts_of_volumes(volumes, tmp_path):
+    """Coordinates determine the box; dimensions may come in any order."""
     values = np.random.default_rng(0).random((4, 3, 5)).astype(np.float32)
     coordinates = {"x": np.linspace(0, 3, 4), "y": np.linspace(-1, 1, 3), "z": np.linspace(10, 12, 5)}
     xr.Dataset({"cfd": (("x", "y", "z"), values)}, coords=coordinates).to_netcdf(tmp_path / "c.nc", engine="h5netcdf")
@@ -120,34 +202,27 @@ def test_a_volume_from_elsewhere(tmp_path):
     assert volume.grid.shape == (5, 3, 4)
     assert volume.grid.box.lower == pytest.approx((-0.5, -1.5, 9.75))
     np.testing.assert_array_equal(volume.values.numpy(), values.transpose(2, 1, 0))
-
-
-def test_a_part_cut_out_by_xarray_keeps_its_place(volumes, tmp_path):
     write_netcdf(tmp_path / "v.nc", volumes)
     with xr.open_dataset(tmp_path / "v.nc") as whole:
         whole.isel(z=slice(1, 4)).to_netcdf(tmp_path / "part.nc", engine="h5netcdf")
     part = read_volume(tmp_path / "part.nc")
     assert part.grid.box.lower == pytest.approx((-1, 2, -1))
     assert part.grid.box.upper == pytest.approx((3, 8, 5))
-    assert torch.equal(part.values, VALUES[1:4])
+    assert torch.equal(part.values, volumes[0].values[1:4])
 
 
-def test_refusals(volumes, tmp_path):
-    spoilt = Volume(torch.where(VALUES > 3e-5, torch.nan, VALUES), GRID)
-    write_netcdf(tmp_path / "nan.nc", [spoilt])
+def test_invalid_files(volumes, tmp_path):
+    write_netcdf(tmp_path / "nan.nc", [Volume(torch.where(VALUES > 3e-5, torch.nan, VALUES), GRID)])
     (tmp_path / "text.vti").write_text("no image")
     (tmp_path / "text.nc").write_text("no volume")
     xr.Dataset({"a": ("x", [1.0])}).to_netcdf(tmp_path / "flat.nc", engine="h5netcdf")
-    export(tmp_path / "v.nc", volumes)
-    for name, word in (
-        ("nan.nc", "NaN"), ("text.vti", "not a VTK image"), ("text.nc", "not a readable"), ("flat.nc", "coordinates"),
-        ("absent.nc", "no such file"),
-    ):  # fmt: skip
-        with pytest.raises(InputError, match=f"{name}.*{word}"):
+    for name in ("nan.nc", "text.vti", "text.nc", "flat.nc", "absent.nc"):
+        with pytest.raises(InputError, match=str(tmp_path / name)):
             read_volume(tmp_path / name)
-    with pytest.raises(InputError, match="temperature"):
+    write_netcdf(tmp_path / "v.nc", volumes[:1])
+    with refused(tmp_path / "v.nc"):
         read_volume(tmp_path / "v.nc", "temperature")
-    with pytest.raises(InputError, match="stl"):
+    with refused(tmp_path / "v.stl"):
         export(tmp_path / "v.stl", volumes)
     with refused("volume 'index_excess'"):
         Volume(VALUES.movedim(0, 2), GRID)

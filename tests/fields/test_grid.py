@@ -1,4 +1,4 @@
-"""Voxel fields: what they pass through, what they are on the faces of the box, and their gradient."""
+"""Voxel fields: interpolation, boundaries, gradient."""
 
 from __future__ import annotations
 
@@ -42,29 +42,24 @@ def test_field_is_zero_on_ambient_faces_and_flat_at_the_others(degree):
                 assert float(gradient[:, "xyz".index(face[0])].abs().max()) < 1e-14
 
 
-def test_linear_field_has_its_coefficients_at_the_centres():
-    values = random(*GRID.shape)
-    field = VoxelField(Boundary().extend(values, 1), GRID, 1)
-    assert torch.allclose(field(GRID.points(torch.float64)), values, atol=1e-14)
-
-
-def test_spline_through_values_meets_them():
-    values = random(*GRID.shape)
-    assert torch.allclose(VoxelField.through(values, GRID)(GRID.points(torch.float64)), values, atol=1e-13)
+def test_fields_interpolate_their_values():
+    values, centres = random(*GRID.shape), GRID.points(torch.float64)
+    for field in (VoxelField(Boundary().extend(values, 1), GRID, 1), VoxelField.through(values, GRID)):
+        assert torch.allclose(field(centres), values, atol=1e-13)
 
 
 @pytest.mark.parametrize("degree", [1, 3])
-def test_gradient_is_that_of_the_value(degree):
+def test_gradient_is_exact(degree):
     field = VoxelField(Boundary(("x+",)).extend(random(*GRID.shape), (degree + 1) // 2), GRID, degree)
     points = torch.tensor(BOX.lower) + (0.03 + 0.94 * random(60, 3, seed=3)) * torch.tensor(BOX.edges)
     points.requires_grad_(True)
     value, gradient = field.value_and_gradient(points)
-    (autograd,) = torch.autograd.grad(value.sum(), points)
-    assert torch.allclose(gradient, autograd, atol=1e-12)
+    (expected,) = torch.autograd.grad(value.sum(), points)
+    assert torch.allclose(gradient, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("degree", [1, 3])
-def test_weights_are_a_partition_of_one(degree):
+def test_weights_sum_to_one(degree):
     weights, slopes = spline_weights(random(50), degree)
     assert torch.allclose(weights.sum(-1), torch.ones(50, dtype=torch.float64))
     assert torch.allclose(slopes.sum(-1), torch.zeros(50, dtype=torch.float64), atol=1e-15)
@@ -78,7 +73,7 @@ def test_single_precision_and_another_device_keep_the_field():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_what_cannot_be_right():
+def test_invalid_fields_are_refused():
     with refused("coefficients"):
         VoxelField(torch.zeros(5, 6, 7), GRID, 1)
     with refused("degree"):

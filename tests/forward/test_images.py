@@ -26,7 +26,7 @@ from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Target
@@ -105,7 +105,7 @@ def test_the_reference_between_pixels_is_the_cubic_spline():
         (slope,) = torch.autograd.grad(references.at(number, at).sum(), at)
         assert torch.allclose(slope, references.slope(number, place), atol=1e-3)
     beyond = torch.tensor([[-3.0, 5.0], [25.5, 5.0], [5.0, 17.0]])
-    assert references.known(torch.ones(3, dtype=torch.int16), beyond).tolist() == [False, False, False]
+    assert references.covers(torch.ones(3, dtype=torch.int16), beyond).tolist() == [False, False, False]
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 9), (2, 7), (6, 2), (1, 1)])
@@ -127,7 +127,7 @@ def test_pixels_without_a_reference_are_not_known():
     images[0, 4:7, 4:7] = torch.nan
     references = References(images, [(20, 20)])
     place = torch.tensor([[5.2, 4.9], [12.0, 12.0]])
-    assert references.known(torch.zeros(2, dtype=torch.int16), place).tolist() == [False, True]
+    assert references.covers(torch.zeros(2, dtype=torch.int16), place).tolist() == [False, True]
     assert bool(references.at(torch.zeros(2, dtype=torch.int16), place).isfinite().all())
 
 
@@ -140,7 +140,7 @@ def test_gain_and_offset_are_found_among_outliers():
     spoiled = right.clone()
     spoiled[::20] += 800
     references.fit(view, pixel, still, spoiled, torch.ones(3000))
-    assert float((references.seen(view, pixel, still) - right).square().mean().sqrt()) < 3
+    assert float((references.flow_at(view, pixel, still) - right).square().mean().sqrt()) < 3
 
 
 # -- the model -------------------------------------------------------------------------------------------------------
@@ -263,9 +263,9 @@ def test_a_run_tells_where_images_take_over_and_its_pace_goes_on(balls, taken):
     flow[:, ::2] = torch.nan
     both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05), maps={**taken.maps, "flow": flow})
     settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
-    Training(settings, TrainingData(settings, both)).run(steps.append)
+    Trainer(settings, TrainingData(settings, both)).run(steps.append)
     assert [(s.step, s.note) for s in steps if s.note] == [
-        (5, "the loss is of images from here on, of displacements before: it jumps")
+        (5, "the loss changes from displacements to images and jumps")
     ]
     assert all(s.rays_per_second > 0 for s in steps)
 
@@ -313,8 +313,8 @@ def test_a_run_from_images_resumes_bit_for_bit(taken):
             states.append(step.capture())
         return False
 
-    once = Training(whole, TrainingData(whole, taken)).run(keep)
-    again = Training(whole, TrainingData(whole, taken), states[0]).run()
+    once = Trainer(whole, TrainingData(whole, taken)).run(keep)
+    again = Trainer(whole, TrainingData(whole, taken), states[0]).run()
     a, b = (dict(r.field.network.state_dict()) for r in (once, again))
     assert all(torch.equal(a[name], b[name]) for name in a)
 
@@ -324,7 +324,7 @@ def test_without_a_limit_a_run_is_judged_by_pixels_withheld(taken):
     settings = replace(NETWORK, max_steps=0, first_cycle=120)
     result = settings(taken, lambda step: step.step > 121)
     held = [row["withheld_residual"] for row in result.history if "withheld_residual" in row]
-    judges = TrainingData(settings, taken, judged=True).withheld
+    judges = TrainingData(settings, taken, withhold=True).withheld
     assert judges is not None
     assert len(judges) > 200
     assert held[-1] < 0.5 * math.sqrt(judges.chi_square)  # of what is left of them without a field
@@ -388,7 +388,7 @@ def test_the_noise_of_images_may_be_told_by_attributes(tmp_path, taken):
 def test_noise_told_by_attributes_has_rounding_in_it_and_no_gaps(taken):
     flow, reference = (taken.maps[name].clone() for name in ("flow", "reference"))
     flow[0, :3], reference[1, 5:9, 5:9] = math.nan, math.nan
-    sigma = Images.completed({"flow": flow, "reference": 2 * reference}, {"read_noise": 0})["image_sigma"]
+    sigma = Images.complete({"flow": flow, "reference": 2 * reference}, {"read_noise": 0})["image_sigma"]
     assert torch.equal(sigma.isfinite(), flow.isfinite())
     assert torch.allclose(sigma[2:], torch.tensor(math.sqrt(1.25 / 12)), rtol=0.01)  # half the gain: a quarter
 
@@ -403,9 +403,9 @@ def test_what_is_missing_is_told(taken, balls):
     displaced = predict(balls, taken.cameras, BOX, 1.00027)
     with refused("from"):
         NeRIF(source="images")(displaced)
-    with refused("from"):
+    with refused("source"):
         NeRIF(source="image")
-    with pytest.raises(InputError, match="technique: images show a pattern, and are made by nerif render"):
+    with pytest.raises(InputError, match="technique: images need a pattern; simulate them with nerif render"):
         predict(balls, taken.cameras, BOX, 1.00027, technique=Images)
     grey = {**taken.maps, "flow": torch.ones_like(taken.maps["flow"])}
     with pytest.raises(InputError, match="flow: expected an image of a pattern, got one of a single grey"):

@@ -23,7 +23,8 @@ from nerif.geometry import Box, Ring
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import REPROJECTION, ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 from refusals import refused
 
 RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)
@@ -49,7 +50,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_a_result_is_not_scored_by_a_technique_that_sees_something_else(files):
     directory = ResultDirectory(files["emission"].with_suffix(""))
     kept = (directory / REPROJECTION).read_bytes()
-    message = r"deflection.nc: expected a technique that sees the field of radiance per length \(emission\), got deflec"
+    message = r"deflection.nc: expected a technique that measures the field of radiance per length \(emission\)"
     with pytest.raises(InputError, match=message):
         evaluate(directory.path, measurement=files["deflection"])
     assert (directory / REPROJECTION).read_bytes() == kept
@@ -60,7 +61,7 @@ def test_a_technique_sees_no_field_of_another_quantity(files, tmp_path, capsys):
     words = ["project", str(files["deflection"].with_suffix("")), "-o", str(out)]
     assert main([*words, "--technique", "absorption"]) == 2
     said = capsys.readouterr().err
-    assert "technique: expected a technique that sees the field of refractive index (deflection, interfero" in said
+    assert "technique: expected a technique that measures the field of refractive index (deflection, interfero" in said
     assert not out.exists()
     field, box, n_ambient = ResultDirectory(files["deflection"].with_suffix("")).field()
     with refused("technique"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.analysis.consistency import everywhere, looks, of_one_view
+from nerif.analysis.consistency import everywhere, image_remarks, of_one_view
 from nerif.analysis.evaluation import score_lines
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
@@ -66,9 +66,9 @@ def words_of(page: Path) -> str:
 
 
 def test_the_report_of_absorption_speaks_of_nothing_else(absorption):
-    words, _, settings = words_of(absorption / "report.html").partition("How it was done")
+    words, _, settings = words_of(absorption / "report.html").partition("Settings and versions")
     assert "gas." not in settings
-    for expected in ("Absorption tomography", "Extinction coefficient", "mm⁻¹", "absorbance", "held out"):
+    for expected in ("Absorption tomography", "Extinction coefficient", "mm⁻¹", "absorbance", "withheld"):
         assert expected in words, expected
     for strange in ("isplacement", " px =", "n − 1", "Density", "Temperature", "mbient", "ackground", "NaN"):
         assert strange not in words, strange
@@ -77,13 +77,13 @@ def test_the_report_of_absorption_speaks_of_nothing_else(absorption):
 def test_the_report_of_two_techniques_shows_both(both):
     words = words_of(both / "report.html")
     assert "Background-oriented schlieren tomography and interferometric tomography" in words
-    for expected in ("displacement in px and fringes", "Held-out view, displacement", "Held-out view, fringes",
-                     "Residuals of displacement against the noise", "Residuals of fringes", "n − 1",
+    for expected in ("displacement in px and fringes", "Withheld view, displacement", "Withheld view, fringes",
+                     "Residuals of displacement over the noise", "Residuals of fringes", "n − 1",
                      "cameras and backgrounds"):  # fmt: skip
         assert expected in words, expected
     metrics = json.loads((both / "metrics.json").read_text())
     first, *_, last = (" ".join(line.split(":")[0].split()[1:]) for line in score_lines(metrics["views"]))
-    assert (first, last) == ("training views, displacement", "held-out view, fringes")
+    assert (first, last) == ("training views, displacement", "withheld view, fringes")
 
 
 def test_views_have_a_row_for_each_component_and_colours_for_what_it_measures(absorption, both):
@@ -93,7 +93,7 @@ def test_views_have_a_row_for_each_component_and_colours_for_what_it_measures(ab
     views, [scale] = view_images(reprojections[0], [])
     assert [*views[0].rows] == ["absorbance"]
     assert scale.limits[0] == 0 < scale.limits[1]
-    assert scale.apart[0] == -scale.apart[1]
+    assert scale.difference_limits[0] == -scale.difference_limits[1]
     views, [pixels, fringes] = view_images(reprojections[1], [])
     assert [*views[0].rows] == ["u", "v", "fringes"]
     assert (pixels.unit, fringes.unit) == ("px", "")
@@ -204,10 +204,10 @@ def test_an_observation_alone_is_a_measurement_of_its_views(both):
 def test_an_offset_of_the_background_is_told(absorption):
     alone = Measurement.read(absorption.with_suffix(".nc"))
     shifted = replace(alone, maps={**alone.maps, "absorbance": alone.maps["absorbance"] + 0.4})
-    first = looks(shifted, shifted, [1.0] * 3)[0]
-    assert "its rim shows absorbance 0." in first
+    first = image_remarks(shifted, shifted, [1.0] * 3)[0]
+    assert "absorbance at the border 0." in first
     assert "subtract it as the offset of the background" in first
-    assert looks(alone, alone, [1.0] * 3) == []
+    assert image_remarks(alone, alone, [1.0] * 3) == []
 
 
 @pytest.mark.slow

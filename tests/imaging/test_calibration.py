@@ -1,8 +1,9 @@
-"""Calibration from points that were found: exact ones give the rig back, bad ones are refused by name."""
+"""Calibration from detected points: exact ones give the rig back, inconsistent ones are refused by view."""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,274 +11,364 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from calibration_images import detection, target_images
-from nerif.common.conventions import InputError
-from nerif.geometry import Camera, Plane, Ring
+from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
 from nerif.imaging.calibration.bundle import Bundle, Observation, Pose, _Layout, adjust
-from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate
+from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
 from nerif.imaging.calibration.cameras_file import read_cameras
+from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
-from nerif.simulation.experiment import target_poses, world_axes
+from nerif.simulation.experiment import side_of_one, target_poses, world_axes
 from refusals import refused
 
 TARGET = CalibrationTarget("charuco", 9, 7, pitch=12.0)
+NOISE = 0.05  # px
+KINDS = sorted(PROJECTIONS)
 
 
-def rig() -> tuple[Camera, ...]:
-    """Four cameras that are not quite where they should be, with distortion and oblique backgrounds."""
-    rng = np.random.default_rng(2)
-    ring = Ring(views=4, arc=(20.0, 140.0), elevation=8.0, image_size=(400, 500), pixel_pitch=0.03)
+def rig(kind: str) -> tuple[Camera, ...]:
+    """Cameras off from a regular ring, with distortion and oblique backgrounds."""
+    rng, perspective = np.random.default_rng(2), kind == "perspective"
+    shape = (
+        {"views": 4, "arc": (20.0, 140.0)} if perspective else {"views": 3, "arc": (20.0, 120.0), "magnification": 0.1}
+    )
+    distortion = [-0.12, 0.1, 0.001, -0.0005, 0.0] if perspective else [-2e-6, 0, 1e-6, -2e-6, 0]
     cameras = []
-    for camera in ring.cameras():
-        turn = torch.from_numpy(Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix())
-        rotation = turn @ camera.rotation
+    for camera in Ring(elevation=8.0, image_size=(400, 500), pixel_pitch=0.03, projection=kind, **shape).cameras():
+        rotation = torch.from_numpy(Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()) @ camera.rotation
         k = camera.intrinsics.clone()
-        k[0, 2] += rng.normal(0, 5)
-        k[1, 2] += rng.normal(0, 5)
+        k[:2, 2] += torch.from_numpy(rng.normal(0, 5, 2)) * perspective
         k[1, 1] *= 1.002
-        normal = torch.from_numpy(Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix()) @ camera.background.normal
+        normal = torch.from_numpy(Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix()) @ camera.plane.normal
         cameras.append(
-            dataclasses.replace(
+            replace(
                 camera,
                 rotation=rotation,
                 translation=-rotation @ (camera.centre + torch.from_numpy(rng.normal(0, 4, 3))),
                 intrinsics=k,
                 background=Plane(normal, -500.0 + float(rng.normal(0, 10))),
-                distortion=torch.tensor([-0.12, 0.1, 0.001, -0.0005, 0.0], dtype=torch.float64),
+                distortion=torch.tensor(distortion, dtype=torch.float64),
             )
         )
     return tuple(cameras)
 
 
-CAMERAS = rig()
-SETTINGS = CalibrationSettings(world="0", axes=world_axes(CAMERAS))
-NOISE = 0.05  # px
+RIGS = {kind: rig(kind) for kind in KINDS}
+CAMERAS, BEAMS = RIGS["perspective"], RIGS["telecentric"]
+NAMES = [c.name for c in BEAMS]
+SETTINGS = {
+    "perspective": CalibrationSettings(world="0", axes=world_axes(CAMERAS)),
+    "telecentric": CalibrationSettings(
+        world="0", axes=world_axes(BEAMS), projection="telecentric", side=side_of_one(BEAMS),
+        distortion=("k1", "p1", "p2"),
+    ),
+}  # fmt: skip
 
 
-def images(noise: float = 0.0, poses: int = 12, backgrounds: int = 3) -> list[ViewImages]:
-    return target_images(CAMERAS, TARGET, noise, poses, backgrounds)
+def images(kind: str = "perspective", noise: float = 0.0, poses: int = 12, backgrounds: int = 3) -> list[ViewImages]:
+    return target_images(RIGS[kind], TARGET, noise, poses, backgrounds)
 
 
 @pytest.fixture(scope="module")
-def exact() -> Calibration:
+def exact() -> dict[str, Calibration]:
     """From points without noise."""
-    return calibrate(images(), SETTINGS)
+    return {kind: calibrate(images(kind), SETTINGS[kind]) for kind in KINDS}
 
 
 @pytest.fixture(scope="module")
-def noisy() -> Calibration:
-    return calibrate(images(NOISE, poses=16), SETTINGS)
+def noisy() -> dict[str, Calibration]:
+    distance = {"perspective": None, "telecentric": 480.0}
+    return {kind: calibrate(images(kind, NOISE, 10), SETTINGS[kind], distance[kind]) for kind in KINDS}
 
 
-def test_exact_points_give_the_rig_back(exact):
-    assert exact.rms() < 1e-4
-    for camera, pose, k, plane in zip(CAMERAS, exact.poses, exact.intrinsics, exact.backgrounds, strict=True):
-        turn = Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude()
-        assert np.degrees(turn) < 1e-3
+def turns(result: Calibration, cameras: tuple[Camera, ...]) -> np.ndarray:
+    """Angles between calibrated and true cameras, degrees."""
+    rotations = [p.rotation @ c.rotation.numpy().T for c, p in zip(cameras, result.poses, strict=True)]
+    return np.degrees(Rotation.from_matrix(np.stack(rotations)).magnitude())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_exact_points_give_the_rig_back(exact, kind):
+    result = exact[kind]
+    assert result.rms() < 1e-4
+    assert turns(result, RIGS[kind]).max() < 1e-3
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, (50, 3)))
+    for camera, found, k in zip(RIGS[kind], result.cameras, result.intrinsics, strict=True):
+        whole = found.camera(background=camera.background)
+        assert found.projection == camera.projection
+        assert float((whole.project(points) - camera.project(points)).abs().max()) < 2e-3
+        assert np.allclose(k[:2], camera.intrinsics[[0, 1], [0, 1]].numpy(), rtol=2e-5)
+
+
+def test_centres_distortion_and_backgrounds_of_perspective_cameras_come_back(exact):
+    result = exact["perspective"]
+    for camera, pose, k, plane in zip(CAMERAS, result.poses, result.intrinsics, result.backgrounds, strict=True):
         assert np.abs(pose.translation - camera.translation.numpy()).max() < 0.01
         assert np.abs(k[:4] - camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].numpy()).max() < 0.05
         assert np.abs(k[4:8] - camera.distortion[:4].numpy()).max() < 0.02
         assert plane is not None
         assert plane.rms < 0.01
-        assert np.abs(np.array(plane.normal) - camera.background.normal.numpy()).max() < 1e-5
-        assert abs(plane.offset - camera.background.offset) < 0.01
+        assert np.abs(np.array(plane.normal) - camera.plane.normal.numpy()).max() < 1e-5
+        assert abs(plane.offset - camera.plane.offset) < 0.01
 
 
-def test_errors_are_about_what_is_stated(noisy):
-    assert noisy.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.1)
-    turns, moves = [], []
-    for camera, pose in zip(CAMERAS, noisy.poses, strict=True):
-        turns.append(np.degrees(Rotation.from_matrix(pose.rotation @ camera.rotation.numpy().T).magnitude()))
-        moves.append(np.linalg.norm(pose.translation - camera.translation.numpy()))
-    assert np.all(np.array(turns) < 3 * noisy.sigma_rotation)
-    assert np.mean(turns) > 0.1 * noisy.sigma_rotation.mean()
-    assert np.all(np.array(moves) < 3 * noisy.sigma_translation)
+@pytest.mark.parametrize("kind", KINDS)
+def test_errors_are_about_their_standard_deviations(noisy, kind):
+    """Without the depth of a telecentric camera: 700 mm that no image constrains."""
+    result = noisy[kind]
+    assert result.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.1)
+    shifts = np.array([
+        (p.translation - c.translation.numpy())[: 3 if kind == "perspective" else 2]
+        for c, p in zip(RIGS[kind], result.poses, strict=True)
+    ])  # fmt: skip
+    angles = turns(result, RIGS[kind])
+    assert np.all(angles < 4 * result.sigma_rotation)
+    assert np.mean(angles) > 0.1 * result.sigma_rotation.mean()
+    assert np.all(np.linalg.norm(shifts, axis=1) < 4 * result.sigma_translation)
+    assert kind == "perspective" or result.sigma_translation.max() < 0.1
 
 
-def test_turns_and_shifts_of_cameras_are_about_their_pose_sigma(noisy):
-    """The mount is left out; what noise does to a camera about its own axes is what refinement goes by."""
-    result = dataclasses.replace(noisy, mount=(0.0, 0.0))
-    off = []
+def test_pose_errors_about_the_cameras_axes_are_about_pose_sigma(noisy):
+    """Noise alone, without the mount: the prior of a refinement."""
+    result = replace(noisy["perspective"], mount=(0.0, 0.0))
+    errors = []
     for camera, found in zip(CAMERAS, result.cameras, strict=True):
         turn = Rotation.from_matrix((camera.rotation @ found.rotation.T).numpy()).as_rotvec()
-        centre = -found.rotation.T @ found.translation
-        shift = found.rotation @ (camera.centre - centre)
-        off.append(np.concatenate([turn, shift.numpy()]) / found.pose_sigma.numpy())
-    assert np.abs(off).max() < 4
-    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.6
+        shift = found.rotation @ (camera.centre + found.rotation.T @ found.translation)
+        errors.append(np.concatenate([turn, shift.numpy()]) / found.pose_sigma.numpy())
+    assert np.abs(errors).max() < 4
+    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
-def test_a_mount_adds_to_the_noise_and_is_kept_in_the_file(tmp_path, exact):
-    exact.write(tmp_path / "c.toml")
+def test_a_mount_adds_to_the_noise_and_is_in_the_file(tmp_path, exact):
+    exact["perspective"].write(tmp_path / "c.toml")
     sigma = read_cameras(tmp_path / "c.toml")[0].camera((400, 500)).pose_sigma
     assert sigma.tolist() == pytest.approx([np.radians(0.005)] * 3 + [0.05] * 3, rel=0.05)
 
 
-def test_without_background_images_there_is_no_plane_but_a_note():
-    result = calibrate(images(backgrounds=0), SETTINGS)
+def test_without_background_images_planes_are_unknown():
+    result = calibrate(images(poses=8, backgrounds=0), SETTINGS["perspective"])
     assert result.backgrounds == (None,) * 4
-    assert sum("its plane is not known" in n for n in result.notes) == 4
+    assert sum("background plane is unknown" in n for n in result.notes) == 4
+
+
+def test_backgrounds_of_telecentric_cameras_are_at_the_distance_of_the_settings(exact, noisy):
+    result = exact["telecentric"]
+    assert result.backgrounds == (None,) * 3  # though there are images of targets on it
+    assert sum("background plane is unknown" in n for n in result.notes) == 3
+    assert sum("z_cam = 0 was placed at the origin" in n for n in result.notes) == 1
+    assert [float(c.translation[2]) for c in result.cameras] == [0.0] * 3
+    for camera in noisy["telecentric"].cameras:
+        assert camera.background.offset == -480.0
+        assert torch.allclose(camera.background.normal, -camera.rotation[2])
 
 
 @pytest.mark.slow
-def test_world_is_where_it_is_asked_for():
-    plain = calibrate(images(), dataclasses.replace(SETTINGS, axes=("x+", "y+", "z+")))
-    moved = calibrate(images(), dataclasses.replace(SETTINGS, axes=("y+", "z+", "x+"), origin=(1.0, 2.0, 3.0)))
-    for a, b in zip(plain.poses, moved.poses, strict=True):
+def test_world_is_as_in_the_settings():
+    plain = calibrate(images(), replace(SETTINGS["perspective"], axes=("x+", "y+", "z+")))
+    other = calibrate(images(), replace(SETTINGS["perspective"], axes=("y+", "z+", "x+"), origin=(1.0, 2.0, 3.0)))
+    for a, b in zip(plain.poses, other.poses, strict=True):
         x, y, z = a.inverse.translation
         assert np.allclose(b.inverse.translation, [y + 1, z + 2, x + 3], atol=1e-3)
 
 
+def changed(view: ViewImages, change: Callable[[Detection], Detection]) -> ViewImages:
+    poses, background = ({n: change(d) for n, d in group.items()} for group in (view.poses, view.background))
+    return replace(view, poses=poses, background=background)
+
+
 def test_a_bad_image_is_left_out_and_named():
-    views = images(0.02)
-    wrong = next(iter(n for n in views[1].poses if n != "0"))
-    ids, pixels = views[1].poses[wrong].ids, views[1].poses[wrong].pixels.copy()
-    pixels[::2] += 3.0  # the target moved while the image was taken
-    poses = {**views[1].poses, wrong: Detection(ids, pixels, TARGET.points[ids])}
-    views[1] = dataclasses.replace(views[1], poses=poses)
-    result = calibrate(views, SETTINGS)
-    assert [e.image for e in result.errors if not e.used and e.camera == views[1].name] == [wrong]
-    assert any(f"{views[1].name}/{wrong}: left out" in n for n in result.notes)
+    views = images(noise=0.02, poses=8)
+    name, bad = next((n, d) for n, d in views[1].poses.items() if n != "0")
+    pixels = bad.pixels.copy()
+    pixels[::2] += 3.0  # the target moved while the image was recorded
+    views[1] = replace(views[1], poses={**views[1].poses, name: replace(bad, pixels=pixels)})
+    result = calibrate(views, SETTINGS["perspective"])
+    assert [e.image for e in result.errors if not e.used and e.camera == views[1].name] == [name]
+    assert any(f"{views[1].name}/{name}: left out" in n for n in result.notes)
     assert result.rms() < 0.1
 
 
-def mirrored(view: ViewImages) -> ViewImages:
-    """The view as through a mirror, its corners numbered as a chessboard's would be."""
+def mirrored(detection: Detection) -> Detection:
+    """A detection as through a mirror, its corners numbered as a chessboard's would be."""
     columns, rows = TARGET.shape
     flip = np.arange(columns * rows).reshape(rows, columns)[:, ::-1].ravel()
-
-    def turned(found: Detection) -> Detection:
-        pixels = found.pixels * [-1, 1] + [view.size[1] - 1, 0]
-        return Detection(flip[found.ids], pixels, TARGET.points[flip[found.ids]])
-
-    return dataclasses.replace(
-        view,
-        poses={n: turned(d) for n, d in view.poses.items()},
-        background={n: turned(d) for n, d in view.background.items()},
-    )
+    ids = flip[detection.ids]
+    return Detection(ids, detection.pixels * [-1, 1] + [499, 0], TARGET.points[ids])
 
 
-def test_a_mirrored_camera_is_refused_by_name():
-    views = images(0.02)
-    views[2] = mirrored(views[2])
-    with refused("view '100deg'"):
-        calibrate(views, SETTINGS)
+def shifted(view: ViewImages) -> ViewImages:
+    """Poses under wrong names."""
+    values = list(view.poses.values())
+    return replace(view, poses=dict(zip(view.poses, values[1:] + values[:1], strict=True)))
 
 
-def test_poses_under_wrong_names_are_refused():
-    views = images(0.02)
-    names = list(views[3].poses)
-    shifted = dict(zip(names, list(views[3].poses.values())[1:] + list(views[3].poses.values())[:1], strict=True))
-    views[3] = dataclasses.replace(views[3], poses=shifted)
-    with refused("view '140deg'"):
-        calibrate(views, SETTINGS)
+FAULTS: dict[str, Callable[[ViewImages], ViewImages]] = {
+    "mirrored": lambda view: changed(view, mirrored),
+    "mirrored, as ChArUco": lambda view: changed(view, lambda d: replace(d, pixels=d.pixels * [-1, 1] + [499, 0])),
+    "wrong names": shifted,
+    "too few": lambda view: replace(view, poses=dict(list(view.poses.items())[:2]), background={}),
+    "none in common": lambda view: replace(view, poses={f"9{n}": d for n, d in view.poses.items()}),
+}
+COMMON = next(n for n in images("telecentric")[0].poses if n in images("telecentric")[1].poses)
+FAULTS["one in common"] = lambda view: replace(
+    view, poses={n if n == COMMON else f"9{n}": d for n, d in view.poses.items()}
+)
 
 
-def relabelled(target: Target) -> list[ViewImages]:
-    """The same images, taken for those of another target."""
+@pytest.mark.parametrize(
+    ("kind", "fault"), [(k, f) for k in KINDS for f in FAULTS if (k, f) != ("perspective", "one in common")]
+)
+def test_a_view_with_a_fault_is_refused_by_name(kind, fault):
+    views = images(kind, 0.02)
+    i = 0 if fault == "too few" or "in common" in fault else len(views) - 1
+    views[i] = FAULTS[fault](views[i])
+    with refused(f"view '{views[i].name}'"):
+        calibrate(views, SETTINGS[kind])
 
-    def other(found: dict[str, Detection]) -> dict[str, Detection]:
-        return {n: dataclasses.replace(d, points=target.points[d.ids]) for n, d in found.items()}
 
-    return [dataclasses.replace(v, poses=other(v.poses), background=other(v.background)) for v in images()]
+def relabelled(target: CalibrationTarget) -> list[ViewImages]:
+    """The same images with the points of another target."""
+    return [changed(view, lambda d: replace(d, points=target.points[d.ids])) for view in images(poses=8)]
 
 
 @pytest.mark.slow
 def test_a_wrong_pitch_shows_in_the_size_of_the_rig_only():
-    result = calibrate(relabelled(dataclasses.replace(TARGET, pitch=24.0)), SETTINGS)
+    result = calibrate(relabelled(replace(TARGET, pitch=24.0)), SETTINGS["perspective"])
     assert result.rms() < 1e-3
     reach = np.linalg.norm(result.poses[0].inverse.translation)
     assert reach == pytest.approx(2 * float(CAMERAS[0].centre.norm()), rel=1e-3)
 
 
-def test_a_wrong_number_of_squares_is_refused():
-    with refused("view '60deg'"):
-        calibrate(relabelled(CalibrationTarget("charuco", 8, 8, pitch=12.0)), SETTINGS)
-
-
-def test_too_few_poses_and_cameras_without_a_common_one():
-    views = images()
-    few = dataclasses.replace(views[0], poses=dict(list(views[0].poses.items())[:2]), background={})
+def test_a_wrong_number_of_squares_and_a_large_error_are_refused():
+    with refused("view '100deg'"):
+        calibrate(relabelled(CalibrationTarget("charuco", 8, 8, pitch=12.0)), SETTINGS["perspective"])
     with refused("view '20deg'"):
-        calibrate([few, *views[1:]], SETTINGS)
-    lonely = dataclasses.replace(views[0], poses={f"9{n}": d for n, d in views[0].poses.items()})
-    with refused("view '20deg'"):
-        calibrate([lonely, *views[1:]], SETTINGS)
-    with refused("calibrate"):
-        calibrate([], SETTINGS)
-    with refused("world"):
-        calibrate(views, dataclasses.replace(SETTINGS, world="77"))
-
-
-def test_a_large_error_is_refused_with_its_worst_image():
-    with refused("view '20deg'"):
-        calibrate(images(0.5, poses=8), dataclasses.replace(SETTINGS, max_error=0.3))
+        calibrate(images("telecentric", NOISE), replace(SETTINGS["telecentric"], max_error=0.01))
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "field"),
     [
-        ({"axes": ("x+", "y+", "z-")}, "right-handed"),
-        ({"distortion": ("k9",)}, "k9"),
+        ({"axes": ("x+", "y+", "z-")}, "axes"),
+        ({"distortion": ("k9",)}, "distortion"),
         ({"max_error": 0.0}, "max_error"),
+        ({"projection": "fisheye"}, "projection"),
+        ({"projection": "telecentric", "side": None}, "side"),
+        ({"projection": "telecentric", "side": (NAMES[0], "left")}, "side"),
     ],
 )
-def test_settings_that_cannot_be_right(change, words):
-    with pytest.raises(InputError, match=words):
+def test_invalid_settings(change, field):
+    with refused(field):
         CalibrationSettings(**change)
 
 
-@pytest.fixture
-def small() -> tuple[Bundle, list[Observation]]:
-    """Two cameras, three poses, off from the truth."""
-    rng = np.random.default_rng(0)
-    poses = target_poses(CAMERAS[1:3], TARGET, 4, seed=3)
-    observations = [
-        Observation(i, j, d)
-        for i, camera in enumerate(CAMERAS[1:3])
-        for j, pose in enumerate(poses)
-        for d in [detection(camera, TARGET, pose, 0.0, rng)]
+def test_names_of_views_and_poses_that_are_none():
+    with refused("calibrate"):
+        calibrate([], SETTINGS["perspective"])
+    with refused("world"):
+        calibrate(images(poses=4), replace(SETTINGS["perspective"], world="77"))
+    with refused("side"):
+        calibrate(images("telecentric"), replace(SETTINGS["telecentric"], side=("cam9", "x+")))
+
+
+# -- telecentric: two rotations per image, and the mirror image of the rig -----------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_first_guess_resolves_every_tilt_up_to_one_mirror_image(seed):
+    """Whatever the order of the two rotations of an image, and with noise."""
+    noisy = images("telecentric", NOISE, 16)
+    views = [noisy[i] for i in np.random.default_rng(seed).permutation(3)]
+    bundle, observations = first_guess(views, ("k1",), "0", TELECENTRIC)
+    assert max(bundle.rms(o) for o in observations) < 3.0
+    truth = {c.name: c.rotation.numpy() for c in BEAMS}
+    relative = truth[views[0].name] @ truth[views[1].name].T
+    errors = [
+        np.degrees(Rotation.from_matrix(b.cameras[0].rotation @ b.cameras[1].rotation.T @ relative.T).magnitude())
+        for b in (bundle, mirror(bundle))
     ]
-    k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, 0, 0, 0, 0, 0] for c in CAMERAS[1:3]], dtype=float)
-    cameras = tuple(Pose(c.rotation.numpy(), c.translation.numpy() + 1.0) for c in CAMERAS[1:3])
+    assert min(errors) < 2.0 < 10.0 < max(errors)
+
+
+def test_the_mirror_image_takes_the_same_images_and_the_side_decides():
+    settings = SETTINGS["telecentric"]
+    assert settings.side == (NAMES[0], "x+")
+    bundle, observations = first_guess(images("telecentric"), ("k1",), "0", TELECENTRIC)
+    for o in observations:
+        assert np.allclose(bundle.project(o), mirror(bundle).project(o), atol=1e-9)
+    for face, sign in (("x+", 1), ("x-", -1)):
+        result = _on_side(bundle, replace(settings, side=(NAMES[0], face)), NAMES)
+        assert -sign * float(settings.rotation[0] @ result.cameras[0].rotation[2]) > 0.5
+    with refused("side"):
+        _on_side(bundle, replace(settings, side=(NAMES[1], "y+")), NAMES)  # where the mirror image stands too
+
+
+def test_one_telecentric_camera_alone_has_a_scale_and_poses(exact):
+    one = calibrate(images("telecentric")[:1], replace(SETTINGS["telecentric"], world="1"))
+    assert one.rms() < 1e-3
+    assert one.intrinsics[0, 0] == pytest.approx(exact["telecentric"].intrinsics[0, 0], rel=1e-4)
+
+
+# -- bundle adjustment ---------------------------------------------------------------------------------------------
+
+
+def small(kind: str) -> tuple[Bundle, list[Observation]]:
+    """Two cameras, three or four poses, off from the truth."""
+    rng = np.random.default_rng(0)
+    if kind == "telecentric":
+        views = images(kind)[:2]
+        common = sorted(set(views[0].poses) & set(views[1].poses))[:3]
+        views = [replace(v, poses={n: v.poses[n] for n in common}) for v in views]
+        bundle, observations = first_guess(views, ("k1", "k2", "p1", "p2", "k3"), common[0], TELECENTRIC)
+        bundle.intrinsics[:, 4:] = (1e-6, 1e-10, 1e-6, 2e-6, 1e-14)
+        return bundle, observations
+    pair = CAMERAS[1:3]
+    poses = target_poses(pair, TARGET, 4, seed=3)
+    observations = [
+        Observation(i, j, detection(camera, TARGET, pose, 0.0, rng))
+        for i, camera in enumerate(pair)
+        for j, pose in enumerate(poses)
+    ]
+    k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, 0, 0, 0, 0, 0] for c in pair], dtype=float)
+    cameras = tuple(Pose(c.rotation.numpy(), c.translation.numpy() + 1.0) for c in pair)
     return Bundle(k, cameras, tuple(poses), 0, (True,) * 8 + (False,), ((400, 500),) * 2), observations
 
 
-def test_normal_equations_are_the_slope_of_the_cost(small):
-    bundle, observations = small
+@pytest.mark.parametrize("kind", KINDS)
+def test_normal_equations_are_the_slope_of_the_cost(kind):
+    bundle, observations = small(kind)
     layout = _Layout(bundle, observations, noise=10.0)  # in the quadratic part of Huber's loss
     x = layout.pack(bundle)
     cost, curvature, slope = layout.normal_equations(x)
     assert cost == pytest.approx(layout.cost(x))
     assert np.allclose(curvature, curvature.T)
+    size = np.sqrt(np.diag(curvature))
     for i in range(len(x)):
-        step = 1e-5 * max(1.0, abs(x[i]))
-        up, down = x.copy(), x.copy()
-        up[i] += step
-        down[i] -= step
-        assert 2 * slope[i] == pytest.approx((layout.cost(up) - layout.cost(down)) / (2 * step), rel=1e-3, abs=1e-2)
+        step = np.zeros_like(x)
+        step[i] = 1e-2 / size[i] if size[i] > 0 else 1.0  # the cost does not depend on an unconstrained depth
+        numeric = (layout.cost(x + step) - layout.cost(x - step)) / (2 * step[i])
+        assert 2 * slope[i] == pytest.approx(numeric, rel=1e-3, abs=1e-5 * max(size[i], 1.0))
+    assert int((size == 0).sum()) == (2 if kind == "telecentric" else 0)  # the depths of the cameras
 
 
-def test_adjustment_ends_in_a_minimum(small):
-    bundle, observations = small
-    done, covariance = adjust(bundle, observations, noise=0.01)
-    layout = _Layout(done, observations, 0.01)
-    x = layout.pack(done)
-    least = layout.cost(x)
-    assert least < 1e-3 * _Layout(bundle, observations, 0.01).cost(layout.pack(bundle))
+def test_adjustment_ends_in_a_minimum():
+    bundle, observations = small("perspective")
+    result, covariance = adjust(bundle, observations, noise=0.01)
+    layout = _Layout(result, observations, 0.01)
+    x = layout.pack(result)
+    minimum = layout.cost(x)
+    assert minimum < 1e-3 * _Layout(bundle, observations, 0.01).cost(layout.pack(bundle))
     rng = np.random.default_rng(0)
     spread = np.where(np.abs(x) > 0, np.abs(x), 1.0)
-    assert all(layout.cost(x + 1e-4 * spread * rng.standard_normal(len(x))) > least for _ in range(20))
+    assert all(layout.cost(x + 1e-4 * spread * rng.standard_normal(len(x))) > minimum for _ in range(20))
     assert np.all(np.diagonal(covariance, axis1=1, axis2=2)[:, 9:] > 0)
 
 
-def test_poses_are_put_one_after_the_other_and_undone():
+def test_poses_compose_and_invert():
     rng = np.random.default_rng(0)
     a, b = (Pose.of_vector(rng.standard_normal(6)) for _ in range(2))
-    point = rng.standard_normal(3)
-    joint = a @ b
-    assert np.allclose(
-        joint.rotation @ point + joint.translation, a.rotation @ (b.rotation @ point + b.translation) + a.translation
-    )
+    points = rng.standard_normal((2, 3))
+    assert np.allclose((a @ b).apply(points), a.apply(b.apply(points)))
     assert np.allclose((a @ a.inverse).vector, 0, atol=1e-12)
     assert np.allclose(Pose.of_vector(a.vector).rotation, a.rotation)

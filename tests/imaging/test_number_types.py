@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from nerif.imaging.calibration.corners import eight_bit, saddle_points
+from nerif.imaging.calibration.targets import eight_bit, saddle_points
 from nerif.imaging.displacement.correlation import correlate, normalised_median_outliers
 from nerif.imaging.displacement.displacement import DisplacementSettings, Reference, displacement, measure
 from nerif.imaging.displacement.noise import local_correlation, smoothing_error, structure_variance

@@ -82,7 +82,7 @@ def test_noise_told_by_attributes_of_a_file_is_that_of_a_pair():
     noise = CameraNoise(READ**2, 1 / ELECTRONS)
     pair = ImagePair.of(reference, flow, np.zeros((*light.shape, 2)), noise, 1, everywhere, everywhere)
     maps = {"flow": torch.tensor(flow)[None], "reference": torch.tensor(reference)[None]}
-    told = Images.completed(maps, {"read_noise": READ, "electrons_per_grey_value": ELECTRONS})["image_sigma"]
+    told = Images.complete(maps, {"read_noise": READ, "electrons_per_grey_value": ELECTRONS})["image_sigma"]
     np.testing.assert_allclose(told[0].numpy(), pair.sigma, rtol=0.01)
 
 

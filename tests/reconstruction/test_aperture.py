@@ -22,11 +22,11 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.reconstruction.aperture import lens_rays, seen_through
-from nerif.reconstruction.neural.losses import LossWeights
+from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.objective import Draw, Objective
+from nerif.reconstruction.neural.objective import Objective
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.precision import MixedPrecision
+from nerif.reconstruction.neural.sampling import Draw, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.voxels.operator import VoxelOperator, rays_through
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
@@ -199,12 +199,11 @@ def test_rays_of_a_pixel_that_miss_the_box_leave_every_term_and_its_slope_finite
     settings = NeRIF(network=shape, weights=weights, model=model, device="cpu", lens_rays=4, norm="l2")
     data = TrainingData(settings, measurement, coarsest=1)
     torch.manual_seed(0)
-    field, generator = data.untrained(), torch.Generator().manual_seed(0)
+    field, generator = data.initial_field(), torch.Generator().manual_seed(0)
     network = MixedPrecision(field.network, data.device, "float32", "off")
-    objective = Objective(settings, data, field, network, generator, Ranks())
-    pieces, _ = objective.batch(torch.arange(len(data)), Draw(4, 4))
-    assert not bool(pieces[0].rays.crosses.all())
-    for name, term in objective.terms(pieces).items():
+    batch = Sampler(settings, data, field, network, generator, Ranks()).of(torch.arange(len(data)), Draw(4, 4))
+    assert not bool(batch.pieces[0].rays.crosses.all())
+    for name, term in Objective(settings, data, field, network, generator).terms(batch).items():
         slopes = torch.autograd.grad(term, list(field.network.parameters()), retain_graph=True, allow_unused=True)
         assert bool(term.isfinite()), name
         assert all(bool(g.isfinite().all()) for g in slopes if g is not None), name

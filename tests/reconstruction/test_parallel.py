@@ -1,4 +1,4 @@
-"""Two processes under torchrun do what one does with the same batch."""
+"""Several processes under torchrun find the field of one."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.files import read_field
+from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.objective import Draw, Objective
+from nerif.reconstruction.neural.objective import Objective
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.precision import MixedPrecision
-from nerif.reconstruction.neural.settings import LossWeights
+from nerif.reconstruction.neural.sampling import Draw, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
 
 SMALL = [
@@ -51,58 +51,51 @@ def test_two_processes_find_the_field_of_one(measured, tmp_path, norm, optimiser
     one, two = tmp_path / "one", tmp_path / "two"
     words = ["--norm", norm, "--optimiser", optimiser, "--withhold", "none", *SMALL]
     assert main(["reconstruct", str(measured), "-o", str(one), *words]) == 0
-    done = torchrun("reconstruct", measured, "-o", two, *words)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("all 30 steps done") == 1  # the first process alone tells
+    run = torchrun("reconstruct", measured, "-o", two, *words)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.count("all 30 steps done") == 1  # only the first process reports
     points = 40 * torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 20
     a, b = read_field(one)[0](points), read_field(two)[0](points)
     assert float(a.abs().max()) > 0
     torch.testing.assert_close(a, b, rtol=0, atol=tolerance * float(a.abs().max()))
 
 
-def test_what_does_not_split_is_refused(measured, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("options", [["--method", "tv"], ["--uncertainty", "fast"]])
+def test_voxels_and_bootstrap_are_refused(measured, tmp_path, monkeypatch, capsys, options):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), "--method", "tv"]) == 2
-    assert "under torchrun" in capsys.readouterr().err
-    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), "--uncertainty", "fast"]) == 2
+    assert main(["reconstruct", str(measured), "-o", str(tmp_path / "r"), *options]) == 2
     assert "under torchrun" in capsys.readouterr().err
 
 
-def test_every_ray_is_in_one_share():
-    rays = torch.arange(11)
-    shares = [rays[Ranks(rank, 3).share] for rank in range(3)]
-    assert sorted(torch.cat(shares).tolist()) == rays.tolist()
-
-
-def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_and_counts_for_nothing(measured):
-    """One ray of a technique that measures the gradient and one of a technique that does not, for three processes."""
+def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_with_weight_0(measured):
+    """One ray of a technique with a gradient and one of a technique without, for three processes."""
     m = Measurement.read(measured)
-    fringes = torch.zeros(m.shape)
-    both = replace(m, maps={"fringes": fringes, "fringes_sigma": torch.ones(m.shape)}, wavelength_nm=532.0)
-    weights, heads = LossWeights(1.0, 1.0, 1.0, 1.0), NetworkShape(width=24, depth=2, gradient_head=True)
-    settings = NeRIF(device="cpu", precision="float32", weights=weights, network=heads)
-    data = TrainingData(settings, both, coarsest=1)
+    maps = {"fringes": torch.zeros(m.shape), "fringes_sigma": torch.ones(m.shape)}
+    settings = NeRIF(
+        device="cpu", precision="float32", weights=LossWeights(1.0, 1.0, 1.0, 1.0),
+        network=NetworkShape(width=24, depth=2, gradient_head=True),
+    )  # fmt: skip
+    data = TrainingData(settings, replace(m, maps=maps, wavelength_nm=532.0), coarsest=1)
     torch.manual_seed(0)
-    field = data.untrained()
+    field = data.initial_field()
     network = MixedPrecision(field.network, data.device, settings.precision, settings.compile)
-    index = torch.tensor([0, len(data) - 1])
 
     def of(ranks: Ranks) -> tuple[dict[str, float], set[str], float]:
-        drawn = torch.Generator().manual_seed(1)
-        objective = Objective(settings, data, field, network, drawn, ranks)
-        pieces, whole = objective.batch(index, Draw(1, 8))
-        terms = objective.terms(pieces)
+        generator = torch.Generator().manual_seed(1)
+        batch = Sampler(settings, data, field, network, generator, ranks).of(
+            torch.tensor([0, len(data) - 1]), Draw(1, 8)
+        )
+        objective = Objective(settings, data, field, network, generator)
+        terms = objective.terms(batch)
         field.network.zero_grad()
         sum(terms.values()).backward()
-        weighed = {name for name, p in field.network.named_parameters() if p.grad is not None}
-        share = sum(piece.numbers for piece in pieces) / whole
-        assert share or float(objective.of_nothing([p.part for p in pieces], [p.numbers for p in pieces])) == 0
-        return {name: share * float(term.detach()) for name, term in terms.items()}, weighed, share
+        names = {name for name, p in field.network.named_parameters() if p.grad is not None}
+        share = batch.own_numbers / batch.numbers
+        assert share or float(objective.ambient_term(batch)) == 0
+        return {name: share * float(term.detach()) for name, term in terms.items()}, names, share
 
-    alone, weighed, _ = of(Ranks())
-    shared = [of(Ranks(rank, 3)) for rank in range(3)]
-    assert [share for _, _, share in shared] == [1.0, 0.0, 0.0]
-    for terms, others, _ in shared:
-        assert list(terms) == list(alone)
-        assert others == weighed
-    assert {name: sum(terms[name] for terms, _, _ in shared) for name in alone} == pytest.approx(alone)
+    alone, names, _ = of(Ranks())
+    ranks = [of(Ranks(rank, 3)) for rank in range(3)]
+    assert [share for _, _, share in ranks] == [1.0, 0.0, 0.0]
+    assert all(list(terms) == list(alone) and others == names for terms, others, _ in ranks)
+    assert {name: sum(terms[name] for terms, _, _ in ranks) for name in alone} == pytest.approx(alone)

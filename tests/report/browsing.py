@@ -1,13 +1,16 @@
-"""A real browser, and what tests ask of a page in it."""
+"""A real browser, and what tests read from a page in it."""
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import shutil
 import time
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
@@ -23,7 +26,7 @@ KEYS = {"right": "\ue014", "up": "\ue013", "page up": "\ue00e", "space": " "}
 
 
 def open_browser(profile: Path, *more: str) -> Any:
-    """A fresh Chromium that keeps what the page says and asks for."""
+    """Start a Chromium that logs console and network."""
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -35,7 +38,7 @@ def open_browser(profile: Path, *more: str) -> Any:
 
 
 def show(driver: Any, page: Path, width: int = 960, height: int = 640) -> None:
-    """Open a page at a window's size and wait until it says that it is ready."""
+    """Open a page in a window of this size and wait until it is ready."""
     size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     driver.get_log("browser")
@@ -45,7 +48,7 @@ def show(driver: Any, page: Path, width: int = 960, height: int = 640) -> None:
 
 
 def wait_for(driver: Any, script: str, seconds: float = 30.0) -> None:
-    """Ask again and again until the page says yes."""
+    """Repeat a script until it returns true."""
     end = time.monotonic() + seconds
     while not driver.execute_script(script):
         assert time.monotonic() < end, f"waited in vain for: {script}"
@@ -53,40 +56,47 @@ def wait_for(driver: Any, script: str, seconds: float = 30.0) -> None:
 
 
 def errors(driver: Any) -> list[str]:
-    """What the console calls errors."""
+    """Errors in the console."""
     return [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
 
 
 def requests(driver: Any) -> list[str]:
-    """Addresses that the page asked for, its own, those inside it and the browser's own pages left out."""
-    asked = [json.loads(e["message"])["message"] for e in driver.get_log("performance")]
-    urls = [m["params"]["request"]["url"] for m in asked if m["method"] == "Network.requestWillBeSent"]
+    """Requested addresses, except the page, its own data and the browser's pages."""
+    messages = [json.loads(e["message"])["message"] for e in driver.get_log("performance")]
+    urls = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
     return [u for u in urls if not u.startswith(("data:", "blob:", "file:", "chrome:"))]
 
 
 def image(driver: Any, selector: str) -> np.ndarray:
-    """Red, green, blue of a canvas, as it is seen."""
-    import base64
-    import io
-
-    import imageio.v3 as iio
-
+    """Red, green, blue of a canvas."""
     driver.execute_script(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
     time.sleep(0.4)  # the view sharpens once it rests
     address = driver.execute_script(f"return document.querySelector('{selector}').toDataURL('image/png')")
     return np.asarray(iio.imread(io.BytesIO(base64.b64decode(address.split(",")[1]))))[..., :3].astype(int)
 
 
+def changed(before: np.ndarray, after: np.ndarray, threshold: int = 12) -> float:
+    """Share of pixels that differ."""
+    return float((np.abs(after - before).max(axis=-1) > threshold).mean())
+
+
 def press(driver: Any, selector: str, *keys: str) -> None:
-    """Give an element the focus and type."""
+    """Focus an element and type."""
     element = driver.find_element("css selector", selector)
     driver.execute_script("arguments[0].focus()", element)
     element.send_keys("".join(KEYS.get(k, k) for k in keys))
 
 
 def choose(driver: Any, name: str, value: str) -> None:
-    """Choose one of a switch."""
-    driver.execute_script(f"document.querySelector('input[name={name}][value={value}]').click()")
+    """Choose a radio button."""
+    driver.execute_script(f"document.querySelector('input[name={name}][value=\"{value}\"]').click()")
+
+
+def slide(driver: Any, name: str, value: int) -> None:
+    """Set a slider."""
+    driver.execute_script(
+        f"const s = document.getElementById('{name}'); s.value = {value}; s.dispatchEvent(new Event('input'))"
+    )
 
 
 def text(driver: Any, selector: str) -> str:
@@ -95,7 +105,7 @@ def text(driver: Any, selector: str) -> str:
 
 
 def drag(driver: Any, selector: str, x: int, y: int) -> None:
-    """Press in the middle of an element, move, let go."""
+    """Drag from the centre of an element."""
     from selenium.webdriver.common.action_chains import ActionChains
 
     element = driver.find_element("css selector", selector)
@@ -103,31 +113,20 @@ def drag(driver: Any, selector: str, x: int, y: int) -> None:
     ActionChains(driver).move_to_element(element).click_and_hold().move_by_offset(x, y).release().perform()
 
 
-def middle(driver: Any, selector: str) -> dict[str, int]:
-    """Bring an element to the middle of the window and return where its own middle is then, px."""
+def swipe(driver: Any, selector: str, x: int, y: int) -> float:
+    """Move a finger by (x, y) px from the centre of an element, or tap; return by how much the page scrolls, px."""
+
+    def touch(kind: str, *points: dict[str, float]) -> None:
+        driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": list(points)})
+
     driver.execute_script(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
     box = driver.execute_script(f"return document.querySelector('{selector}').getBoundingClientRect().toJSON()")
-    return {"x": round(box["x"] + box["width"] / 2), "y": round(box["y"] + box["height"] / 2)}
-
-
-def tap(driver: Any, selector: str) -> None:
-    """Touch the middle of an element with a finger, briefly."""
-    swipe(driver, selector, 0, 0)
-
-
-def swipe(driver: Any, selector: str, x: int, y: int) -> float:
-    """Draw a finger by (x, y) px over an element and return how far the page has scrolled by that, px."""
-    at = middle(driver, selector)
+    u, v = round(box["x"] + box["width"] / 2), round(box["y"] + box["height"] / 2)
     before = driver.execute_script("return scrollY")
-    moves = [{"x": at["x"] + x * i / 10, "y": at["y"] + y * i / 10} for i in range(1, 11)] if x or y else []
-    _touch(driver, "touchStart", at)
-    for move in moves:
-        _touch(driver, "touchMove", move)
+    touch("touchStart", {"x": u, "y": v})
+    for i in range(1, 11) if x or y else ():
+        touch("touchMove", {"x": u + x * i / 10, "y": v + y * i / 10})
         time.sleep(0.02)
-    _touch(driver, "touchEnd")
+    touch("touchEnd")
     time.sleep(0.3)
     return float(driver.execute_script("return scrollY")) - before
-
-
-def _touch(driver: Any, kind: str, *points: dict[str, float]) -> None:
-    driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": list(points)})

@@ -22,7 +22,7 @@ QUICK = [
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four views of balls in a box of three different edges, one held out, with error bars and a truth."""
+    """Four views of balls in a box of three different edges, one withheld, with error bars and a truth."""
     folder = tmp_path_factory.mktemp("report")
     measurement, out = str(folder / "m.nc"), str(folder / "balls")
     box = ["--box", "50", "40", "30"]
@@ -36,13 +36,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(whole: Path, tmp_path: Path) -> Path:
-    """A copy to spoil."""
+    """A copy to damage."""
     return Path(shutil.copytree(whole, tmp_path / "copy"))
 
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """One browser for this file."""
     driver = open_browser(tmp_path_factory.mktemp("profile"))
     yield driver
     driver.quit()

@@ -1,4 +1,4 @@
-"""What the page's JavaScript does with what is packed into it, written once more."""
+"""What the page's JavaScript computes from the packed arrays, in Python."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from nerif.report.packing import MASKED
 
 
 def unpack(packed: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Return what `pack` was given, to within half a step."""
+    """The packed values, to within half a step."""
     data = np.frombuffer(zlib.decompress(base64.b64decode(packed["text"])), dtype=np.uint8).astype(np.uint16)
-    steps = data[: len(data) // 2] | (data[len(data) // 2 :] << 8)
-    codes = np.cumsum(steps, dtype=np.uint16)
+    codes = np.cumsum(data[: len(data) // 2] | (data[len(data) // 2 :] << 8), dtype=np.uint16)
     values = packed["low"] + codes * packed["step"]
     return np.where(codes == MASKED, np.nan, values).reshape(shape)
 
 
 def quantity_of(relation: dict[str, Any], x: np.ndarray) -> np.ndarray:
-    """Return the quantity of an index excess, NaN where masked."""
+    """The quantity of an index excess, NaN where masked."""
     with np.errstate(divide="ignore", invalid="ignore"):
         shifted = x.astype(np.float64) + relation["offset"]
         q = shifted * relation["factor"] if relation["kind"] == "linear" else relation["factor"] / shifted

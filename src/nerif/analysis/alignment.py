@@ -1,4 +1,4 @@
-"""The rigid motion that no camera sees: of all cameras with the field. Errors before it and after it."""
+"""The error up to a rigid motion of the field, which no camera can detect if the whole rig moves along."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from nerif.data.volume import Volume
 from nerif.fields.base import Field, in_chunks
 from nerif.geometry.pose import turned
 
-__all__ = ["Moved", "aligned"]
+__all__ = ["MovedField", "aligned"]
 
-POINTS, ROUNDS = 60_000, 12
-SETTLED = 1e-5  # mm, and as much at the edge of the grid
+MAX_POINTS, MAX_ITERATIONS = 60_000, 12
+TOLERANCE = 1e-5  # mm, at the edge of the grid for the rotation
 
 
-class Moved(Field):
-    """Another field, moved: g(x) = f(exp([w]x) x + c).
+class MovedField(Field):
+    """A field in rigid motion: g(x) = f(exp([w]x) x + c).
 
     Parameters
     ----------
@@ -35,33 +35,29 @@ class Moved(Field):
         value, gradient = self.field.value_and_gradient(points @ rotation.T + self.shift.to(points))
         return value, gradient @ rotation
 
-    def to(self, device: torch.device | str) -> Moved:
-        return Moved(self.field.to(device), self.turn, self.shift)
+    def to(self, device: torch.device | str) -> MovedField:
+        return MovedField(self.field.to(device), self.turn, self.shift)
 
 
 @torch.no_grad()
-def aligned(field: Field, truth: Volume) -> Moved:
-    """Return a field moved rigidly to where it is closest to a truth on the truth's grid (Gauss and Newton).
+def aligned(field: Field, truth: Volume) -> MovedField:
+    """Return the field in the rigid motion closest to a truth of its quantity, by Gauss-Newton iteration.
 
-        min_(w, c)  sum |f(exp([w]x) x + c) - truth|^2
-
-    Parameters
-    ----------
-    field : of the truth's quantity
+    min_(w, c)  sum |f(exp([w]x) x + c) - truth|^2
     """
     points = truth.grid.points().reshape(-1, 3)
-    some = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:POINTS]
-    points, wanted = points[some], truth.values.flatten()[some].double()
+    sample = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:MAX_POINTS]
+    points, target = points[sample], truth.values.flatten()[sample].double()
     reach = float(points.norm(dim=1).max())
-    found = Moved(field, torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    for _ in range(ROUNDS):
-        seen = [found.value_and_gradient(some) for some in in_chunks(points)]
-        value, slope = (torch.cat(parts).double() for parts in zip(*seen, strict=True))
-        rotation = turned(found.turn)
-        place, slope = points.double() @ rotation.T, slope @ rotation.T  # where f is asked, but for the shift
-        jacobian = torch.cat([torch.linalg.cross(place, slope) * (1 / reach), slope], dim=1)
-        step = torch.linalg.lstsq(jacobian, (wanted - value)[:, None]).solution[:, 0]
-        found = Moved(field, found.turn + step[:3] / reach, found.shift + step[3:])
-        if float(step.abs().max()) < SETTLED:
+    result = MovedField(field, torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    for _ in range(MAX_ITERATIONS):
+        parts = [result.value_and_gradient(chunk) for chunk in in_chunks(points)]
+        value, gradient = (torch.cat(part).double() for part in zip(*parts, strict=True))
+        rotation = turned(result.turn)
+        position, gradient = points.double() @ rotation.T, gradient @ rotation.T
+        jacobian = torch.cat([torch.linalg.cross(position, gradient) * (1 / reach), gradient], dim=1)
+        step = torch.linalg.lstsq(jacobian, (target - value)[:, None]).solution[:, 0]
+        result = MovedField(field, result.turn + step[:3] / reach, result.shift + step[3:])
+        if float(step.abs().max()) < TOLERANCE:
             break
-    return found
+    return result

@@ -1,11 +1,9 @@
-"""The two halves of an image of an axisymmetric flow: which pixels are on which side, and how far they are alike.
+"""The two halves of an image of an axisymmetric flow: which pixel lies on which side, and how the halves differ.
 
-A field about an axis looks the same from a camera when it is reflected at the plane through the camera and the axis. So
-the map of what was measured is that of itself reflected,
+An axisymmetric field does not change by reflection at the plane through the camera and the axis. The displacement
+map therefore equals its own reflection, apart from noise and the antisymmetric part:
 
-    d(p) = M(q + d(q)) - p,     q = M(p),     M the reflection of the image,
-
-but for noise, and for what is not alike around the axis.
+    d(p) = M(q + d(q)) - p,     q = M(p),     M the reflection of the image
 """
 
 from __future__ import annotations
@@ -26,46 +24,33 @@ from nerif.geometry import Camera
 from nerif.geometry.symmetry import Symmetry
 
 __all__ = [
-    "HALVES",
-    "Reflection",
-    "asymmetry",
-    "asymmetry_sentence",
-    "camera_of",
-    "halved",
-    "kept_half",
-    "left_of_axis",
+    "HALVES", "Reflection", "asymmetry", "asymmetry_sentence", "camera_of", "halved", "left_of_axis", "withhold_half",
 ]  # fmt: skip
 
 HALVES = ("left", "right")
-"""Of an image, beside the axis as it runs in its direction."""
-FEWEST = 30  # pixels that have a counterpart
+"""Halves of an image, seen in the direction of the axis."""
+MIN_PIXELS = 30  # whose reflection was measured too
 
 
 @dataclass(frozen=True)
 class Reflection:
-    """The reflection M of an image at the plane through its camera and an axis.
-
-    Parameters
-    ----------
-    camera : Camera
-    symmetry : about the axis
-    """
+    """The reflection M of an image at the plane through its camera and an axis."""
 
     camera: Camera
     symmetry: Symmetry
 
     def __call__(self, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """Return where pixels are reflected to, px; NaN where that is not seen."""
+        """Return the reflected pixels, px; NaN behind the camera."""
         points = self._points(pixels)
         normal, distance = self._beside(points)
         return self.camera.project(points - 2 * distance[:, None] * normal)
 
     def side(self, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
-        """Return how far to the left of the plane pixels look, mm at the depth of the axis."""
+        """Return the distance of rays from the plane, mm at the depth of the axis, positive on the left."""
         return self._beside(self._points(pixels))[1]
 
     def _points(self, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-        """Where rays pass the axis."""
+        """The points of the rays closest to the axis."""
         rays = self.camera.rays(pixels.to(self.camera.intrinsics.dtype), sensitivity=False)
         axis = torch.tensor(self.symmetry.direction, dtype=torch.float64)
         origin, direction = rays.origin.double(), rays.direction.double()
@@ -75,7 +60,7 @@ class Reflection:
         return origin + s[:, None] * direction
 
     def _beside(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " n"]]:
-        """The plane's normal, towards what is left of the axis in the image, and how far beside it points are."""
+        """The normal of the plane, to the left in the image, and the distance of points from it."""
         axis = torch.tensor(self.symmetry.direction, dtype=torch.float64)
         point = torch.tensor(self.symmetry.point, dtype=torch.float64)
         sight = self.camera.sight(point.to(self.camera.rotation)).double()
@@ -85,30 +70,30 @@ class Reflection:
 
 
 def left_of_axis(camera: Camera, symmetry: Symmetry) -> Bool[Tensor, "row column"]:
-    """Return which pixels of a camera look past the axis on its left."""
+    """Return the pixels of a camera on the left of the axis."""
     pixels = camera.pixel_grid().reshape(-1, 2).double()
     return (Reflection(camera, symmetry).side(pixels) > 0).reshape(camera.image_size)
 
 
 def halved(measurement: Measurement, symmetry: Symmetry) -> Measurement:
-    """Return the measurement with each view as two, NAME left and NAME right, of which each has one half."""
+    """Return the measurement with two views for each, NAME left and NAME right, with the pixels of one half each."""
     inside = measurement.usable
-    cameras, valid = [], []
+    index, cameras, valid = [], [], []
     for view, camera in enumerate(measurement.cameras):
         left = torch.zeros(inside.shape[1:], dtype=torch.bool)
         left[: camera.image_size[0], : camera.image_size[1]] = left_of_axis(camera, symmetry)
         for name, side in zip(HALVES, (left, ~left), strict=True):
             if bool((inside[view] & side).any()):
-                cameras.append((view, replace(camera, name=f"{camera.name} {name}")))
+                index.append(view)
+                cameras.append(replace(camera, name=f"{camera.name} {name}"))
                 valid.append(inside[view] & side)
-    index = [view for view, _ in cameras]
 
     def twice(x: Tensor | None) -> Tensor | None:
         return None if x is None else x[index]
 
     return replace(
         measurement,
-        cameras=tuple(camera for _, camera in cameras),
+        cameras=tuple(cameras),
         displacement=twice(measurement.displacement),
         sigma=twice(measurement.sigma),
         maps={name: value[index] for name, value in measurement.maps.items()},
@@ -123,36 +108,35 @@ def camera_of(view: str) -> str:
     return name if half in HALVES and name else view
 
 
-def kept_half(
+def withhold_half(
     measurement: Measurement, withhold: Sequence[str], axis: Mapping[str, Any] | Symmetry | None
 ) -> tuple[Measurement, tuple[str, ...]]:
-    """Return the measurement in halves, and the names of those held out, if a half is to be; else as they are.
+    """Return the measurement and the names of the withheld views; in halves if `withhold` is one of HALVES.
 
     Parameters
     ----------
-    measurement : Measurement
-    withhold : names of views, or one of HALVES, unless a view is called so
-    axis : about which the flow is symmetric, or what the metrics of a result hold of it; None for no symmetry
+    withhold : names of views, or one of HALVES, unless a view has that name
+    axis : of an axisymmetric flow, or its record in metrics.json; None otherwise
     """
-    words = tuple(withhold)
-    if len(words) != 1 or words[0] not in HALVES or words[0] in measurement.names:
-        return measurement, words
+    names = tuple(withhold)
+    if len(names) != 1 or names[0] not in HALVES or names[0] in measurement.names:
+        return measurement, names
     if not axis:
         raise InputError(
-            f"expected half an image ('{words[0]}') with --symmetry axis only; name views", field="withhold"
+            f"expected half an image ('{names[0]}') with --symmetry axis only; name views", field="withhold"
         )
     symmetry = axis if isinstance(axis, Symmetry) else Symmetry.kept(axis["symmetry"])
-    parts = halved(measurement, symmetry)
-    return parts, tuple(name for name in parts.names if name.endswith(f" {words[0]}"))
+    halves = halved(measurement, symmetry)
+    return halves, tuple(name for name in halves.names if name.endswith(f" {names[0]}"))
 
 
 def asymmetry(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, Any]]:
-    """Return how far what each view measured departs from what it would be of a flow alike around the axis.
+    """Return how far each view departs from that of an axisymmetric flow.
 
-    `cc` is the correlation of each channel with its reflection, `departure` the rms of what is odd over the rms of
-    what was measured, noise taken off both where sigma is known.
+    `cc` is the correlation of each channel with its reflection, `departure` the rms of the antisymmetric part over the
+    rms of the signal, both without noise where sigma is known.
     """
-    found = []
+    rows = []
     for view, camera in enumerate(measurement.cameras):
         for o in measurement.observations:
             if o.technique.derived:
@@ -160,15 +144,15 @@ def asymmetry(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, An
             usable = measurement.usable_for(o)[view] & measurement.sees_box[view]
             row = _of_view(camera, symmetry, o, view, usable)
             if row is not None:
-                found.append({"name": camera.name, "measured": o.technique.measured, **row})
-    return found
+                rows.append({"name": camera.name, "measured": o.technique.measured, **row})
+    return rows
 
 
-def asymmetry_sentence(departure: Mapping[str, Any]) -> str:
-    """Return one of `asymmetry` in words."""
-    cc = ", ".join(f"{name} {value:.3f}" for name, value in departure["cc"].items())
-    share = f"what is odd about the axis is {departure['departure']:.0%} of it"
-    return f"{departure['name']}: the halves of the {departure['measured']} correlate by {cc}; {share}"
+def asymmetry_sentence(row: Mapping[str, Any]) -> str:
+    """Return one row of `asymmetry` in words."""
+    cc = ", ".join(f"{name} {value:.3f}" for name, value in row["cc"].items())
+    share = f"{row['departure']:.0%} of the signal is antisymmetric"
+    return f"{row['name']}: the halves of the {row['measured']} correlate by {cc}; {share}"
 
 
 def _of_view(
@@ -179,31 +163,28 @@ def _of_view(
     values = o.values[view, :height, :width].double().nan_to_num(0.0, 0.0, 0.0) * usable[..., None]
     reflection, pixels = Reflection(camera, symmetry), camera.pixel_grid().reshape(-1, 2).double()
     mirrored = reflection(pixels)
-    known = torch.cat([values, usable[..., None].double()], dim=-1)
-    there = _read(known, mirrored)
-    both = usable.flatten() & (there[:, -1] > 0.999)
-    if int(both.sum()) < FEWEST:
+    sampled = _interpolated(torch.cat([values, usable[..., None].double()], dim=-1), mirrored)
+    both = usable.flatten() & (sampled[:, -1] > 0.999)
+    if int(both.sum()) < MIN_PIXELS:
         return None
-    own, other = values.reshape(len(pixels), -1)[both], there[both, :-1]
+    here, there = values.reshape(len(pixels), -1)[both], sampled[both, :-1]
     if o.technique.in_pixels():
-        other = reflection(mirrored[both] + other) - pixels[both]
+        there = reflection(mirrored[both] + there) - pixels[both]
     channels: Sequence[str] = o.technique.channels
-    cc = {c: _correlation(own[:, i], other[:, i]) for i, c in enumerate(channels)}
-    odd, size = float((own - other).square().mean()) / 2, float(own.square().mean())
+    cc = {c: _correlation(here[:, i], there[:, i]) for i, c in enumerate(channels)}
+    antisymmetric, signal = float((here - there).square().mean()) / 2, float(here.square().mean())
     if o.sigma is not None:
         noise = float(o.sigma[view, :height, :width].double().reshape(len(pixels), -1)[both].square().mean())
-        odd, size = max(odd - noise, 0.0), max(size - noise, 0.0)
-    if not size > 0:
-        return None  # there is nothing but noise, which has no symmetry to depart from
-    return {"cc": cc, "departure": math.sqrt(odd / size)}
+        antisymmetric, signal = max(antisymmetric - noise, 0.0), max(signal - noise, 0.0)
+    return {"cc": cc, "departure": math.sqrt(antisymmetric / signal)} if signal > 0 else None
 
 
-def _read(known: Float[Tensor, "row column c"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
-    """A map between its pixels, 0 beyond it."""
-    height, width, _ = known.shape
+def _interpolated(image: Float[Tensor, "row column c"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
+    """Bilinear interpolation, 0 outside the image."""
+    height, width, _ = image.shape
     size = pixels.new_tensor([width - 1, height - 1]).clamp_min(1)
     place = (2 * pixels / size - 1).nan_to_num(9.0)
-    sampled = functional.grid_sample(known.movedim(-1, 0)[None], place[None, None], align_corners=True)
+    sampled = functional.grid_sample(image.movedim(-1, 0)[None], place[None, None], align_corners=True)
     return sampled[0, :, 0].T
 
 

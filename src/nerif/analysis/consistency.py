@@ -1,13 +1,13 @@
-"""Consistency of the views of a measurement: does each agree with the others, and if not, what is wrong with it?
+"""Consistency of the views of a measurement (`nerif check`): does each agree with the others, and if not, why?
 
-Each view is predicted by a quick reconstruction from the others. Common mistakes (components swapped, signs, mirrored
-or exchanged images, ...) are undone one at a time; the one whose removal clearly improves a fit to all views is
-reported, then the next is searched. What fits equally well either way cannot be detected: all signs flipped, or a
-mirrored image of a symmetric flow.
+For each technique: the maps are binned and inspected by themselves (`image_remarks`). Each view is predicted by a
+quick reconstruction from the others (`predicted_by_others`). Common mistakes (swapped components, signs, mirrored or
+exchanged images: `Correction`) are undone one at a time; the one whose correction clearly improves a joint fit is
+reported, then the next is searched. If no view is predicted by the others, common errors of whole calibrations
+(geometry/plausibility.py) are tried instead (`unrelated_finding`). Last, rays through each face of the box show whether
+the flow extends beyond it (`open_faces`). `corrected` applies the corrections.
 
-Where most views are not predicted at all, the rig as a whole is wrong. The limit is a share of the correlation of
-neighbouring pixels, which noise lowers alike. Common errors of calibrations (geometry/plausibility.py) and images under
-the names of other cameras are undone one at a time, and the one that restores agreement is the likely cause.
+A mistake that fits as well as the truth cannot be detected: all signs flipped, or a mirrored image of a symmetric flow.
 """
 
 from __future__ import annotations
@@ -39,136 +39,201 @@ from nerif.reconstruction.gauge import ambient_faces
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 __all__ = [
-    "NOISY",
-    "Consistency",
-    "Correction",
-    "ViewAgreement",
-    "binned",
-    "check_consistency",
-    "compare",
-    "corrected",
-    "disagreement",
-    "everywhere",
-    "exchanges",
-    "fit",
-    "looks",
-    "of_one_view",
-    "open_faces",
-    "orders",
-    "path_integral",
-    "predicted_by_others",
-    "repeatable",
-    "unrelated",
-    "unrelated_finding",
-    "values_of",
-    "with_values",
-    "without_spikes",
-]
+    "Change", "Consistency", "Correction", "ViewAgreement", "binned", "check_consistency", "compare", "corrected",
+    "everywhere", "fit", "image_remarks", "of_one_view", "open_faces", "orders", "predicted_by_others", "repeatability",
+    "unrelated", "unrelated_finding", "without_spikes",
+]  # fmt: skip
 
-LITTLE = 0.2  # of what pixels agree with their neighbours: correct rigs reach 0.38 and more, wrong ones at most 0.15
-ENOUGH = 0.35  # of the same, that views reach without the likely cause
-NOISY = 0.3  # agreement of neighbouring pixels below which noise hides whether views agree
-SAME = 0.02  # of agreement, which tells no cause from another
-JUDGES = 3  # views by which a cause is judged
+MAX_PIXELS = 48  # along the longer edge of the images that are compared
+SPIKE = 6.0  # times the 95th percentile: rays along a sharp edge, which no coarse reconstruction resolves
+OF_GRADIENTS, OF_INTEGRALS = 3e-3, 3e-4  # regularisation with which withheld views are predicted to about 10 % in size
+
+MAX_OBJECTIVE, MAX_OBJECTIVE_EVERYWHERE = 0.97, 0.8  # of the joint fit, corrected over uncorrected, of one view or all
+MAX_DISAGREEMENT = 0.95  # of a view, corrected over uncorrected, that is worth a joint fit
+MAX_EXCHANGED, MAX_EXCHANGED_LAST = 1.15, 1.03  # disagreement of two views, exchanged over unexchanged: worth a joint
+# fit, and at last, predicted without both
+FEW_VIEWS, MAX_OBJECTIVE_FEW = 9, 0.9  # of fewer views, neighbours are further apart: an exchange needs more evidence
+DISAGREES = 0.5  # agreement of a view over the median, below which it is reported
+WRONG_GAIN = 1.6  # factor of the values of a view
+
+UNRELATED = 0.2  # agreement over repeatability: correct rigs reach 0.38 and more, wrong ones at most 0.15
+EXPLAINED = 0.35  # of the same, that corrected views reach
+MIN_REPEATABILITY = 0.3  # below which noise hides whether views agree
+SAME_AGREEMENT = 0.02
+TRIAL_VIEWS = 3  # by which a cause is judged
+
+OPEN_FACE = (0.4, 2.0)  # the unexplained rms of rays through an open face over the signal of other rays, and its share
+# of their own signal over that share of other rays; rays through an end face cross a corner of the box and carry little
+# signal, of which a flow that ends at the box leaves a large share unexplained, but little in all
+MIN_RAYS = 20
 
 
-def repeatable(small: Measurement) -> float:
-    """Return the correlation (about 0) of neighbouring pixels, median over the views: 0 of white noise alone."""
-    found = []
-    for values, camera in zip(values_of(small), small.cameras, strict=True):
-        height, width = camera.image_size
-        d = values[:height, :width]
-        along = 0 if width < 2 else 1
-        a, b = d.narrow(along, 0, d.shape[along] - 1), d.narrow(along, 1, d.shape[along] - 1)
-        both = torch.isfinite(a).all(dim=-1) & torch.isfinite(b).all(dim=-1)
-        size = float(a[both].norm() * b[both].norm())
-        found.append(float((a[both] * b[both]).sum()) / size if size > 0 else 0.0)
-    return float(torch.tensor(found).median())
-
-
-def unrelated(agreements: Sequence[float], small: Measurement) -> bool:
-    """Return whether the views have nothing to do with one another, and it is not noise that hides it."""
-    most = repeatable(small)
-    return most > NOISY and float(torch.tensor(agreements).median()) < LITTLE * most
-
-
-def unrelated_finding(
-    small: Measurement, agreements: Sequence[float], voxels: int, suspicious: Sequence[int] = (),
-    on_step: Callable[[int, int], None] = lambda done, total: None,
-) -> Finding:  # fmt: skip
-    """Say that no view is predicted by the others, and why that is likely so.
+@dataclass(frozen=True)
+class ViewAgreement:
+    """How well one view agrees with the others.
 
     Parameters
     ----------
-    small : the measurement, binned
-    agreements : of its views
-    voxels : of the quick reconstructions, along the longest edge
-    suspicious : numbers of the cameras that cannot be where they are; all may be wrong where there are none
-    on_step : called with the number of causes tried, and of all
+    name : of the view
+    valid : share of its valid pixels
+    agreement : correlation of the measurement, corrected, with the prediction from the other views
+    gain : factor between measured and predicted values
+    verdict : the mistake, if any
+    measured : the quantity compared
     """
-    trials = _trials(small, suspicious)
-    best, words = 0.0, ""
-    for number, (suspected, trial) in enumerate(trials):
-        with suppress(InputError):  # not a rig to reconstruct from either
-            reached = _agreement(trial, voxels)
-            if reached > best + SAME:  # of two that explain as much, the more common one
-                best, words = reached, suspected
-        on_step(number + 1, len(trials))
-    if best > ENOUGH * repeatable(small):
-        cause = f"likely {words}: without that the agreement is {best:.2f}"
-    else:
-        cause = "check units (mm), poses (world to camera), and whether each image has the camera of its name"
-    now = float(torch.tensor(agreements).median())
-    sentence = f"no view is predicted by the others (agreement {now:.2f}, median of {len(agreements)}): {cause}"
-    return Finding("unrelated", sentence, small.names)
+
+    name: str
+    valid: float
+    agreement: float
+    gain: float
+    verdict: str
+    measured: str = "displacement"
 
 
-def _trials(small: Measurement, suspicious: Sequence[int]) -> list[tuple[str, Measurement]]:
-    """The measurement without each of the likely causes."""
-    trials = []
-    for suspect, cameras, box in suspects(small.cameras, small.box, suspicious or None):
-        with suppress(InputError):
-            trials.append((suspect.words, replace(small, cameras=cameras, box=box)))
-    for correction in orders(small.cameras):
-        trials.append((correction.words, with_values(small, correction.undo(values_of(small), small.cameras))))
-    return trials
+@dataclass(frozen=True)
+class Consistency:
+    """The outcome of a check.
+
+    Parameters
+    ----------
+    views : agreement of every view; empty if there are too few views to compare
+    findings : mistakes, most severe first: unrelated views, then the rig, then single views
+    remarks : further notes
+    corrections : that undo the mistakes, by the name of the technique (`corrected`)
+    """
+
+    views: tuple[ViewAgreement, ...]
+    findings: tuple[Finding, ...]
+    remarks: tuple[str, ...]
+    corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
 
 
-def _agreement(small: Measurement, voxels: int) -> float:
-    """The median agreement of a few views with the others."""
-    step = -(-len(small.names) // JUDGES)
-    judges = range(0, len(small.names), step)
-    reached = [compare(predicted_by_others(small, [i], voxels)[i], small, i)[0] for i in judges]
-    return float(torch.tensor(reached).median())
+@on_free_cores
+def check_consistency(
+    measurement: Measurement, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
+    aperture: str = "auto",
+) -> Consistency:  # fmt: skip
+    """Compare every view with a quick reconstruction from the others, for each technique.
+
+    Parameters
+    ----------
+    measurement : of three views or more; with fewer, only the data themselves are inspected
+    voxels : of the quick reconstructions, along the longest edge
+    on_step : called with the numbers of finished and of all reconstructions of this round
+    aperture : depth of field, as in NeRIF
+    """
+    measurement = seen_through(measurement, aperture)
+    observations = integrals_of(measurement)
+    rig = rig_findings(measurement.cameras, measurement.box)
+    past_box = {name for finding in rig if finding.code == "beside" for name in finding.views}
+    suspicious = [name for finding in rig for name in finding.views]
+    views: list[ViewAgreement] = []
+    findings: list[Finding] = []
+    remarks: list[str] = []
+    corrections: dict[str, tuple[Correction, ...]] = {}
+    for observation in observations:
+        try:
+            one = _check_technique(observation, measurement, voxels, on_step, past_box, suspicious)
+        except InputError as error:
+            if not rig:
+                raise
+            remarks.append(f"views were not compared: {error}")
+            continue
+        prefix = f"{observation.technique.name}: " if len(observations) > 1 else ""
+        views += one.views
+        corrections |= one.corrections
+        findings += [replace(finding, sentence=prefix + finding.sentence) for finding in one.findings]
+        remarks += [prefix + remark for remark in one.remarks]
+    worst = [finding for finding in findings if finding.code == "unrelated"]
+    others = [finding for finding in findings if finding.code != "unrelated"]
+    return Consistency(tuple(views), (*worst, *rig, *others), tuple(remarks), corrections)
 
 
-OF_GRADIENTS, OF_INTEGRALS = 3e-3, 3e-4  # weights with which withheld views are predicted at their size, to about 10 %
-SPIKE = 6.0  # times the 95th percentile: rays along a sharp edge, which no coarse reconstruction follows
+def _check_technique(
+    observation: Observation, measurement: Measurement, voxels: int, on_step: Callable[[int, int], None],
+    past_box: Collection[str], suspicious: Collection[str],
+) -> Consistency:  # fmt: skip
+    """Compare the views of one technique, without those that look past the box; cameras of others may be wrong."""
+    kind, measurement = observation.technique, observation.alone(measurement)
+    names = [name for name in measurement.names if name not in past_box]
+    if not names:
+        return Consistency((), (), ("no view looks at the box: nothing to compare",))
+    measurement = measurement.select(names)
+    small = uncorrected = without_spikes(binned(measurement, MAX_PIXELS))
+    pixels = measurement.usable.flatten(1).sum(dim=1).tolist()
+    valid = [n / (c.image_size[0] * c.image_size[1]) for n, c in zip(pixels, measurement.cameras, strict=True)]
+    remarks = image_remarks(measurement, small, valid)
+    if len(names) < 3:
+        return Consistency((), (), (*remarks, "fewer than three views: they cannot be compared"))
+    corrections: list[Correction] = []
+    for _ in range(max(1, len(names) // 2)):
+        correction = _most_likely_mistake(small, voxels, on_step)
+        if correction is None:
+            break
+        corrections.append(correction)
+        small = _undone(correction, small)
+    joint, objective = fit(small, voxels)
+    if not objective > 0:
+        nothing = f"every {kind.measured} of rays through the box is 0: nothing to compare"
+        return Consistency((), (), (*remarks, nothing))
+    compared = _compared(small, voxels)
+    if unrelated([agreement for agreement, _ in compared], small):
+        compared = _compared(uncorrected, voxels) if corrections else compared
+        numbers = [i for i, name in enumerate(names) if name in suspicious]
+        finding = unrelated_finding(uncorrected, [agreement for agreement, _ in compared], voxels, numbers, on_step)
+        views = [
+            ViewAgreement(name, share, agreement, gain, "not predicted by the others", kind.measured)
+            for name, share, (agreement, gain) in zip(names, valid, compared, strict=True)
+        ]
+        return Consistency(tuple(views), (finding,), tuple(remarks))
+    if repeatability(small) < MIN_REPEATABILITY:
+        remarks.append("the noise is too large to judge whether the views agree")
+    findings = [_finding(c, names) for c in corrections]
+    median = float(torch.tensor([a for a, _ in compared]).median())
+    extreme = max(range(len(names)), key=lambda i: abs(math.log(max(compared[i][1], 1e-6))))  # it affects the others
+    views = []
+    for i, (agreement, gain) in enumerate(compared):
+        mistakes = [c for c in corrections if i in c.views and len(c.views) < len(names)]
+        verdict, code = "; ".join(c.words for c in mistakes), ""
+        if not mistakes and agreement < DISAGREES * median and median > 0.3 and len(names) > 4:
+            verdict = "does not agree with the other views: wrong calibration, other flow, or other time?"
+            code = "unlike"
+        elif not mistakes and i == extreme and not 1 / WRONG_GAIN < gain < WRONG_GAIN and agreement > 0.5:
+            verdict = f"{kind.measured} {gain:.2g} times that predicted by the other views: {kind.misscaled}?"
+            code = "misscaled"
+        if code:
+            findings.append(Finding(code, f"view {names[i]}: {verdict}", (names[i],)))
+        views.append(ViewAgreement(names[i], valid[i], agreement, gain, verdict, kind.measured))
+    if not any(v.verdict for v in views) or corrections:  # a wrong view has rays through every face
+        findings += open_faces(joint, small)
+    if kind.quantity == INDEX:
+        mean = float(joint.sample(Grid.of_resolution(small.box, voxels)).mean())
+        gas = "lighter (hot gas, helium)" if mean < 0 else "denser (cold or heavy gas)"
+        remarks.append(f"the flow is {gas} than the ambient; if this is wrong, all signs are flipped")
+    return Consistency(
+        tuple(views), tuple(findings), tuple(remarks), {kind.name: tuple(corrections)} if corrections else {}
+    )
 
 
-def values_of(small: Measurement) -> Float[Tensor, "view row column c"]:
-    """Return what was measured."""
+# -- binned maps, and what they show by themselves ----------------------------------------------------------------
+
+
+def _values(small: Measurement) -> Float[Tensor, "view row column c"]:
     return small.observations[0].values
 
 
-def with_values(small: Measurement, values: Float[Tensor, "view row column c"]) -> Measurement:
-    """Return the measurement with other values."""
+def _with_values(small: Measurement, values: Float[Tensor, "view row column c"]) -> Measurement:
     return small.observed({small.observations[0].technique.name: values})
 
 
-def path_integral(small: Measurement) -> PathIntegral:
-    """Return what the technique sees of a field."""
-    return PathIntegral(forward_model(small.observations[0].technique, small))
+def binned(measurement: Measurement, max_pixels: int) -> Measurement:
+    """Return the measurement with pixels averaged in squares, no image longer than about `max_pixels`.
 
-
-def binned(measurement: Measurement, longest: int) -> Measurement:
-    """Return the measurement with pixels averaged in squares, so that no image is longer than about `longest` px.
-
-    Images of a few rows keep one, as high as their squares would be or as they are. A square counts if half of its
-    pixels do; of a view so sparse that none would, if one does. Sigma and masks are left behind.
+    Images of few rows keep one row. A square is valid if half of its pixels are; in a view so sparse that none would
+    be, if one pixel is. Sigma and masks are dropped.
     """
-    most = -(-max(max(c.image_size) for c in measurement.cameras) // longest)
-    down, across = (max(1, min(most, *(c.image_size[i] for c in measurement.cameras))) for i in (0, 1))
+    edge = -(-max(max(c.image_size) for c in measurement.cameras) // max_pixels)
+    down, across = (max(1, min(edge, *(c.image_size[i] for c in measurement.cameras))) for i in (0, 1))
     scale = torch.tensor([across, down], dtype=measurement.cameras[0].intrinsics.dtype)
     cameras = []
     for camera in measurement.cameras:
@@ -179,36 +244,87 @@ def binned(measurement: Measurement, longest: int) -> Measurement:
         cameras.append(replace(camera, intrinsics=k, image_size=(height // down, width // across)))
     rows, columns = (n // bins for n, bins in zip(measurement.shape[1:], (down, across), strict=True))
     inside = (slice(0, rows * down), slice(0, columns * across))
-    seen = measurement.observations[0]
-    pixels = scale if seen.technique.in_pixels() else torch.ones(1)
+    observation = measurement.observations[0]
+    pixels = scale if observation.technique.in_pixels() else torch.ones(1)
     maps = []
-    for values, usable in zip(seen.values, measurement.usable, strict=True):
+    for values, usable in zip(observation.values, measurement.usable, strict=True):
         good = usable[inside].reshape(rows, down, columns, across)
         parts = torch.where(good[..., None], values[inside].reshape(rows, down, columns, across, -1), 0.0)
         count = good.sum(dim=(1, 3))[..., None]
         mean = parts.sum(dim=(1, 3)) / count.clamp_min(1) / pixels.to(values)
-        mean = mean if seen.signed else mean.clamp_min(0)  # below it is noise, which without sigma would be refused
-        enough = count * 2 >= down * across
-        maps.append(torch.where(enough if bool(enough.any()) else count > 0, mean, torch.nan))
+        mean = mean if observation.signed else mean.clamp_min(0)  # negative values are noise, and refused without sigma
+        dense = count * 2 >= down * across
+        maps.append(torch.where(dense if bool(dense.any()) else count > 0, mean, torch.nan))
     return measurement_of(
-        {seen.technique: torch.stack(maps)}, cameras, measurement.box, measurement.n_ambient, measurement.wavelength_nm,
-        measurement.ambient_faces,
+        {observation.technique: torch.stack(maps)}, cameras, measurement.box, measurement.n_ambient,
+        measurement.wavelength_nm, measurement.ambient_faces,
     )  # fmt: skip
 
 
 def without_spikes(small: Measurement) -> Measurement:
-    """Return the measurement without the few pixels whose value is far beyond all others that are not 0."""
-    values = values_of(small)
+    """Return the measurement without the few pixels that far exceed all other non-zero values."""
+    values = _values(small)
     length = values.norm(dim=-1)
-    some = length[length > 0]
-    if not len(some):
+    nonzero = length[length > 0]
+    if not len(nonzero):
         return small
-    limit = SPIKE * torch.quantile(some[:: max(1, len(some) // 1_000_000)], 0.95)
-    return with_values(small, torch.where((length <= limit)[..., None], values, torch.nan))
+    limit = SPIKE * torch.quantile(nonzero[:: max(1, len(nonzero) // 1_000_000)], 0.95)
+    return _with_values(small, torch.where((length <= limit)[..., None], values, torch.nan))
+
+
+def image_remarks(measurement: Measurement, small: Measurement, valid: Sequence[float]) -> list[str]:
+    """Return remarks on views with few valid pixels, or whose border is not at rest."""
+    remarks, kind = [], measurement.observations[0].technique
+    for i, name in enumerate(measurement.names):
+        if valid[i] < 0.5:
+            remarks.append(f"view {name}: only {valid[i]:.0%} of its pixels are valid")
+        rows, columns = small.cameras[i].image_size
+        d = _values(small)[i, :rows, :columns]
+        finite = torch.isfinite(d).all(dim=-1)
+        border = torch.ones(rows, columns, dtype=torch.bool)
+        edge = max(1, min(rows, columns) // 12)
+        down = slice(edge, -edge) if rows > 2 * edge else slice(None)  # the border of a line is its two ends
+        border[down, edge:-edge] = False
+        border &= finite
+        if int(border.sum()) < 20:
+            continue
+        offset, spread = d[border].median(dim=0).values, d[border].std(dim=0)
+        rms = d[finite].square().mean().sqrt()
+        if float(offset.norm()) > 0.5 * float(rms) and bool((offset.abs() > 2 * spread).any()):
+            remarks.append(f"view {name}: {_of_border(kind, offset, measurement.cameras[i].image_size[1] / columns)}")
+    return remarks
+
+
+def _of_border(kind: type[ForwardModel], offset: Tensor, bin_edge: float) -> str:
+    if kind.background:
+        u, v = (float(x) * bin_edge for x in offset)
+        return (
+            f"displacement at the border ({u:.2f}, {v:.2f}) px; if the camera moved, nerif displacement "
+            "--shake-border removes it"
+        )
+    value = f"{kind.measured} at the border {float(offset[0]):.3g}"
+    return f"{value}; if only the ambient is there, subtract it as the offset of the background"
+
+
+def repeatability(small: Measurement) -> float:
+    """Return the correlation (about 0) of neighbouring pixels, median over the views; 0 for white noise."""
+    correlations = []
+    for values, camera in zip(_values(small), small.cameras, strict=True):
+        height, width = camera.image_size
+        d = values[:height, :width]
+        axis = 0 if width < 2 else 1
+        a, b = d.narrow(axis, 0, d.shape[axis] - 1), d.narrow(axis, 1, d.shape[axis] - 1)
+        both = torch.isfinite(a).all(dim=-1) & torch.isfinite(b).all(dim=-1)
+        size = float(a[both].norm() * b[both].norm())
+        correlations.append(float((a[both] * b[both]).sum()) / size if size > 0 else 0.0)
+    return float(torch.tensor(correlations).median())
+
+
+# -- views predicted by the others --------------------------------------------------------------------------------
 
 
 def fit(measurement: Measurement, voxels: int, weight: float = 0.0) -> tuple[Field, float]:
-    """Return a quick reconstruction, and its objective; of weight 0 smooth enough to predict other views well."""
+    """Return a quick reconstruction and its objective; weight 0 is smooth enough to predict other views well."""
     weight = weight or (OF_GRADIENTS if measurement.observations[0].technique.gauge else OF_INTEGRALS)
     settings = Tikhonov(
         voxels=voxels, basis="linear", iterations=20, tolerance=1e-3, regularisation=weight, coarse_to_fine=False,
@@ -218,171 +334,86 @@ def fit(measurement: Measurement, voxels: int, weight: float = 0.0) -> tuple[Fie
     return result.field, float(result.history[-1]["objective"])
 
 
+def _path_integral(small: Measurement) -> PathIntegral:
+    return PathIntegral(forward_model(small.observations[0].technique, small))
+
+
 def predicted_by_others(
-    small: Measurement, left_out: Sequence[int], voxels: int
+    small: Measurement, withheld: Sequence[int], voxels: int
 ) -> dict[int, Float[Tensor, "row column c"]]:
-    """Return what the other views predict of those left out."""
-    others = [name for i, name in enumerate(small.names) if i not in left_out]
-    field, _ = fit(small.select(others), voxels)
-    return {i: predict_view(field, small.cameras[i], path_integral(small), small.box) for i in left_out}
+    """Return the prediction of withheld views from the others."""
+    field, _ = fit(small.select([name for i, name in enumerate(small.names) if i not in withheld]), voxels)
+    return {i: predict_view(field, small.cameras[i], _path_integral(small), small.box) for i in withheld}
 
 
 def compare(
     predicted: Float[Tensor, "row column c"], small: Measurement, view: int, measured: Tensor | None = None
 ) -> tuple[float, float]:
-    """Return the correlation (about 0) of what is measured and predicted, and the factor between them."""
+    """Return the correlation (about 0) of measurement and prediction, and the factor between them."""
     height, width = small.cameras[view].image_size
-    measured = (values_of(small)[view] if measured is None else measured)[:height, :width]
+    measured = (_values(small)[view] if measured is None else measured)[:height, :width]
     good = torch.isfinite(measured).all(dim=-1)
     a, b = predicted[good].flatten(), measured[good].flatten()
     product = float((a * b).sum())
     return product / max(float(a.norm() * b.norm()), 1e-30), product / max(float(a.square().sum()), 1e-30)
 
 
-def disagreement(predicted: Tensor, small: Measurement, view: int, measured: Tensor) -> float:
-    """Return the share of what is measured that a prediction does not explain: 0 at best, 2 for the opposite."""
+def _disagreement(predicted: Tensor, small: Measurement, view: int, measured: Tensor) -> float:
+    """The share of the measurement that a prediction does not explain: 0 at best, 2 for the opposite."""
     correlation, _ = compare(predicted, small, view, measured)
     return 1 - correlation * abs(correlation)
 
 
-OPEN = (0.4, 2.0)  # flow goes on beyond a face: what is not explained of rays through it is at least this share of what
-# the others measured, and this many times theirs as a share of its own. Rays through an end cross a corner of the box
-# and carry little: flow that ends at the box leaves a large share of that unexplained, but of a small thing
-FEWEST = 20  # rays of which something can be said
+def _compared(small: Measurement, voxels: int) -> list[tuple[float, float]]:
+    """Agreement and gain of every view."""
+    return [compare(predicted_by_others(small, [i], voxels)[i], small, i) for i in range(len(small.names))]
 
 
-def open_faces(field: Field, small: Measurement) -> list[Finding]:
-    """Return a finding for each face beyond which the flow seems to go on: rays through it fit worse than others.
+# -- mistakes and their corrections -------------------------------------------------------------------------------
 
-    The others are those through faces known to be ambient alone. Where no face is, they are those not through this one
-    nor through one that was found; the worst face comes first.
-    """
-    what, known = small.observations[0].technique.measured, ambient_faces(small)
-    squares, through = _through_faces(field, small)
-    suspects = [face for face in FACES if face not in known]
-    ambient, left = torch.ones(len(squares), dtype=torch.bool), torch.ones(len(squares), dtype=torch.bool)
-    for face in suspects:
-        ambient &= ~through[face]
-    found = {}
-    for face in sorted(suspects, key=lambda face: -_unexplained(squares[through[face]])):
-        own, usual = squares[through[face] & left], squares[ambient if known else ~through[face] & left]
-        if len(own) < FEWEST or len(usual) < FEWEST:
-            continue
-        share, share_usual = _unexplained(own), _unexplained(usual)
-        size = float((own[:, 0].mean() / (usual if known else squares[left])[:, 1].mean()).sqrt())
-        if size > OPEN[0] and share > OPEN[1] * share_usual:
-            left &= ~through[face]
-            found[face] = Finding(
-                "open_face",
-                f"face {face}: {share:.0%} of the {what} of rays through it is not explained, {share_usual:.0%} of "
-                f"the others; the flow seems to go on beyond it: give --open-faces {face}, or a larger box",
-            )
-    return [found[face] for face in suspects if face in found]
-
-
-def _through_faces(field: Field, small: Measurement) -> tuple[Float[Tensor, "n 2"], dict[str, Bool[Tensor, " n"]]]:
-    """Of every ray that measured something the squares of what is not explained, and of it all; and its faces."""
-    model, channels = path_integral(small), values_of(small).shape[-1]
-    squares: list[Tensor] = []
-    through: dict[str, list[Tensor]] = {face: [] for face in FACES}
-    for i, camera in enumerate(small.cameras):
-        height, width = camera.image_size
-        predicted = predict_view(field, camera, model, small.box).reshape(-1, channels)
-        measured = values_of(small)[i, :height, :width].reshape(-1, channels)
-        rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(small.box)
-        good = torch.isfinite(measured).all(dim=-1) & rays.crosses
-        both = torch.stack([(predicted - measured).square().sum(dim=-1), measured.square().sum(dim=-1)], dim=-1)
-        squares.append(both[good])
-        for face in FACES:
-            through[face].append(rays.exit_faces(small.box, [face])[good])
-    return torch.cat(squares), {face: torch.cat(masks) for face, masks in through.items()}
-
-
-def _unexplained(squares: Float[Tensor, "n 2"]) -> float:
-    """The share of what rays measured that is not explained, 0 where they measured nothing."""
-    lost, all_of_it = squares.sum(dim=0).tolist()
-    return math.sqrt(lost / all_of_it) if all_of_it > 0 else 0.0
-
-
-def looks(measurement: Measurement, small: Measurement, valid: Sequence[float]) -> list[str]:
-    """Return what the maps themselves tell."""
-    remarks, kind = [], measurement.observations[0].technique
-    for i, name in enumerate(measurement.names):
-        if valid[i] < 0.5:
-            remarks.append(f"view {name}: only {valid[i]:.0%} of its pixels can be used")
-        rows, columns = small.cameras[i].image_size
-        d = values_of(small)[i, :rows, :columns]
-        rim = torch.ones(rows, columns, dtype=torch.bool)
-        edge = max(1, min(rows, columns) // 12)
-        down = slice(edge, -edge) if rows > 2 * edge else slice(None)  # a line has two ends and no rim
-        rim[down, edge:-edge] = False
-        rim &= torch.isfinite(d).all(dim=-1)
-        inner = d[torch.isfinite(d).all(dim=-1)]
-        if int(rim.sum()) < 20:
-            continue
-        offset, spread = d[rim].median(dim=0).values, d[rim].std(dim=0)
-        rms = inner.square().mean().sqrt()
-        if float(offset.norm()) > 0.5 * float(rms) and bool((offset.abs() > 2 * spread).any()):
-            remarks.append(f"view {name}: {_of_rim(kind, offset, measurement.cameras[i].image_size[1] / columns)}")
-    return remarks
-
-
-def _of_rim(kind: type[ForwardModel], offset: Tensor, shrunk: float) -> str:
-    """What a rim says that is not at rest, in images that were shrunk."""
-    if kind.background:
-        u, v = (float(x) * shrunk for x in offset)
-        moved = f"its rim is displaced by ({u:.2f}, {v:.2f}) px as a whole; did the camera move?"
-        return f"{moved} nerif displacement --shake-border removes it"
-    value = f"its rim shows {kind.measured} {float(offset[0]):.3g} as a whole"
-    return f"{value}; if nothing but the ambient is there, subtract it as the offset of the background"
-
-
-SORTED = "images and cameras were sorted differently, one by numbers (2, 10), the other by letters (10, 2)"
-REVERSED = "images and cameras are in opposite order"
-
-View = Callable[[Tensor], Tensor]  # (row, column, channel) to the same
+Transform = Callable[[Tensor], Tensor]  # of an image (row, column, channel)
 
 
 @dataclass(frozen=True)
 class Change:
-    """What may have happened to a view.
+    """A mistake that a view may have.
 
     Parameters
     ----------
     code : of its Finding
-    words : for people
-    undo : the change that undoes it
-    everywhere : its name if all views have it; empty if that cannot be detected
-    square : whether it can happen to square images only
+    words : its description
+    undo : the transform that undoes it
+    everywhere : its description if all views have it; empty if that cannot be detected
+    square : whether only square images can have it
     """
 
     code: str
     words: str
-    undo: View
+    undo: Transform
     everywhere: str = ""
     square: bool = False
 
 
-def _signs(u: float, v: float) -> View:
+def _signs(u: float, v: float) -> Transform:
     return lambda d: d * d.new_tensor([u, v])
 
 
-MIRRORED, UPSIDE_DOWN = "the image is mirrored left to right", "the image is upside down, mirrored top to bottom"
-TURNED = "the image is turned by 180 degrees"
-
-TRANSPOSED, QUARTER = "the image is transposed (rows and columns exchanged)", "the image is turned by 90 degrees"
-
-
-def _vectors_of(image: View, u: float, v: float) -> View:
-    """Undo what happened to an image whose rows became columns: its vectors have the axes exchanged, and signs."""
+def _vectors_of(image: Transform, u: float, v: float) -> Transform:
+    """The transform of vectors whose image has rows and columns exchanged."""
     return lambda d: _signs(u, v)(image(d).flip(-1))
 
+
+MIRRORED, UPSIDE_DOWN = "the image is mirrored left to right", "the image is upside down, mirrored top to bottom"
+TURNED, QUARTER = "the image is turned by 180 degrees", "the image is turned by 90 degrees"
+TRANSPOSED = "the image is transposed (rows and columns exchanged)"
+SORTED = "images and cameras were sorted differently, one by numbers (2, 10), the other by letters (10, 2)"
+REVERSED = "images and cameras are in opposite order"
 
 OF_VECTORS = (
     Change("swapped", "u and v are swapped", lambda d: d.flip(-1), "u and v are swapped"),
     Change("flipped", "the sign of the displacement is flipped (is it the optical flow, which is -d?)", _signs(-1, -1)),
     Change("flipped_u", "the sign of u is flipped", _signs(-1, 1)),
-    # of either component it looks alike, but for the sign of the field
+    # either component is equivalent, but for the sign of the field
     Change("flipped_v", "the sign of v is flipped", _signs(1, -1), "the sign of one component, u or v, is flipped"),
     Change("mirrored", MIRRORED, lambda d: _signs(-1, 1)(d.flip(1)), MIRRORED),
     Change("reversed_columns", "the columns are reversed", lambda d: d.flip(1)),
@@ -404,33 +435,33 @@ OF_SCALARS = (
     Change("quarter_turn", QUARTER, lambda d: d.rot90(1, (0, 1)), square=True),
     Change("quarter_turn", QUARTER, lambda d: d.rot90(-1, (0, 1)), square=True),
 )
-"""Of maps with one number a pixel."""
+"""Of maps with one value per pixel."""
 
 SIGN = Change("flipped", "the sign is flipped", lambda d: -d)
-"""Of one value per pixel that may be negative. A flipped sign of all values cannot be detected."""
+"""Of one value per pixel that may be negative; undetectable in all views at once."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What is wrong with which views.
+    """The correction of a mistake in some views.
 
     Parameters
     ----------
     views : indices
     code : of its Finding
-    words : for people
-    change : what undoes it in each of them; None where images have the places of others
-    order : of each of these views then, the number under which its image is
+    words : description of the mistake
+    change : transform of each of these views; None where images are exchanged
+    order : index of the image of each of these views, where images are exchanged
     """
 
     views: tuple[int, ...]
     code: str
     words: str
-    change: View | None
+    change: Transform | None
     order: tuple[int, ...] = ()
 
     def undo(self, d: Tensor, cameras: Sequence[Camera]) -> Tensor:
-        """Return values (view, row, column, channel) without the mistake; each view has its own size."""
+        """Return corrected values (view, row, column, channel); each view has its own size."""
         d = d.clone()
         if self.change is None:
             d[list(self.views)] = d[list(self.order)]
@@ -441,8 +472,17 @@ class Correction:
         return d
 
 
+def _undone(correction: Correction, small: Measurement) -> Measurement:
+    return _with_values(small, correction.undo(_values(small), small.cameras))
+
+
+def _finding(correction: Correction, names: Sequence[str]) -> Finding:
+    views = tuple(names[i] for i in correction.views)
+    return Finding(correction.code, f"{Finding.subject(views, len(names))}: {correction.words}", views)
+
+
 def _changes(observation: Observation, cameras: Sequence[Camera]) -> list[Change]:
-    """What may have happened to the images of these cameras."""
+    """The mistakes that images of these sizes can have."""
     changes = OF_VECTORS if len(observation.technique.channels) == 2 else OF_SCALARS
     if len(observation.technique.channels) == 1 and observation.signed:
         changes = (*changes, SIGN)
@@ -451,322 +491,243 @@ def _changes(observation: Observation, cameras: Sequence[Camera]) -> list[Change
 
 
 def of_one_view(view: int, observation: Observation, cameras: Sequence[Camera]) -> list[Correction]:
-    """Everything that may be wrong with one view alone."""
+    """Return the possible mistakes of a single view."""
     return [Correction((view,), c.code, c.words, c.undo) for c in _changes(observation, [cameras[view]])]
 
 
-def exchanges(cameras: Sequence[Camera]) -> list[Correction]:
-    """Every two views of one image size that may be exchanged."""
+def everywhere(observation: Observation, cameras: Sequence[Camera]) -> list[Correction]:
+    """Return the possible mistakes of all views together."""
+    views, changes = tuple(range(len(cameras))), _changes(observation, cameras)
+    return [Correction(views, c.code, c.everywhere, c.undo) for c in changes if c.everywhere]
+
+
+def _exchanges(cameras: Sequence[Camera]) -> list[Correction]:
+    """All pairs of views of equal size."""
     sizes = [c.image_size for c in cameras]
     pairs = [(j, i) for i in range(len(sizes)) for j in range(i) if sizes[i] == sizes[j]]
     return [Correction(pair, "exchanged", "these two views are exchanged", None, pair[::-1]) for pair in pairs]
 
 
 def orders(cameras: Sequence[Camera]) -> list[Correction]:
-    """Orders in which the images of all views may have been given to the cameras, where their sizes allow it."""
+    """Return the orders in which the images may have been assigned to the cameras, where their sizes allow it."""
     names, sizes = [c.name for c in cameras], [c.image_size for c in cameras]
     every = tuple(range(len(names)))
     by_number = sorted(every, key=lambda i: [float(word) for word in re.findall(r"\d+(?:\.\d+)?", names[i])])
     by_letter = sorted(every, key=lambda i: names[i])
     there, back = dict(zip(by_number, by_letter, strict=True)), dict(zip(by_letter, by_number, strict=True))
-    ways = {tuple(there[i] for i in every): SORTED, tuple(back[i] for i in every): SORTED, every[::-1]: REVERSED}
-    ways.pop(every, None)
-    possible = {order: words for order, words in ways.items() if [sizes[i] for i in order] == sizes}
-    return [Correction(every, "reordered", words, None, order) for order, words in possible.items()]
-
-
-def everywhere(observation: Observation, cameras: Sequence[Camera]) -> list[Correction]:
-    """What may be wrong with all views alike."""
-    views = tuple(range(len(cameras)))
-    changes = _changes(observation, cameras)
-    return [Correction(views, c.code, c.everywhere, c.undo) for c in changes if c.everywhere]
-
-
-LONGEST = 48  # px along the longer edge of the images that are compared, whatever the size of the sensor
-BETTER = 0.97  # a mistake is one if undoing it brings the objective of the joint fit below this share
-SHORTLIST = 0.95  # worth a joint fit: undoing it brings the disagreement with the other views below this share
-NO_EXCHANGE = 1.15  # two views are not worth a joint fit if they fit each other's prediction so much worse
-EXCHANGE = 1.03  # two views are exchanged only if what the other views predict of them does not speak against it
-BETTER_EVERYWHERE = 0.8  # and below this if it is to have happened to all views
-FEW, BETTER_OF_FEW = 9, 0.9  # with fewer views, neighbours are further apart, and an exchange needs stronger evidence
-UNLIKE = 0.5  # a view that agrees less than this share of the median, for no reason that is known
-GAIN = 1.6  # a view whose values are this many times too large or too small
-
-
-@dataclass(frozen=True)
-class ViewAgreement:
-    """How well one view agrees with the others.
-
-    Parameters
-    ----------
-    name : of the view
-    valid : share of its pixels that can be used
-    agreement : correlation of what is measured with what the other views predict, mistakes that were found undone
-    gain : factor by which measured values are larger than predicted
-    verdict : what is wrong with it, or nothing
-    measured : what is compared
-    """
-
-    name: str
-    valid: float
-    agreement: float
-    gain: float
-    verdict: str
-    measured: str = "displacement"
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """What was found.
-
-    Parameters
-    ----------
-    views : agreement of every view; empty if there are too few views to compare
-    findings : mistakes, the worst first: no view predicted by the others, then the rig, then single views
-    remarks : what a user should know besides
-    corrections : what undoes the mistakes that can be undone, of each technique by its name (`corrected`)
-    """
-
-    views: tuple[ViewAgreement, ...]
-    findings: tuple[Finding, ...]
-    remarks: tuple[str, ...]
-    corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
-
-
-@on_free_cores
-def check_consistency(
-    measurement: Measurement, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
-    aperture: str = "auto",
-) -> Consistency:  # fmt: skip
-    """Compare every view with a quick reconstruction from the others, technique by technique.
-
-    Parameters
-    ----------
-    measurement : of three views or more; of fewer only the data themselves are looked at
-    voxels : of the quick reconstructions, along the longest edge
-    on_step : called with the number of reconstructions done, and of those in this round
-    aperture : whether views see through the whole of their lens (seen_through)
-
-    Raises
-    ------
-    InputError
-        If the aperture is "on" and none is known.
-    """
-    measurement = seen_through(measurement, aperture)
-    observations = integrals_of(measurement)
-    several = len(observations) > 1
-    views: list[ViewAgreement] = []
-    rig = rig_findings(measurement.cameras, measurement.box)
-    past = {name for finding in rig if finding.code == "beside" for name in finding.views}
-    findings: list[Finding] = []
-    remarks: list[str] = []
-    corrections: dict[str, tuple[Correction, ...]] = {}
-    for observation in observations:
-        try:
-            own = _check(observation, measurement, voxels, on_step, past, [name for f in rig for name in f.views])
-        except InputError as error:
-            if not rig:
-                raise
-            remarks.append(f"views were not compared: {error}")
-            continue
-        of = f"{observation.technique.name}: " if several else ""
-        views += own.views
-        corrections |= own.corrections
-        findings += [replace(finding, sentence=of + finding.sentence) for finding in own.findings]
-        remarks += [of + remark for remark in own.remarks]
-    hopeless = [finding for finding in findings if finding.code == "unrelated"]
-    others = [finding for finding in findings if finding.code != "unrelated"]
-    return Consistency(tuple(views), (*hopeless, *rig, *others), tuple(remarks), corrections)
-
-
-def _check(
-    observation: Observation, measurement: Measurement, voxels: int, on_step: Callable[[int, int], None],
-    past: Collection[str], suspicious: Collection[str],
-) -> Consistency:  # fmt: skip
-    """Compare the views of one technique but those that look past the box; cameras of some may be wrong."""
-    kind, measurement = observation.technique, observation.alone(measurement)
-    seeing = [name for name in measurement.names if name not in past]
-    if not seeing:
-        return Consistency((), (), ("no view looks at the box: nothing can be compared",))
-    measurement = measurement.select(seeing)
-    small = without_spikes(binned(measurement, LONGEST))
-    pixels = measurement.usable.flatten(1).sum(dim=1).tolist()
-    valid = [n / (c.image_size[0] * c.image_size[1]) for n, c in zip(pixels, measurement.cameras, strict=True)]
-    remarks = looks(measurement, small, valid)
-    names = small.names
-    if len(names) < 3:
-        return Consistency((), (), (*remarks, "fewer than three views: they cannot be compared with one another"))
-    found: list[Correction] = []
-    uncorrected = small
-    for _ in range(max(1, len(names) // 2)):
-        correction = _most_likely_mistake(small, voxels, on_step)
-        if correction is None:
-            break
-        found.append(correction)
-        small = _without(correction, small)
-    everything, objective = fit(small, voxels)
-    if not objective > 0:
-        nothing = f"every {kind.measured} of rays through the box is 0: there is nothing to compare"
-        return Consistency((), (), (*remarks, nothing))
-    views: list[ViewAgreement] = []
-    compared = _compared(small, voxels)
-    if unrelated([agreement for agreement, _ in compared], small):
-        compared = _compared(uncorrected, voxels) if found else compared
-        numbers = [i for i, name in enumerate(names) if name in suspicious]
-        agreements = [agreement for agreement, _ in compared]
-        finding = unrelated_finding(uncorrected, agreements, voxels, numbers, on_step)
-        words = "not predicted by the others"
-        for name, share, (agreement, gain) in zip(names, valid, compared, strict=True):
-            views.append(ViewAgreement(name, share, agreement, gain, words, kind.measured))
-        return Consistency(tuple(views), (finding,), tuple(remarks))
-    if repeatable(small) < NOISY:
-        remarks.append("noise hides most of what was measured, and with it whether the views agree")
-    findings = [_finding(c, names) for c in found]
-    middle = float(torch.tensor([a for a, _ in compared]).median())
-    oddest = max(range(len(names)), key=lambda i: abs(math.log(max(compared[i][1], 1e-6))))  # it pulls at the others
-    for i, (agreement, gain) in enumerate(compared):
-        own = [c for c in found if i in c.views and len(c.views) < len(names)]
-        verdict, code = "; ".join(c.words for c in own), ""
-        if not own and agreement < UNLIKE * middle and middle > 0.3 and len(names) > 4:
-            verdict, code = "does not fit the other views: wrong calibration, other flow, or other time?", "unlike"
-        elif not own and i == oddest and not 1 / GAIN < gain < GAIN and agreement > 0.5:
-            verdict = f"{kind.measured} {gain:.2g} times what the other views predict: {kind.misscaled}?"
-            code = "misscaled"
-        if code:
-            findings.append(Finding(code, f"view {names[i]}: {verdict}", (names[i],)))
-        views.append(ViewAgreement(names[i], valid[i], agreement, gain, verdict, kind.measured))
-    if not any(v.verdict for v in views) or found:  # a view that does not fit has rays through every face
-        findings += open_faces(everything, small)
-    if kind.quantity == INDEX:
-        mean = float(everything.sample(Grid.of_resolution(small.box, voxels)).mean())
-        gas = "lighter (hot gas, helium)" if mean < 0 else "denser (cold or heavy gas)"
-        remarks.append(f"the flow comes out {gas} than the ambient; if that is wrong, every sign is flipped")
-    undone = {kind.name: tuple(found)} if found else {}
-    return Consistency(tuple(views), tuple(findings), tuple(remarks), undone)
+    words = {tuple(there[i] for i in every): SORTED, tuple(back[i] for i in every): SORTED, every[::-1]: REVERSED}
+    words.pop(every, None)
+    return [
+        Correction(every, "reordered", text, None, order)
+        for order, text in words.items() if [sizes[i] for i in order] == sizes
+    ]  # fmt: skip
 
 
 def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int, int], None]) -> Correction | None:
-    """The one mistake whose undoing helps the joint fit most, if it helps clearly."""
+    """The correction that improves the joint fit most, if it does so clearly."""
     views = range(len(small.names))
-    observation, d = small.observations[0], values_of(small)
-    alike, done = [*everywhere(observation, small.cameras), *orders(small.cameras)], 0
+    observation, d = small.observations[0], _values(small)
+    of_all, done = [*everywhere(observation, small.cameras), *orders(small.cameras)], 0
 
     def step(total: int) -> None:
         nonlocal done
         done += 1
         on_step(done, total)
 
-    likely, agreements, predictions = [], [], []
+    shortlist, agreements, predictions = [], [], {}
     for i in views:
-        predicted = predicted_by_others(small, [i], voxels)[i]
-        now = disagreement(predicted, small, i, d[i])
+        predictions[i] = predicted = predicted_by_others(small, [i], voxels)[i]
+        limit = MAX_DISAGREEMENT * _disagreement(predicted, small, i, d[i])
         agreements.append(compare(predicted, small, i)[0])
-        ways = of_one_view(i, observation, small.cameras)
-        left = [disagreement(predicted, small, i, c.undo(d, small.cameras)[i]) for c in ways]
-        likely += [c for c, x in zip(ways, left, strict=True) if x < SHORTLIST * now]
-        predictions.append(predicted)
+        shortlist += [
+            c for c in of_one_view(i, observation, small.cameras)
+            if _disagreement(predicted, small, i, c.undo(d, small.cameras)[i]) < limit
+        ]  # fmt: skip
         step(2 * len(views))
-    likely += [c for c in exchanges(small.cameras) if _crossed(dict(enumerate(predictions)), small, c) < NO_EXCHANGE]
-    _, before = fit(small, voxels, 1e-4)
-    if not before > 0:  # nothing was measured
+    shortlist += [c for c in _exchanges(small.cameras) if _exchanged(predictions, small, c) < MAX_EXCHANGED]
+    _, uncorrected = fit(small, voxels, 1e-4)
+    if not uncorrected > 0:
         return None
     results = []
-    for correction in [*likely, *alike]:
-        gain = fit(_without(correction, small), voxels, 1e-4)[1] / before
-        limit = BETTER_EVERYWHERE if len(correction.views) == len(views) else BETTER
-        results.append((gain / limit, gain, correction))  # what all views have must gain more than what a few have
-        step(len(views) + len(likely) + len(alike))
-    enough = UNLIKE * float(torch.tensor(agreements).median())
-    for over_limit, gain, correction in sorted(results, key=lambda r: r[0]):
+    for correction in [*shortlist, *of_all]:
+        ratio = fit(_undone(correction, small), voxels, 1e-4)[1] / uncorrected
+        limit = MAX_OBJECTIVE_EVERYWHERE if len(correction.views) == len(views) else MAX_OBJECTIVE
+        results.append((ratio / limit, ratio, correction))
+        step(len(views) + len(shortlist) + len(of_all))
+    min_agreement = DISAGREES * float(torch.tensor(agreements).median())
+    for over_limit, ratio, correction in sorted(results, key=lambda r: r[0]):
         if over_limit > 1:
             return None
         if correction.change is None and len(correction.views) == 2:
-            clear = len(views) >= FEW or gain < BETTER_OF_FEW
-            expected = predicted_by_others(small, correction.views, voxels)
-            if not clear or _crossed(expected, small, correction) > EXCHANGE:
+            clear = len(views) >= FEW_VIEWS or ratio < MAX_OBJECTIVE_FEW
+            predicted_pair = predicted_by_others(small, correction.views, voxels)
+            if not clear or _exchanged(predicted_pair, small, correction) > MAX_EXCHANGED_LAST:
                 continue
-        if len(correction.views) == len(views) or _fits(_without(correction, small), correction.views, enough, voxels):
+        if len(correction.views) == len(views):
+            return correction
+        trial = _undone(correction, small)
+        corrected_pair = predicted_by_others(trial, correction.views, voxels)
+        if all(compare(corrected_pair[i], trial, i)[0] >= min_agreement for i in correction.views):
             return correction
     return None
 
 
-def _fits(mended: Measurement, views: Sequence[int], enough: float, voxels: int) -> bool:
-    """Whether views agree with the others once mended; one that does not has something else."""
-    predicted = predicted_by_others(mended, views, voxels)
-    return all(compare(predicted[i], mended, i)[0] >= enough for i in views)
-
-
-def _without(correction: Correction, small: Measurement) -> Measurement:
-    return with_values(small, correction.undo(values_of(small), small.cameras))
-
-
-def _crossed(predicted: dict[int, Tensor], small: Measurement, pair: Correction) -> float:
-    """Disagreement of two views with predictions of each other, as a share of that with their own."""
+def _exchanged(predicted: Mapping[int, Tensor], small: Measurement, pair: Correction) -> float:
+    """Disagreement of two exchanged views with the predictions, over that of the unexchanged ones."""
     i, j = pair.views
-    d = values_of(small)
-    straight = sum(disagreement(predicted[k], small, k, d[k]) for k in (i, j))
-    crossed = disagreement(predicted[i], small, i, d[j]) + disagreement(predicted[j], small, j, d[i])
+    d = _values(small)
+    straight = sum(_disagreement(predicted[k], small, k, d[k]) for k in (i, j))
+    crossed = _disagreement(predicted[i], small, i, d[j]) + _disagreement(predicted[j], small, j, d[i])
     return crossed / max(straight, 1e-30)
 
 
-def _compared(small: Measurement, voxels: int) -> list[tuple[float, float]]:
-    """Agreement and gain of every view with what the others predict of it."""
-    return [compare(predicted_by_others(small, [i], voxels)[i], small, i) for i in range(len(small.names))]
+# -- errors of the whole rig, and of the box ----------------------------------------------------------------------
 
 
-def _finding(correction: Correction, names: Sequence[str]) -> Finding:
-    views = tuple(names[i] for i in correction.views)
-    return Finding(correction.code, f"{Finding.subject(views, len(names))}: {correction.words}", views)
+def unrelated(agreements: Sequence[float], small: Measurement) -> bool:
+    """Return whether no view is predicted by the others, though the noise is low enough to judge it."""
+    limit = repeatability(small)  # noise lowers both
+    return limit > MIN_REPEATABILITY and float(torch.tensor(agreements).median()) < UNRELATED * limit
 
 
-def corrected(measurement: Measurement, found: Consistency) -> Measurement:
-    """Return a measurement with the corrections of `found` applied, to sigma and masks as well.
-
-    Images of the pattern are left out: they are not what was corrected.
+def unrelated_finding(
+    small: Measurement, agreements: Sequence[float], voxels: int, suspicious: Sequence[int] = (),
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> Finding:  # fmt: skip
+    """Return the finding that no view is predicted by the others, with the most likely cause.
 
     Parameters
     ----------
-    measurement : that was compared, by one technique beside its images
-    found : by check_consistency, of this measurement
+    small : the measurement, binned
+    agreements : of its views
+    voxels : of the quick reconstructions, along the longest edge
+    suspicious : indices of cameras with impossible poses; none: all may be wrong
+    on_step : called with the numbers of tested and of all causes
+    """
+    trials = _trials(small, suspicious)
+    best, cause = 0.0, ""
+    for number, (words, trial) in enumerate(trials):
+        with suppress(InputError):  # not a valid rig either
+            agreement = _agreement(trial, voxels)
+            if agreement > best + SAME_AGREEMENT:  # otherwise the earlier, more common cause
+                best, cause = agreement, words
+        on_step(number + 1, len(trials))
+    if best > EXPLAINED * repeatability(small):
+        remedy = f"likely {cause}: without that the agreement is {best:.2f}"
+    else:
+        remedy = "check units (mm), poses (world to camera), and whether each image has the camera of its name"
+    median = float(torch.tensor(agreements).median())
+    sentence = f"no view is predicted by the others (agreement {median:.2f}, median of {len(agreements)}): {remedy}"
+    return Finding("unrelated", sentence, small.names)
 
-    Raises
-    ------
-    InputError
-        If there is nothing that can be undone, or there are several techniques, whose views share their masks.
+
+def _trials(small: Measurement, suspicious: Sequence[int]) -> list[tuple[str, Measurement]]:
+    """The measurement without each of the likely causes."""
+    trials = []
+    for suspect, cameras, box in suspects(small.cameras, small.box, suspicious or None):
+        with suppress(InputError):
+            trials.append((suspect.words, replace(small, cameras=cameras, box=box)))
+    return trials + [(correction.words, _undone(correction, small)) for correction in orders(small.cameras)]
+
+
+def _agreement(small: Measurement, voxels: int) -> float:
+    """The median agreement of TRIAL_VIEWS views."""
+    views = range(0, len(small.names), -(-len(small.names) // TRIAL_VIEWS))
+    agreements = [compare(predicted_by_others(small, [i], voxels)[i], small, i)[0] for i in views]
+    return float(torch.tensor(agreements).median())
+
+
+def open_faces(field: Field, small: Measurement) -> list[Finding]:
+    """Return a finding for each face beyond which the flow seems to extend: rays through it fit worse than others.
+
+    The others are those through faces known to be ambient only or, without such faces, all that cross neither this
+    face nor one already found, the worst first.
+    """
+    measured, ambient = small.observations[0].technique.measured, ambient_faces(small)
+    squares, through = _through_faces(field, small)
+    suspect_faces = [face for face in FACES if face not in ambient]
+    closed, rest = torch.ones(len(squares), dtype=torch.bool), torch.ones(len(squares), dtype=torch.bool)
+    for face in suspect_faces:
+        closed &= ~through[face]
+    findings = {}
+    for face in sorted(suspect_faces, key=lambda face: -_unexplained(squares[through[face]])):
+        inside, others = squares[through[face] & rest], squares[closed if ambient else ~through[face] & rest]
+        if len(inside) < MIN_RAYS or len(others) < MIN_RAYS:
+            continue
+        share, share_others = _unexplained(inside), _unexplained(others)
+        size = float((inside[:, 0].mean() / (others if ambient else squares[rest])[:, 1].mean()).sqrt())
+        if size > OPEN_FACE[0] and share > OPEN_FACE[1] * share_others:
+            rest &= ~through[face]
+            findings[face] = Finding(
+                "open_face",
+                f"face {face}: {share:.0%} of the {measured} of rays through it is unexplained, {share_others:.0%} for "
+                f"other rays; the flow seems to extend beyond it: give --open-faces {face}, or a larger box",
+            )
+    return [findings[face] for face in suspect_faces if face in findings]
+
+
+def _through_faces(field: Field, small: Measurement) -> tuple[Float[Tensor, "n 2"], dict[str, Bool[Tensor, " n"]]]:
+    """Squares of the residual and of the measurement of every valid ray, and which rays cross each face."""
+    model, channels = _path_integral(small), _values(small).shape[-1]
+    squares: list[Tensor] = []
+    through: dict[str, list[Tensor]] = {face: [] for face in FACES}
+    for i, camera in enumerate(small.cameras):
+        height, width = camera.image_size
+        predicted = predict_view(field, camera, model, small.box).reshape(-1, channels)
+        measured = _values(small)[i, :height, :width].reshape(-1, channels)
+        rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(small.box)
+        good = torch.isfinite(measured).all(dim=-1) & rays.crosses
+        both = torch.stack([(predicted - measured).square().sum(dim=-1), measured.square().sum(dim=-1)], dim=-1)
+        squares.append(both[good])
+        for face in FACES:
+            through[face].append(rays.exit_faces(small.box, [face])[good])
+    return torch.cat(squares), {face: torch.cat(masks) for face, masks in through.items()}
+
+
+def _unexplained(squares: Float[Tensor, "n 2"]) -> float:
+    """The unexplained share of the rms signal; 0 without a signal."""
+    residual, signal = squares.sum(dim=0).tolist()
+    return math.sqrt(residual / signal) if signal > 0 else 0.0
+
+
+# -- the corrected measurement ------------------------------------------------------------------------------------
+
+
+def corrected(measurement: Measurement, consistency: Consistency) -> Measurement:
+    """Return a measurement with all corrections applied to values, sigma and masks, without images of the pattern.
+
+    Parameters
+    ----------
+    measurement : of one technique beside its images
+    consistency : the check of this measurement
     """
     observations = integrals_of(measurement)
     if len(observations) > 1:
         names = " and ".join(o.technique.name for o in observations)
-        raise InputError(
-            f"expected one technique to correct, got {names}; correct each file by itself", field="measurement"
-        )
+        raise InputError(f"expected one technique to correct, got {names}; correct each file", field="measurement")
     (observation,) = observations
-    corrections = found.corrections.get(observation.technique.name, ())
+    corrections = consistency.corrections.get(observation.technique.name, ())
     if not corrections:
-        raise InputError("nothing was found in it that can be undone", field="measurement")
+        raise InputError("nothing was found in it that can be corrected", field="measurement")
     alone = observation.alone(measurement)
     if alone.names != measurement.names:
-        raise InputError(
-            "expected that every view measured something, for views are corrected by number", field="measurement"
-        )
+        raise InputError("expected valid pixels in every view; corrections number the views", field="measurement")
     for correction in corrections:
-        alone = _undone(correction, alone)
+        alone = _corrected(correction, alone)
     return alone
 
 
-def _undone(correction: Correction, measurement: Measurement) -> Measurement:
-    (own,) = measurement.observations
-    cameras, name = measurement.cameras, own.technique.name
-    values = correction.undo(own.values, cameras)
-    sigma = None if own.sigma is None else correction.undo(own.sigma, cameras).abs()
-    channels = own.values.shape[-1]
+def _corrected(correction: Correction, measurement: Measurement) -> Measurement:
+    (observation,) = measurement.observations
+    cameras, name, values = measurement.cameras, observation.technique.name, observation.values
+    sigma = None if observation.sigma is None else correction.undo(observation.sigma, cameras).abs()
 
-    def mask(of: Tensor | None) -> Tensor | None:
-        """A mask as a map of as many channels, so that it is turned and exchanged likewise."""
-        if of is None:
+    def mask(valid: Tensor | None) -> Tensor | None:
+        """The corrected mask, by way of a map with the channels of the values."""
+        if valid is None:
             return None
-        alike = of.to(own.values.dtype)[..., None].expand(*of.shape, channels).contiguous()
-        return correction.undo(alike, cameras).abs()[..., 0] > 0.5
+        channels = valid.to(values.dtype)[..., None].expand(*valid.shape, values.shape[-1]).contiguous()
+        return correction.undo(channels, cameras).abs()[..., 0] > 0.5
 
-    mended = measurement.observed({name: values}, {name: sigma})
-    return replace(mended, valid=mask(measurement.valid), flow_mask=mask(measurement.flow_mask))
+    result = measurement.observed({name: correction.undo(values, cameras)}, {name: sigma})
+    return replace(result, valid=mask(measurement.valid), flow_mask=mask(measurement.flow_mask))

@@ -1,4 +1,4 @@
-"""How close two volumes or two displacement maps are (paper, App. C), by scikit-image where it has the measure."""
+"""Similarity of two volumes or two maps (paper, App. C), and the coverage of standard deviations."""
 
 from __future__ import annotations
 
@@ -15,48 +15,49 @@ __all__ = [
 Array = np.ndarray
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Shares of Gaussian errors, at which a reliability diagram is drawn."""
+"""Confidence levels of a reliability diagram."""
+NAN = float("nan")
 
 
 def correlation(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> float:
-    """Return the correlation coefficient (paper, Eq. (cc)); NaN where one of the two is constant."""
+    """Return the correlation coefficient (paper, Eq. (cc)); NaN if either is constant."""
     x, y = a.astype(np.float64).ravel(), b.astype(np.float64).ravel()
     x, y = x - x.mean(), y - y.mean()
     norm = math.sqrt(float(x @ x) * float(y @ y))
-    return float(x @ y) / norm if norm > 0 else float("nan")
+    return float(x @ y) / norm if norm > 0 else NAN
 
 
 def psnr(truth: Float[Array, "*n"], test: Float[Array, "*n"]) -> float:
-    """Return the peak signal-to-noise ratio in dB (paper, Eq. (psnr)), the peak being the range of the truth."""
+    """Return the peak signal-to-noise ratio in dB (paper, Eq. (psnr)); the peak is the range of the truth."""
     span = float(truth.max() - truth.min())
     if span == 0:
-        return float("nan")
+        return NAN
     error = float(np.square(truth.astype(np.float64) - test.astype(np.float64)).mean())
     return 10 * math.log10(span**2 / error) if error > 0 else float("inf")
 
 
 def ssim(truth: Float[Array, "*n"], test: Float[Array, "*n"]) -> float:
-    """Return the mean structural similarity (paper, Eq. (ssim)) over windows of 7; in 2-D or 3-D."""
+    """Return the mean structural similarity (paper, Eq. (ssim)) over windows of 7, in 2-D or 3-D."""
     from skimage.metrics import structural_similarity
 
     span = float(truth.max() - truth.min())
     if span == 0 or min(truth.shape) < 7:
-        return float("nan")
+        return NAN
     return float(structural_similarity(truth.astype(np.float64), test.astype(np.float64), data_range=span))
 
 
 def volume_errors(truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_ambient: float) -> dict[str, float]:
-    """Compare two volumes of index excess, voxel by voxel.
+    """Compare two volumes of index excess.
 
-    l2 = |n_gt - n_rec| / |n_gt - 1| (the paper's, flattered by the ambient), l2_variation = the same over
-    |n_gt - n_ambient| (the honest one), and cc.
+    l2 = |n_gt - n_rec| / |n_gt - 1| (the paper's; small because n - 1 is mostly the ambient),
+    l2_variation = |n_gt - n_rec| / |n_gt - n_ambient|, and cc.
     """
     gt, rec = truth.astype(np.float64), test.astype(np.float64)
     error = float(np.linalg.norm(gt - rec))
     variation = float(np.linalg.norm(gt))
     return {
         "l2": error / float(np.linalg.norm(gt + (n_ambient - 1))),
-        "l2_variation": error / variation if variation > 0 else float("nan"),
+        "l2_variation": error / variation if variation > 0 else NAN,
         "cc": correlation(gt, rec),
     }
 
@@ -71,35 +72,29 @@ def slice_metrics(
 ) -> list[dict[str, float]]:
     """Return cc, ssim and psnr of equally spaced slices across z; `heights` in mm."""
     nz = truth.shape[0]
-    chosen = np.unique(((np.arange(slices) + 0.5) * nz / slices).astype(int))
+    indices = np.unique(((np.arange(slices) + 0.5) * nz / slices).astype(int))
+    scores = {"cc": correlation, "ssim": ssim, "psnr": psnr}
     return [
-        {
-            "z_mm": float(heights[i]),
-            "cc": correlation(truth[i], test[i]),
-            "ssim": ssim(truth[i], test[i]),
-            "psnr": psnr(truth[i], test[i]),
-        }
-        for i in chosen
+        {"z_mm": float(heights[i]), **{name: score(truth[i], test[i]) for name, score in scores.items()}}
+        for i in indices
     ]
 
 
 def view_metrics(
     measured: Float[Array, "row column c"], predicted: Float[Array, "row column c"], valid: Array
 ) -> dict[str, float]:
-    """Compare what a view measured with what is predicted over the valid pixels: cc, ssim, psnr, rms of all components.
+    """Return cc, ssim, psnr and rms difference of a view over the valid pixels.
 
-    SSIM needs whole windows: pixels that are not valid are set to the same value in both maps and windows centred on
-    them are left out.
+    For SSIM, which needs whole windows, invalid pixels are set equal in both maps, and windows around them left out.
     """
     from skimage.metrics import structural_similarity
 
     if not valid.any():
-        nan = float("nan")
-        return {"cc": nan, "ssim": nan, "psnr": nan, "rms": nan}
+        return {"cc": NAN, "ssim": NAN, "psnr": NAN, "rms": NAN}
     a, b = measured[valid], predicted[valid]
     rms = float(np.sqrt(np.mean((a - b).astype(np.float64) ** 2)))
     span = float(a.max() - a.min())
-    similarity = float("nan")
+    similarity = NAN
     if span > 0 and min(valid.shape) >= 7:
         maps = []
         for c in range(measured.shape[-1]):
@@ -114,24 +109,21 @@ def coverage(
 ) -> dict[str, float | list[float]]:
     """Return how often errors lie within standard deviations, everywhere and in the flow.
 
-    share and share_in_flow count those within two, share_in_one and share_in_one_in_flow those within one; reliability
-    lists, for each of LEVELS, the share in the flow within as many as hold that share of Gaussian errors; spearman is
-    the rank correlation of |error| and std, everywhere.
+    share and share_in_flow: within two standard deviations; share_in_one and share_in_one_in_flow: within one;
+    reliability: in the flow, within the interval of each of LEVELS; spearman: rank correlation of |error| and std.
 
     Source: Guo et al., On calibration of modern neural networks, Proc. ICML (2017), for the diagram.
     """
     from scipy.stats import norm, spearmanr
 
-    size, std = np.abs(error).ravel(), std.ravel()
-    inside = flow.ravel()
+    size, std, inside = np.abs(error).ravel(), std.ravel(), flow.ravel()
     one, two = size <= std, size <= 2 * std
-    times = [float(norm.ppf((1 + level) / 2)) for level in LEVELS]
-    own, held = size[inside], std[inside]
+    z = [float(norm.ppf((1 + level) / 2)) for level in LEVELS]
     return {
         "share": float(two.mean()),
         "share_in_flow": float(two[inside].mean()),
         "share_in_one": float(one.mean()),
         "share_in_one_in_flow": float(one[inside].mean()),
-        "reliability": [float((own <= z * held).mean()) for z in times],
+        "reliability": [float((size[inside] <= k * std[inside]).mean()) for k in z],
         "spearman": float(spearmanr(size, std).statistic),
     }

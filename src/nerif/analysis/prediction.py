@@ -1,4 +1,4 @@
-"""What cameras would see of a field that is known."""
+"""Prediction of the views that cameras take of a field."""
 
 from __future__ import annotations
 
@@ -26,68 +26,64 @@ from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, f
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.voxels.operator import rays_through
-from nerif.reconstruction.voxels.symmetric_operator import seen_of
+from nerif.reconstruction.voxels.symmetric_operator import project_spline
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
-SAMPLES = 80  # a ray; 0.06 % of the rms displacement of a network fitted to the flame
+SAMPLES = 80  # per ray; error 0.06 % of the rms displacement for a network fitted to the flame
 EXACT_WORK = {"cpu": 2.5e11, "cuda": 2.5e13}  # multiplications: ten seconds on two cores
-VOXELS, BEYOND = 100, 3  # along the longest edge of the box, and beyond each face
-SYMMETRIC_VOXELS = 400  # the same, of (r, h) alone
-RAYS = 1.4  # along the edge of a voxel, at least
-COMPARED = 1024  # pixels
-AT_ONCE = 1 << 21  # thin rays through voxels
+SPLINE_VOXELS, SPLINE_MARGIN = 100, 3  # along the longest edge of the box, and beyond each face
+SYMMETRIC_VOXELS = 400  # along the longest edge of (r, h)
+RAYS_PER_VOXEL = 1.4  # along an edge, at least
+COMPARED_PIXELS = 1024
+MAX_THIN_RAYS = 1 << 21  # per call of the voxel operator
 
 Splines = (VoxelField, SymmetricVoxels)
 __all__ = ["TRACED", "SampledViews", "check_sees", "predict", "predict_view", "reproject"]
 
 TRACED = "traced"
-"""Name of the model of deflection that bends rays to every order."""
+"""Name of the deflection model that traces rays through the field, to all orders."""
 
 
 def check_sees(techniques: Sequence[type[ForwardModel]], quantity: str, what: str) -> None:
-    """Refuse techniques that see another field than one of that quantity; `what` names the parameter or file.
-
-    Raises
-    ------
-    InputError
-        Naming those that see it.
-    """
+    """Raise an error for a technique that does not measure the quantity; `what` names the parameter or file."""
     for kind in techniques:
         if kind.quantity != quantity:
             names = ", ".join(k.name for k in TECHNIQUES.values() if k.quantity == quantity and not k.derived)
-            field = f"the field of {name_of(quantity)}"
-            raise InputError(f"expected a technique that sees {field} ({names}), got {kind.name}", field=what)
+            raise InputError(
+                f"expected a technique that measures the field of {name_of(quantity)} ({names}), got {kind.name}",
+                field=what,
+            )
 
 
 def predict_view(
     field: Field, camera: Camera, projector: Projector, box: Box, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "row column c"]:
-    """Return what a camera would see of a field; 0 where a ray misses the box."""
+    """Return the view of a field; 0 where a ray misses the box."""
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
     if not rays.crosses.any():
         return torch.zeros(*camera.image_size, projector.channels)
     if isinstance(field, Splines) and isinstance(projector, PathIntegral) and projector.model.linear:
-        seen = _through_voxels(field, rays, projector.model, device)
+        view = _through_voxels(field, rays, projector.model, device)
     else:
-        seen = project(projector, field, rays, device)
-    return seen.reshape(*camera.image_size, projector.channels)
+        view = project(projector, field, rays, device)
+    return view.reshape(*camera.image_size, projector.channels)
 
 
 def _through_voxels(
     field: VoxelField | SymmetricVoxels, rays: Rays, model: ForwardModel, device: torch.device | str
 ) -> Float[Tensor, "n c"]:
-    """What `project` gives, by the compiled operator: tens of times faster."""
-    flat = field if isinstance(field, VoxelField) else field.parts[0]
-    step = VOXEL_STEP["linear" if flat.degree == 1 else "cubic"]
-    each, seen = rays_through(rays, min(field.grid.spacing)), []
-    for index in torch.arange(len(rays)).split(max(1, AT_ONCE // each)):
+    """The result of `project` by the compiled operator, tens of times faster."""
+    section = field if isinstance(field, VoxelField) else field.parts[0]
+    step = VOXEL_STEP["linear" if section.degree == 1 else "cubic"]
+    thin_rays, parts = rays_through(rays, min(field.grid.spacing)), []
+    for index in torch.arange(len(rays)).split(max(1, MAX_THIN_RAYS // thin_rays)):
         pause()
         part = rays[index]
         if bool(part.crosses.any()):
-            seen.append(seen_of(field, part, model, step, device).cpu())
+            parts.append(project_spline(field, part, model, step, device).cpu())
         else:
-            seen.append(torch.zeros(len(part), len(model.channels)))
-    return torch.cat(seen)
+            parts.append(torch.zeros(len(part), len(model.channels)))
+    return torch.cat(parts)
 
 
 @on_free_cores
@@ -103,23 +99,18 @@ def predict(
     wavelength_nm: float | None = None,
     quantity: str | None = None,
 ) -> Measurement:
-    """Return the measurement that cameras would make of a field, without noise.
+    """Return the measurement of a field by cameras, without noise.
 
     Parameters
     ----------
-    field : of what the technique sees; of an index the excess over n_ambient
+    field : of the quantity that the technique measures; of an index the excess over n_ambient
     box : outside of which the field is ambient, mm
-    model : auto or a model of the technique, as a reconstruction has it, or traced: rays bent to every order
-    samples : along a ray, or Runge-Kutta steps of a traced one
-    on_view : told how many views are done, out of how many
+    model : auto, a model of the technique, or traced: rays traced through the field
+    samples : per ray, or Runge-Kutta steps of a traced one
+    on_view : called with the numbers of predicted views and of all views
     technique : what a pixel measures
     wavelength_nm : of the light, for interferometry
-    quantity : what the field is (volume.QUANTITIES), if that is to be checked
-
-    Raises
-    ------
-    InputError
-        If there is no such model, the technique sees another quantity, or needs what is not given.
+    quantity : of the field (volume.QUANTITIES), to be checked against the technique; None for no check
     """
     check_simulated((technique,))
     if quantity is not None:
@@ -149,54 +140,53 @@ def reproject(
     on_view: Callable[[int, int], None] = lambda done, total: None,
     model: str = AUTO,
 ) -> Reprojection:
-    """Predict what every view of a measurement sees of a field, by every technique of the measurement.
+    """Predict every view of a measurement from a field, for each of its techniques.
 
-    A network is integrated along every ray where that takes some seconds only. Of larger images it is sampled on
-    voxels, and the views are interpolated between rays through those (`SampledViews`); how far that is from the
-    integral through the network is measured on some pixels, and told as `accuracies`.
+    The path integral through a network is computed on every pixel if that takes some seconds. For larger images the
+    network is sampled on voxels (`SampledViews`); the error is then measured on a sample of pixels, see `accuracies`.
 
     Parameters
     ----------
-    withheld : names of the views that the reconstruction has not seen
-    on_view : told how many views are done, out of how many
-    model : forward model that the field was reconstructed with
+    withheld : names of the views that the reconstruction did not use
+    on_view : called with the numbers of predicted views and of all views
+    model : forward model of the reconstruction
     """
     box, maps, accuracies, done = measurement.box, {}, {}, 0
-    known: dict[tuple[ForwardModel, int], Tensor] = {}  # images and displacements are of one integral
-    many = _work(field, measurement.cameras) > EXACT_WORK[torch.device(device).type]
-    voxels = on_voxels(field, box, device) if many else None
-    total = sum(len(_seeing(kind, measurement.cameras)) for kind in measurement.techniques)
+    integrals: dict[tuple[ForwardModel, int], Tensor] = {}  # images and displacements share one
+    large = _work(field, measurement.cameras) > EXACT_WORK[torch.device(device).type]
+    voxels = on_voxels(field, box, device) if large else None
+    total = sum(len(_views_of(kind, measurement.cameras)) for kind in measurement.techniques)
     for observation in measurement.observations:
         kind = observation.technique
         forward = forward_model(kind, measurement, model)
-        projector = PathIntegral(forward.integral, SAMPLES)
+        integral = forward.integral
+        projector = PathIntegral(integral, SAMPLES)
         sampled = None if voxels is None else SampledViews(field, voxels, box, projector, device)
         predicted = torch.full_like(observation.values, float("nan"))
-        integral = forward.integral
-        views = [(i, kind.seen_by(measurement.cameras[i])) for i in _seeing(kind, measurement.cameras)]
+        views = [(i, kind.seen_by(measurement.cameras[i])) for i in _views_of(kind, measurement.cameras)]
         for i, camera in views:
             height, width = camera.image_size
-            if (integral, i) not in known and sampled:
-                seen = measurement.sees_box[i, :height, :width, None]
-                known[integral, i] = sampled(camera).where(seen, torch.zeros(()))
-            elif (integral, i) not in known:
-                known[integral, i] = predict_view(field, camera, projector, box, device)
-            predicted[i, :height, :width] = forward.mapped(known[integral, i], i)
+            if (integral, i) not in integrals and sampled:
+                crosses = measurement.sees_box[i, :height, :width, None]
+                integrals[integral, i] = sampled(camera).where(crosses, torch.zeros(()))
+            elif (integral, i) not in integrals:
+                integrals[integral, i] = predict_view(field, camera, projector, box, device)
+            predicted[i, :height, :width] = forward.to_map(integrals[integral, i], i)
             done += 1
             on_view(done, total)
         maps[kind.name] = predicted
-        seen_as = type(integral) if forward.integral is not forward else kind
-        if seen_as.measured not in accuracies:
-            found = Accuracy(seen_as)
+        technique = type(integral) if integral is not forward else kind
+        if technique.measured not in accuracies:
+            accuracies[technique.measured] = Accuracy(technique)
             if sampled:
-                integrals = [known[integral, i] for i, _ in views]
-                found = sampled.accuracy(seen_as, [camera for _, camera in views], integrals)
-            accuracies[seen_as.measured] = found
+                accuracies[technique.measured] = sampled.accuracy(
+                    technique, [camera for _, camera in views], [integrals[integral, i] for i, _ in views]
+                )
     return Reprojection(measurement, maps, tuple(withheld), tuple(accuracies.values()))
 
 
-def _seeing(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
-    """Which cameras can see by a technique: those with a background, where it needs one."""
+def _views_of(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
+    """The views that a technique can have: those with a background, if it needs one."""
     return [i for i, camera in enumerate(cameras) if camera.background or not kind.background]
 
 
@@ -211,35 +201,35 @@ def _work(field: Field, cameras: Sequence[Camera]) -> float:
 
 
 def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> VoxelField | SymmetricVoxels:
-    """Return the cubic splines through a field's values on voxels that go on beyond the box: right up to its faces."""
+    """Return cubic splines through a field on voxels that extend beyond the box, to be accurate at its faces."""
     symmetry = symmetry_of_field(field)
     if symmetry is not None:
         reduced, size = symmetry.reduced_box(box, ()), max(box.edges) / SYMMETRIC_VOXELS
         left = -reduced.upper[0] if symmetry.axial else reduced.lower[0]
         whole = Box((left, *reduced.lower[1:]), reduced.upper)
         shape = (math.ceil(whole.edges[2] / size), 2, math.ceil(whole.edges[0] / size))
-        return SymmetricVoxels.through(field, symmetry, _beyond(Grid(whole, shape), (0, 2)), device)
-    grid = _beyond(Grid.of_resolution(box, VOXELS), (0, 1, 2))
+        return SymmetricVoxels.through(field, symmetry, _extended(Grid(whole, shape), (0, 2)), device)
+    grid = _extended(Grid.of_resolution(box, SPLINE_VOXELS), (0, 1, 2))
     return VoxelField.through(field.sample(grid, device), grid)
 
 
-def _beyond(grid: Grid, axes: Sequence[int]) -> Grid:
-    """The grid with BEYOND voxels more beyond its faces across some of x, y, z."""
+def _extended(grid: Grid, axes: Sequence[int]) -> Grid:
+    """The grid with SPLINE_MARGIN more voxels beyond its faces across some of x, y, z."""
     lower, upper, shape = list(grid.box.lower), list(grid.box.upper), list(grid.shape)
     for axis in axes:
-        lower[axis] -= BEYOND * grid.spacing[axis]
-        upper[axis] += BEYOND * grid.spacing[axis]
-        shape[2 - axis] += 2 * BEYOND
+        lower[axis] -= SPLINE_MARGIN * grid.spacing[axis]
+        upper[axis] += SPLINE_MARGIN * grid.spacing[axis]
+        shape[2 - axis] += 2 * SPLINE_MARGIN
     return Grid(Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])), (shape[0], shape[1], shape[2]))
 
 
 @dataclass(frozen=True)
 class SampledViews:
-    """Views of a network by way of its values on voxels.
+    """Views of a network from its values on voxels.
 
-    Rays of a lattice of pixels, RAYS a voxel, are integrated through the spline by the compiled
-    operator, and the pixels between them are interpolated by bicubic splines. What bending adds (`curved`) is
-    integrated through the network itself on a coarser lattice.
+    A lattice of rays, RAYS_PER_VOXEL, is integrated through the spline by the compiled operator, with bicubic
+    interpolation between its pixels. The effect of bending (`curved`) is integrated through the network on a coarser
+    lattice.
 
     Parameters
     ----------
@@ -247,7 +237,7 @@ class SampledViews:
     voxels : spline through its values (`on_voxels`)
     box : where the rays are integrated, mm
     projector : the path integral through the network
-    device : where the network is evaluated
+    device : of the network
     """
 
     field: Field
@@ -257,10 +247,11 @@ class SampledViews:
     device: torch.device | str = "cpu"
 
     def __call__(self, camera: Camera) -> Float[Tensor, "row column c"]:
-        """Return what a camera would see; of no meaning where a ray misses the box."""
+        """Return the view of a camera; undefined where a ray misses the box."""
         pixel = float(camera.pixel_size(torch.tensor(self.box.centre, dtype=camera.rotation.dtype)))
-        step = max(1, int(max(self.box.edges) / self.resolution / (RAYS * pixel)))
-        view = _interpolated(camera, self.box, step, self._straight)
+        step = max(1, int(max(self.box.edges) / self.resolution / (RAYS_PER_VOXEL * pixel)))
+        straight = self.projector.model.linear_twin
+        view = _interpolated(camera, self.box, step, lambda rays: project_spline(self.voxels, rays, straight))
         if not self.projector.model.straight:
             view = view + _interpolated(camera, self.box, 8 * step, self._bending)
         return view
@@ -268,53 +259,45 @@ class SampledViews:
     @property
     def resolution(self) -> int:
         """Voxels along the longest edge of the box."""
-        return VOXELS if isinstance(self.voxels, VoxelField) else SYMMETRIC_VOXELS
-
-    @property
-    def _straight_model(self) -> ForwardModel:
-        return self.projector.model.linear_twin
-
-    def _straight(self, rays: Rays) -> Float[Tensor, "n c"]:
-        return seen_of(self.voxels, rays, self._straight_model)
+        return SPLINE_VOXELS if isinstance(self.voxels, VoxelField) else SYMMETRIC_VOXELS
 
     def _bending(self, rays: Rays) -> Float[Tensor, "n c"]:
-        """What bent rays see more than straight ones."""
-        projectors = self.projector, replace(self.projector, model=self._straight_model)
+        """The difference between bent and straight rays."""
+        projectors = self.projector, replace(self.projector, model=self.projector.model.linear_twin)
         bent, straight = (project(projector, self.field, rays, self.device) for projector in projectors)
         return bent - straight
 
     def accuracy(self, kind: type[ForwardModel], cameras: Sequence[Camera], predicted: Sequence[Tensor]) -> Accuracy:
-        """Compare predicted views, (row, column, c) each, with the path integral through the field, on some pixels."""
+        """Compare predicted views, (row, column, c) each, with the path integral through the field on random pixels."""
         generator = torch.Generator().manual_seed(0)
-        apart = []
+        errors = []
         for camera, view in zip(cameras, predicted, strict=True):
             size = torch.tensor(camera.image_size[::-1])
-            pixels = (torch.rand(-(-COMPARED // len(cameras)), 2, generator=generator) * size).long()
+            pixels = (torch.rand(-(-COMPARED_PIXELS // len(cameras)), 2, generator=generator) * size).long()
             rays = camera.rays(pixels.to(camera.intrinsics)).clip(self.box).to(dtype=torch.float32)
             exact = project(self.projector, self.field, rays, self.device)
-            apart.append((view[pixels[:, 1], pixels[:, 0]] - exact)[rays.crosses])
-        difference = torch.cat(apart)
-        voxels = f"{self.resolution} voxels along the longest edge of the box"
-        how = f"a cubic spline through the network's values on {voxels}"
-        return Accuracy(kind, how, float(difference.square().mean().sqrt()), len(difference))
+            errors.append((view[pixels[:, 1], pixels[:, 0]] - exact)[rays.crosses])
+        error = torch.cat(errors)
+        spline = f"a cubic spline through the network on {self.resolution} voxels along the longest edge of the box"
+        return Accuracy(kind, spline, float(error.square().mean().sqrt()), len(error))
 
 
 def _interpolated(
-    camera: Camera, box: Box, step: int, see: Callable[[Rays], Float[Tensor, "n c"]]
+    camera: Camera, box: Box, step: int, integrate: Callable[[Rays], Float[Tensor, "n c"]]
 ) -> Float[Tensor, "row column c"]:
-    """What `see` makes of rays, on every step-th row and column, and by bicubic splines between them."""
+    """The integrals on every step-th row and column, with bicubic splines between them."""
     from scipy.interpolate import RectBivariateSpline
 
-    step = max(1, min(step, min(camera.image_size) // 4))  # a cubic spline has four knots at least
+    step = max(1, min(step, min(camera.image_size) // 4))  # a cubic spline has at least four knots
     rows, columns = (torch.arange(0, n + step - 1, step).clamp(max=n - 1) for n in camera.image_size)
     v, u = torch.meshgrid(rows, columns, indexing="ij")
     pixels = torch.stack([u, v], dim=-1).reshape(-1, 2).to(camera.intrinsics)
     rays = camera.rays(pixels).clip(box).to(dtype=torch.float32)
     if not rays.crosses.any():
         return torch.zeros(())
-    seen = see(rays).unflatten(0, (len(rows), len(columns)))
+    lattice = integrate(rays).unflatten(0, (len(rows), len(columns)))
     if step == 1:
-        return seen
+        return lattice
     at = [torch.arange(n).numpy() for n in camera.image_size]
-    maps = [RectBivariateSpline(rows.numpy(), columns.numpy(), channel.numpy())(*at) for channel in seen.unbind(-1)]
+    maps = [RectBivariateSpline(rows.numpy(), columns.numpy(), channel.numpy())(*at) for channel in lattice.unbind(-1)]
     return torch.stack([torch.from_numpy(m).float() for m in maps], dim=-1)

@@ -1,12 +1,11 @@
-"""What a field leaves unexplained of a view: is it white, and if not, of what does it have the pattern?
+"""Test of the residual of a view: is it white, and if not, which known cause leaves such a pattern?
 
     z_b = sum_{p in b} r_p / sqrt(n_b s^2),    s^2 = mean r^2,    grain = sqrt(mean z_b^2)
 
-over blocks b of n pixels: 1 where neighbouring residuals have nothing to do with one another, more where they are
-alike. What is alike has a pattern. Those that known causes leave are fitted to the z_b, each on its own, and the one
-that takes away most of what white noise would not leave is named.
+over blocks b of n pixels: 1 for independent residuals, more where neighbours are correlated. The patterns of known
+causes are fitted to z_b one by one; the cause that removes most of what white noise would not leave is reported.
 
-Source: the portmanteau idea of testing residuals for whiteness, Box and Pierce, J. Am. Stat. Assoc. 65 (1970).
+Source: the portmanteau test of residuals for whiteness, Box and Pierce, J. Am. Stat. Assoc. 65 (1970).
 """
 
 from __future__ import annotations
@@ -18,38 +17,39 @@ from statistics import NormalDist
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["CAUSES", "Leftover", "leftover", "white_noise"]
+__all__ = ["CAUSES", "Whiteness", "white_noise", "whiteness"]
 
 Map = Float[np.ndarray, "row column c"]
+Mask = Bool[np.ndarray, "row column"]
 
-BLOCK, FINE = 8, 2  # px: some windows of optical flow, and what a lens or a window smears
-FEWEST = 12  # blocks of which something can be said
+COARSE, FINE = 8, 2  # px, edges of blocks: several windows of optical flow; the blur of a lens or a window
+MIN_BLOCKS = 12
 QUARTILE = NormalDist().inv_cdf(0.625)  # of the absolute value of a standard normal variate
-SURE = 4.0  # standard deviations of the grain of white noise
-GRAIN = {BLOCK: 1.25, FINE: 1.1}  # below these what is alike is at most about half of what noise leaves in a block
-NAMED = {BLOCK: 0.2, FINE: 0.12}  # of what is alike, that a pattern has to take away to be named
+SIGNIFICANT = 4.0  # standard deviations of the grain of white noise
+MIN_GRAIN = {COARSE: 1.25, FINE: 1.1}  # below these, the correlated part is at most about half of the noise in a block
+MIN_SHARE = {COARSE: 0.2, FINE: 0.12}  # of the correlated part, that a cause has to explain
 
 CAUSES = {
-    "offset": "the whole image is displaced (a shaken camera): --refine shift, or nerif displacement --shake-border",
-    "calibration": "the view is not looked at from where the calibration says: nerif check names one that is upside "
-    "down, mirrored or exchanged; where it names none, --refine cameras",
-    "scale": "all of it is too large or too small: distances, pixel pitch, sensitivity, or a method that flattens",
-    "blur": "what was measured is smoother or sharper than the field's: windows of optical flow, the lens (--aperture)",
+    "offset": "a shift of the whole image (camera shake): --refine shift, or nerif displacement --shake-border",
+    "calibration": "a wrong camera pose: nerif check finds images that are upside down, mirrored or exchanged; if it "
+    "finds none, --refine cameras",
+    "scale": "a wrong scale: distances, pixel pitch, sensitivity, or an evaluation method that underestimates",
+    "blur": "different sharpness of measurement and field: windows of optical flow, or the lens (--aperture)",
 }
-"""Patterns of residuals, and what leaves them."""
+"""Patterns of residuals, their causes and the remedies."""
 
 
 @dataclass(frozen=True)
-class Leftover:
-    """What is left unexplained of a view.
+class Whiteness:
+    """Outcome of the test of a residual.
 
     Parameters
     ----------
-    grain : 1 for white noise, larger where neighbours are alike
-    white : whether chance may have made it
-    cause : the pattern that it has, one of CAUSES, or nothing
-    share : of what is alike that this pattern takes away
-    row, column : px, where most of it is
+    grain : 1 for white noise, larger for correlated residuals
+    white : whether it is compatible with white noise
+    cause : one of CAUSES, or empty
+    share : of the correlated part that the cause explains
+    row, column : position of the largest block, px
     """
 
     grain: float
@@ -60,48 +60,44 @@ class Leftover:
     column: float
 
     @property
-    def alike(self) -> float:
-        """How large what is alike is, over the rms of all that is left: sqrt((grain^2 - 1) / n)."""
-        return 0.0 if self.white else math.sqrt(max(self.grain**2 - 1, 0.0)) / BLOCK
+    def correlated(self) -> float:
+        """The rms of the correlated part over that of the residual: sqrt((grain^2 - 1) / n)."""
+        return 0.0 if self.white else math.sqrt(max(self.grain**2 - 1, 0.0)) / COARSE
 
 
-def leftover(residual: Map, predicted: Map | None, mask: Bool[np.ndarray, "row column"]) -> Leftover | None:
-    """Test what is left of a view; None where there are too few pixels to tell.
+def whiteness(residual: Map, predicted: Map | None, mask: Mask) -> Whiteness | None:
+    """Test the residual of a view; None for too few pixels, or a residual of 0.
 
     Parameters
     ----------
     residual : measured less predicted, over sigma where that is known
-    predicted : what the field predicts; None where causes leave other patterns, as in images
-    mask : pixels that count
+    predicted : None where the patterns of the causes are not those of a shifted map, as in images
+    mask : valid pixels
     """
-    coarse, fine = (_tested(residual, predicted, mask, edge) for edge in (BLOCK, FINE))
+    coarse, fine = (_tested(residual, predicted, mask, edge) for edge in (COARSE, FINE))
     if coarse is None or fine is None:
         return None
-    cause, share = _most(fine.shares)
-    if cause != "blur" or share < NAMED[FINE]:  # the field takes up what is smooth of a blur, and leaves what is fine
-        cause, share = _most({name: share for name, share in coarse.shares.items() if name != "blur"})
-        if share < NAMED[BLOCK]:
+    cause, share = _largest(fine.shares)
+    if cause != "blur" or share < MIN_SHARE[FINE]:  # of a blur, the field follows the smooth part and leaves the fine
+        cause, share = _largest({name: share for name, share in coarse.shares.items() if name != "blur"})
+        if share < MIN_SHARE[COARSE]:
             cause, share = "", 0.0
-    return Leftover(coarse.grain, not (coarse.alike or fine.alike), cause, min(share, 1.0), coarse.row, coarse.column)
+    white = not (coarse.correlated or fine.correlated)
+    return Whiteness(coarse.grain, white, cause, min(share, 1.0), coarse.row, coarse.column)
 
 
-def white_noise(residual: Map, mask: Bool[np.ndarray, "row column"]) -> float | None:
-    """Estimate the rms of the noise that differs from pixel to pixel, by the mixed second difference.
+def white_noise(residual: Map, mask: Mask) -> float | None:
+    """Estimate the rms of the pixel-to-pixel noise from the mixed second difference; None without four neighbours.
 
         m = r_ij - r_i+1,j - r_i,j+1 + r_i+1,j+1,      s = q / (2 c),      q the quartile of |m|
 
-    with c the quartile of the absolute value of a standard normal variate. What varies over several pixels cancels in
-    m, and fine detail that the field leaves unexplained in part of an image does not move the quartile. Of noise that
-    is correlated among neighbours it is less than the rms.
+    with c the quartile of the absolute value of a standard normal variate. Variations over several pixels cancel in m,
+    and unresolved detail in part of an image does not move the quartile. Correlated noise is underestimated.
 
     Parameters
     ----------
     residual : measured less predicted
-    mask : pixels that count
-
-    Returns
-    -------
-    In the unit of the residual; None where there are no four neighbours.
+    mask : valid pixels
 
     Source: after J. Immerkaer, Comput. Vis. Image Underst. 64 (1996) 300.
     """
@@ -111,74 +107,74 @@ def white_noise(residual: Map, mask: Bool[np.ndarray, "row column"]) -> float | 
     return float(np.quantile(mixed[full], 0.25)) / (2 * QUARTILE) if full.any() else None
 
 
-def _most(shares: dict[str, float]) -> tuple[str, float]:
+def _largest(shares: dict[str, float]) -> tuple[str, float]:
     return max(shares.items(), key=lambda item: item[1], default=("", 0.0))
 
 
 @dataclass(frozen=True)
-class _Test:
-    """Residuals in blocks of one size: their grain, whether that is more than chance, shares of causes, the worst."""
+class _BlockTest:
+    """The test on blocks of one size; row and column are those of the largest z_b."""
 
     grain: float
-    alike: bool
+    correlated: bool
     shares: dict[str, float]
     row: float
     column: float
 
 
-def _tested(residual: Map, predicted: Map | None, mask: Bool[np.ndarray, "row column"], edge: int) -> _Test | None:
-    kept = np.where(mask[..., None], residual, 0.0).astype(np.float64)
-    count = _blocks(mask.astype(np.float64)[..., None], edge)[..., 0]
+def _tested(residual: Map, predicted: Map | None, mask: Mask, edge: int) -> _BlockTest | None:
+    valid = np.where(mask[..., None], residual, 0.0).astype(np.float64)
+    count = _block_sums(mask.astype(np.float64)[..., None], edge)[..., 0]
     full = count >= edge * edge / 2
-    square = float((kept**2).sum()) / max(kept.shape[-1] * int(mask.sum()), 1)
-    if int(full.sum()) < FEWEST or not square > 0:
+    square = float((valid**2).sum()) / max(valid.shape[-1] * int(mask.sum()), 1)
+    if int(full.sum()) < MIN_BLOCKS or not square > 0:
         return None
-    own = count[full][:, None]
-    z = _blocks(kept, edge)[full] / np.sqrt(own * square)  # of white noise each has the variance 1
+    n = count[full][:, None]
+    z = _block_sums(valid, edge)[full] / np.sqrt(n * square)  # variance 1 for white noise
     energy = float((z**2).mean())
-    alike = energy > max(1 + SURE * math.sqrt(2 / z.size), GRAIN[edge] ** 2)
+    correlated = energy > max(1 + SIGNIFICANT * math.sqrt(2 / z.size), MIN_GRAIN[edge] ** 2)
     shares: dict[str, float] = {}
-    for cause, patterns in (_patterns(predicted) if alike and predicted is not None else {}).items():
-        means = [_blocks(np.where(mask[..., None], p, 0.0), edge)[full] / np.sqrt(own) for p in patterns]
-        shares[cause] = _share(z, np.stack(means, axis=-1))
+    for cause, patterns in (_patterns(predicted) if correlated and predicted is not None else {}).items():
+        means = [_block_sums(np.where(mask[..., None], p, 0.0), edge)[full] / np.sqrt(n) for p in patterns]
+        shares[cause] = _explained(z, np.stack(means, axis=-1))
     worst = int(np.argmax((z**2).sum(axis=1)))
     row, column = (float(i + 0.5) * edge for i in np.argwhere(full)[worst])
-    return _Test(math.sqrt(energy), alike, shares, row, column)
+    return _BlockTest(math.sqrt(energy), correlated, shares, row, column)
 
 
-def _blocks(values: Map, edge: int) -> Float[np.ndarray, "rows columns c"]:
-    """Sums over blocks; a rim that fills none is left out."""
+def _block_sums(values: Map, edge: int) -> Float[np.ndarray, "rows columns c"]:
+    """Sums over whole blocks."""
     rows, columns, channels = values.shape
     high, wide = rows // edge, columns // edge
-    cut = values[: high * edge, : wide * edge]
-    return cut.reshape(high, edge, wide, edge, channels).sum(axis=(1, 3))
+    blocks = values[: high * edge, : wide * edge].reshape(high, edge, wide, edge, channels)
+    return blocks.sum(axis=(1, 3))
 
 
-def _share(z: Float[np.ndarray, "b c"], patterns: Float[np.ndarray, "b c pattern"]) -> float:
-    """Of what white noise would not leave, the share that a sum of patterns takes away."""
-    flat, own = z.ravel(), patterns.reshape(z.size, -1)
-    size = np.linalg.norm(own, axis=0)
-    own = own[:, size > 0] / size[size > 0]
-    if not own.shape[1]:
+def _explained(z: Float[np.ndarray, "b c"], patterns: Float[np.ndarray, "b c pattern"]) -> float:
+    """The share of the excess over white noise that a linear combination of patterns explains."""
+    flat, basis = z.ravel(), patterns.reshape(z.size, -1)
+    size = np.linalg.norm(basis, axis=0)
+    basis = basis[:, size > 0] / size[size > 0]
+    if not basis.shape[1]:
         return 0.0
-    found, *_ = np.linalg.lstsq(own, flat, rcond=1e-6)
-    taken = float((flat**2).sum() - ((flat - own @ found) ** 2).sum()) - own.shape[1]
-    return taken / (float((flat**2).sum()) - flat.size)
+    weights, *_ = np.linalg.lstsq(basis, flat, rcond=1e-6)
+    explained = float((flat**2).sum() - ((flat - basis @ weights) ** 2).sum()) - basis.shape[1]
+    return explained / (float((flat**2).sum()) - flat.size)
 
 
 def _patterns(predicted: Map) -> dict[str, list[Map]]:
-    """The patterns of every cause."""
+    """The patterns that each cause adds to a predicted map, to first order."""
     rows, columns, channels = predicted.shape
     d = predicted.astype(np.float64)
     along, down = np.gradient(d, axis=1), np.gradient(d, axis=0)
     half = max(rows, columns) / 2
     x = np.broadcast_to(((np.arange(columns) - (columns - 1) / 2) / half)[None, :, None], d.shape)
     y = np.broadcast_to(((np.arange(rows) - (rows - 1) / 2) / half)[:, None, None], d.shape)
-    each = [np.zeros_like(d) for _ in range(channels)]
-    for channel, pattern in enumerate(each):
+    offsets = [np.zeros_like(d) for _ in range(channels)]
+    for channel, pattern in enumerate(offsets):
         pattern[..., channel] = 1.0
-    smooth = np.gradient(along, axis=1) + np.gradient(down, axis=0)
-    turned = x * down - y * along
+    laplacian = np.gradient(along, axis=1) + np.gradient(down, axis=0)
+    rotation = x * down - y * along
     if channels == 2:  # vectors turn with the image
-        turned = turned * half + np.stack([d[..., 1], -d[..., 0]], axis=-1)
-    return {"offset": each, "calibration": [along, down, turned], "scale": [d], "blur": [smooth]}
+        rotation = rotation * half + np.stack([d[..., 1], -d[..., 0]], axis=-1)
+    return {"offset": offsets, "calibration": [along, down, rotation], "scale": [d], "blur": [laplacian]}

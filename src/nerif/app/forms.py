@@ -183,9 +183,10 @@ def _fields(record: Any, choices: Mapping[str, Sequence[str]], prefix: str = "")
 
 def _kind(hint: Any) -> tuple[str, bool]:
     """How a field is asked for, and whether it may be None."""
-    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    options = typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
     optional = type(None) in options
     hint = next(o for o in options if o is not type(None))
+    hint = hint.__origin__ if typing.get_origin(hint) is typing.Annotated else hint
     if typing.get_origin(hint) is tuple:
         return "words", optional
     kinds = {bool: "switch", int: "integer", float: "number", str: "text", Path: "text"}

@@ -1,4 +1,4 @@
-"""The masks of a measurement: drawn view by view, by threshold elsewhere, and the run that puts them into it."""
+"""Card for the flow masks of a measurement: drawn in some views, by threshold in the others."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ SETTINGS = ("threshold", "smooth", "smallest", "grow", "sigma")
 
 
 class MaskCard:
-    """Controls of the masks, where the page is being built.
+    """Mask editor, threshold settings and the run that applies them.
 
     Parameters
     ----------
     work : Workspace
-    page : name of the page, whose draft keeps what is drawn
-    name : of the measurement
+    page : name of the page whose draft stores the shapes
+    name : measurement file, relative to the project
     measurement : Measurement
-    offer : goes on with a measurement that masks have been put into
+    offer : called with the file of the masked measurement
     """
 
     def __init__(
@@ -52,12 +52,12 @@ class MaskCard:
             button = ui.button("Show the threshold's mask", icon="contrast", on_click=self._threshold)
             button.props("flat no-caps dense")
         self.place = ui.element("div").classes("stack")
-        self.told = ui.html("", sanitize=False).classes("told").props('aria-live="polite"')
+        self.status = ui.html("", sanitize=False).classes("status").props('aria-live="polite"')
         record = Mask(Path(name), Path("masked.nc"))
         self._writing = asyncio.Lock()
         form = Form(record, only=SETTINGS)
         self.job = JobForm(
-            work, f"{page}.mask", form, self._words, "Put the masks in", SETTINGS[:1], first=self._write, about=name,
+            work, f"{page}.mask", form, self._words, "Apply the masks", SETTINGS[:1], first=self._write, about=name,
             offer=offer,
         )  # fmt: skip
         self.view.on_value_change(self._edit)
@@ -65,43 +65,43 @@ class MaskCard:
 
     @property
     def folder(self) -> str:
-        """Where drawn masks are written, relative to the project: a place of the app alone."""
+        """Folder of the drawn masks, relative to the project."""
         return f"{OWN}/masks/{self.name.removesuffix('.nc')}"
 
     @property
     def out(self) -> str:
-        """Measurement that is written: none that is there."""
+        """Name of the new measurement."""
         return self.work.project.free_name(f"{self.name.removesuffix('.nc')}.masked.nc")
 
     def _words(self) -> list[str]:
-        drawn = ["--drawn", self.folder] if self.edits.drawn else []
-        return ["mask", self.name, "--out", self.out, *drawn]
+        option = ["--drawn", self.folder] if self.edits.drawings else []
+        return ["mask", self.name, "--out", self.out, *option]
 
     def _edit(self) -> None:
-        """Build the editor of the view that is chosen."""
+        """Build the editor of the selected view."""
         self.place.clear()
         with self.place:
             index = self.measurement.names.index(str(self.view.value))
             shape = self.measurement.cameras[index].image_size
             address = magnitude_address(self.measurement, index)
             MaskEditor(str(self.view.value), shape, address, self.edits, self._changed)
-        self._tell()
+        self._show_views()
 
     def _step(self, view: str) -> None:
         if not view:
-            ui.notify("There is no step to take.")
+            ui.notify("Nothing to undo or redo.")
             return
         self.view.set_value(view)
         self._edit()
         self._changed()
 
     def _changed(self) -> None:
-        """Keep what is drawn over a reload, and as the images that nerif mask reads."""
+        """Store the shapes in the draft and as the images that `nerif mask` reads."""
         draft = self.work.draft(self.page)
-        masks = {**draft.get("masks", {}), self.name: self.edits.kept}
+        masks = {**draft.get("masks", {}), self.name: self.edits.state}
         self.work.keep(self.page, {**draft, "masks": masks})
         self.job.show()
-        self._tell()
+        self._show_views()
         ui.timer(0.0, self._written, once=True)
 
     async def _written(self) -> None:
@@ -109,32 +109,32 @@ class MaskCard:
             await self._write()
 
     async def _write(self) -> None:
-        """Write what is drawn as images, beside the page, one state after the other."""
+        """Write the masks as images in a thread, one write at a time."""
         async with self._writing:
-            drawn, folder = self.edits.drawn, self.work.project.path(self.folder)
+            drawings, folder = self.edits.drawings, self.work.project.path(self.folder)
             sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
 
             def work() -> None:
-                for old in folder.glob("*.png"):  # first, so that none is taken for what is drawn now
+                for old in folder.glob("*.png"):  # also those of views that have no shapes any more
                     old.unlink()
-                if drawn:
-                    write_masks(folder, drawn, sizes)
+                if drawings:
+                    write_masks(folder, drawings, sizes)
 
             await self.work.beside(work)
 
-    def _tell(self) -> None:
-        views = ", ".join(self.edits.drawn) or "no view"
-        self.told.set_content(escape(f"Drawn in {views}."))
+    def _show_views(self) -> None:
+        views = ", ".join(self.edits.drawings) or "no view"
+        self.status.set_content(escape(f"Drawn in {views}."))
 
     async def _threshold(self) -> None:
         index = self.measurement.names.index(str(self.view.value))
         with refusals():
-            asked = self.job.view.made()
-            settings: MaskSettings = asked.masks
-            address = await self.work.beside(threshold_address, self.measurement, index, settings, asked.sigma)
+            record = self.job.view.made()
+            settings: MaskSettings = record.masks
+            address = await self.work.beside(threshold_address, self.measurement, index, settings, record.sigma)
             with ui.dialog() as dialog, ui.card():
-                text_html(f"Flow in view {self.view.value}, by the threshold: white", "h3")
+                text_html(f"Threshold mask of view {self.view.value}; white: flow", "h3")
                 image = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")
-                image.props["src"], image.props["alt"] = address, "Mask by the threshold"
+                image.props["src"], image.props["alt"] = address, "Threshold mask"
                 ui.button("Close", on_click=dialog.close).props("flat no-caps")
             dialog.open()

@@ -1,4 +1,4 @@
-"""Masks drawn over a view: corners of a polygon or strokes of a brush, by mouse, touch or typed numbers."""
+"""Editor of the flow mask of one view: polygons and brush strokes, by pointer or by typed coordinates."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ me.addEventListener('pointermove', add); me.addEventListener('pointerup', end, {
 
 
 class MaskEditor:
-    """Controls of one view's mask, where the page is being built.
+    """Tools, the image of the view and the shapes over it.
 
     Parameters
     ----------
-    name : of the view
-    shape : its height and width, px
-    address : of its image
-    edits : MaskEdits that what is drawn goes into
+    name : name of the view
+    shape : height and width, px
+    address : address of its image
+    edits : shapes of all views, changed in place
     changed : called after each step
     """
 
@@ -43,13 +43,13 @@ class MaskEditor:
         height, width = shape
         with ui.element("div").classes("numbers"):
             self._tool = ui.toggle(TOOLS, value="polygon").props('no-caps aria-label="Tool"')
-            self._inside = ui.toggle(EFFECTS, value=True).props('no-caps aria-label="What the shape means"')
+            self._inside = ui.toggle(EFFECTS, value=True).props('no-caps aria-label="Effect of the shape"')
             self._width = ui.number("Width of the brush", value=8, min=1, step=1, suffix="px").props("outlined dense")
             self._width.props["aria-label"] = "Width of the brush (px)"
         with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as place:
             place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
             image = ui.element("img").props("draggable=false")
-            image.props["src"], image.props["alt"] = address, f"Size of what was measured in view {name}"
+            image.props["src"], image.props["alt"] = address, f"Magnitude of the signal in view {name}"
             self._over = ui.html("", sanitize=False).classes("over")
         with ui.element("div").classes("numbers"):
             self._x, self._y = self._number("Column", width), self._number("Row", height)
@@ -95,18 +95,17 @@ class MaskEditor:
         self._changed()
 
     def show(self) -> None:
-        """Show what is drawn."""
+        """Draw the shapes and the open polygon."""
         height, width = self.shape
-        drawn = "".join(map(_svg, self.edits.shapes[self.name]))
+        shapes = "".join(map(_svg, self.edits.shapes[self.name]))
         dots = "".join(f"<circle cx={x:.2f} cy={y:.2f} r={width / 120:.2f} />" for x, y in self.corners)
         path = " ".join(f"{x:.2f},{y:.2f}" for x, y in self.corners)
         draft = f"<g class=draft><polyline points='{path}' />{dots}</g>" if self.corners else ""
         box = f"-0.5 -0.5 {width} {height}"
-        self._over.set_content(f"<svg viewBox='{box}' preserveAspectRatio=none aria-hidden=true>{drawn}{draft}</svg>")
+        self._over.set_content(f"<svg viewBox='{box}' preserveAspectRatio=none aria-hidden=true>{shapes}{draft}</svg>")
 
 
 def _svg(shape: MaskShape) -> str:
-    """A shape as SVG."""
     points, kind = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape.points), "flow" if shape.inside else "none"
     if shape.kind == "polygon":
         return f"<polygon class={kind} points='{points}' />"

@@ -1,4 +1,4 @@
-"""What was drawn into the masks of a measurement, view by view; each step can be undone, and all survives a reload."""
+"""Mask shapes of the views of a measurement, with undo and redo."""
 
 from __future__ import annotations
 
@@ -14,53 +14,53 @@ STEPS = 100  # that can be undone
 
 
 class MaskEdits:
-    """Shapes of each view, with what was before and what was undone.
+    """Shapes of each view and the history of their changes.
 
     Parameters
     ----------
-    names : of the views
-    kept : of `kept` of an earlier one
+    names : names of the views
+    state : `state` of an earlier object
     """
 
-    def __init__(self, names: Sequence[str], kept: Mapping[str, Any] | None = None) -> None:
-        kept = kept or {}
-        shapes = {name: tuple(map(_shape, own)) for name, own in kept.get("shapes", {}).items()}
+    def __init__(self, names: Sequence[str], state: Mapping[str, Any] | None = None) -> None:
+        state = state or {}
+        shapes = {name: tuple(map(_shape, entries)) for name, entries in state.get("shapes", {}).items()}
         self.shapes: dict[str, tuple[MaskShape, ...]] = {name: shapes.get(name, ()) for name in names}
         self.past: list[tuple[str, tuple[MaskShape, ...]]] = []
         self.future: list[tuple[str, tuple[MaskShape, ...]]] = []
-        for steps, found in ((self.past, kept.get("past", [])), (self.future, kept.get("future", []))):
-            steps += [(name, tuple(map(_shape, own))) for name, own in found if name in self.shapes]
+        for steps, history in ((self.past, state.get("past", [])), (self.future, state.get("future", []))):
+            steps += [(name, tuple(map(_shape, entries))) for name, entries in history if name in self.shapes]
 
     @property
-    def kept(self) -> dict[str, Any]:
-        """What can be kept as JSON."""
-        steps = {k: [[n, [asdict(s) for s in own]] for n, own in getattr(self, k)] for k in ("past", "future")}
-        return {"shapes": {name: [asdict(s) for s in own] for name, own in self.drawn.items()}, **steps}
+    def state(self) -> dict[str, Any]:
+        """Shapes and history as JSON values."""
+        steps = {k: [[n, [asdict(s) for s in shapes]] for n, shapes in getattr(self, k)] for k in ("past", "future")}
+        return {"shapes": {name: [asdict(s) for s in shapes] for name, shapes in self.drawings.items()}, **steps}
 
     @property
-    def drawn(self) -> dict[str, tuple[MaskShape, ...]]:
-        """Views that something was drawn in."""
-        return {name: own for name, own in self.shapes.items() if own}
+    def drawings(self) -> dict[str, tuple[MaskShape, ...]]:
+        """Views that have shapes."""
+        return {name: shapes for name, shapes in self.shapes.items() if shapes}
 
     def put(self, name: str, shapes: Sequence[MaskShape]) -> None:
-        """Change what is drawn in a view."""
+        """Replace the shapes of a view."""
         self.past = [*self.past, (name, self.shapes[name])][-STEPS:]
         self.future = []
         self.shapes[name] = tuple(shapes)
 
     def undo(self) -> str:
-        """Take the last step back; returns the view whose it was, nothing if there is none."""
+        """Undo the last step and return the name of its view, empty if there is no step."""
         return self._step(self.past, self.future)
 
     def redo(self) -> str:
-        """Take the last step that was undone again."""
+        """Redo the last undone step and return the name of its view, empty if there is none."""
         return self._step(self.future, self.past)
 
-    def _step(self, come_from: list[Any], go_to: list[Any]) -> str:
-        if not come_from:
+    def _step(self, origin: list[Any], target: list[Any]) -> str:
+        if not origin:
             return ""
-        name, shapes = come_from.pop()
-        go_to.append((name, self.shapes[name]))
+        name, shapes = origin.pop()
+        target.append((name, self.shapes[name]))
         self.shapes[name] = shapes
         return str(name)
 

@@ -1,4 +1,4 @@
-"""Pieces that pages are made of."""
+"""Elements that several pages use."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ __all__ = ["CommandLine", "card", "figures", "refusals", "text_html"]
 
 @contextmanager
 def card(title: str, note: str = "") -> Iterator[ui.element]:
-    """A framed part of a page with a heading of the second rank."""
+    """Build a framed section with a second-level heading."""
     with ui.element("section").classes("card").props(f'aria-label="{escape(title)}"') as section:
         ui.html(f"<h2>{escape(title)}</h2>" + (f"<p class=note>{escape(note)}</p>" if note else ""), sanitize=False)
         yield section
 
 
 def text_html(text: str, tag: str = "p", classes: str = "") -> ui.html:
-    """Text as it is, whatever is in it: names of files are data."""
+    """Build an element with escaped text."""
     return ui.html(f'<{tag} class="{escape(classes)}">{escape(text)}</{tag}>', sanitize=False)
 
 
 def figures(rows: Sequence[tuple[str, str, str]]) -> str:
-    """A list of name, value and remark as HTML."""
+    """Return a list of names, values and remarks as HTML."""
     lines = (f"<div><dt>{escape(a)}</dt><dd>{escape(b)}<small>{escape(c)}</small></dd></div>" for a, b, c in rows)
     return f"<dl class=figures>{''.join(lines)}</dl>"
 
 
 class CommandLine:
-    """The command line that does what the page is set to, and a button that copies it."""
+    """Command line of the page's settings, with a button that copies it."""
 
     def __init__(self) -> None:
         with ui.element("div").classes("command").props('role="group" aria-label="Command line"'):
@@ -45,12 +45,12 @@ class CommandLine:
         self.line = ""
 
     def show(self, arguments: Sequence[str]) -> None:
-        """Show the line of these arguments."""
+        """Show the command line of these arguments."""
         self.line = command_line(arguments)
         self._text.set_content(f"<code tabindex=0>{escape(self.line)}</code>")
 
 
-# without TLS and on another address than this machine's own a browser has no clipboard: then the old way
+# browsers offer navigator.clipboard over TLS or on localhost only; elsewhere execCommand copies
 COPY = """(event) => {
   const text = event.currentTarget.closest('.command').querySelector('code').textContent;
   const label = event.currentTarget.querySelector('.block') || event.currentTarget;
@@ -64,7 +64,7 @@ COPY = """(event) => {
 
 @contextmanager
 def refusals(say: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Say what an InputError or a file that cannot be written has to say, instead of breaking the page."""
+    """Report an InputError or OSError of the block by `say`, by default as a notification."""
     try:
         yield
     except InputError as error:

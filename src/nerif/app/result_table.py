@@ -15,8 +15,8 @@ from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.reconstruction.files import FIELD
 from nerif.report.movie import frames_there
-from nerif.report.summary import trust_figures
-from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, glance
+from nerif.report.summary import accuracy_rows
+from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
 
 __all__ = ["Row", "result_table", "rows_of"]
 
@@ -54,9 +54,9 @@ def rows_of(project: Project, contents: Contents) -> list[Row]:
 
 def _cached(project: Project, name: str) -> Row:
     """A row, read anew when the file that was written last among those it rests on has changed."""
-    there = [n for n in (METRICS, FIELD, RUN, LIVE, VOLUME) if (project.path(name) / n).is_file()]
-    last = max(there, key=lambda n: (project.path(name) / n).stat().st_mtime_ns)
-    return project.cached(f"{name}/{last}", "row", lambda _: _of(name, glance(project.path(name))))
+    out = ResultDirectory(project.path(name))
+    last = max(filter(out.has, (METRICS, FIELD, RUN, LIVE, VOLUME)), key=lambda n: (out / n).stat().st_mtime_ns)
+    return project.cached(f"{name}/{last}", "row", lambda _: _of(name, out.read(views=False)))
 
 
 def _of(name: str, result: Result) -> Row:
@@ -71,7 +71,7 @@ def _of(name: str, result: Result) -> Row:
         word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "Nothing of it is known yet."
     time = "" if seconds is None else f"{float(seconds):.0f} s"
     cells = (result.method, word, error, worst, outcome, time, str(result.about.get("finished", "")))
-    return Row(name, cells, word, sentence, tuple(trust_figures(result)) if ended else ())
+    return Row(name, cells, word, sentence, tuple(accuracy_rows(result)) if ended else ())
 
 
 def _film(project: Project, name: str) -> Row | None:

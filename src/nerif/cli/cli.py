@@ -1,4 +1,4 @@
-"""The command line: `nerif VERB ...`. One module of nerif.cli.commands a verb, loaded on demand."""
+"""The command line, `nerif COMMAND ...`: each command is a module of nerif.cli.commands, imported on demand."""
 
 from __future__ import annotations
 
@@ -10,45 +10,40 @@ from nerif import __version__
 
 __all__ = ["main"]
 
-VERBS = {
-    "design": "before the rig is built: the displacement, sensitivity, blur and resolution to expect",
-    "pattern": "make print-ready backgrounds and calibration targets",
-    "calibrate": "calibrate cameras from images of a target, or import a calibration; draw the rig",
-    "displacement": "turn the images of all views into a measurement",
-    "mask": "add flow masks to a measurement, by threshold or drawn by hand",
-    "check": "find swapped, flipped, mirrored and exchanged views in a measurement",
-    "render": "render the images of an experiment, with its truth",
-    "simulate": "trace curved rays through a phantom and write a measurement, with its truth",
-    "reconstruct": "reconstruct the refractive-index field of a measurement",
-    "project": "predict the displacement any camera would see through a reconstruction",
-    "evaluate": "compare a reconstruction with a truth, or with measured views",
-    "sequence": "reconstruct every frame of a recording, on one machine or a cluster",
-    "movie": "draw volumes over time, as isosurface or slices, to .mp4 or .gif",
-    "report": "write a page that shows a result and says whether it can be trusted",
-    "figures": "write every figure of a result as PDF and PNG at journal widths",
+COMMANDS = {
+    "design": "predict displacement, sensitivity, blur and resolution of a planned rig",
+    "pattern": "make backgrounds and calibration targets to print",
+    "calibrate": "calibrate cameras from images of a target, import a calibration, or draw the rig",
+    "displacement": "compute a measurement from the images of all views",
+    "mask": "add flow masks to a measurement, by threshold or from drawings",
+    "check": "detect swapped, flipped, mirrored and exchanged views, or pose errors, in a measurement",
+    "render": "render the images of an experiment, with the true field",
+    "simulate": "simulate a measurement of a phantom by ray tracing, with the true field",
+    "reconstruct": "reconstruct the field of a measurement",
+    "project": "predict the measurement of any camera from a reconstruction",
+    "evaluate": "compare a reconstruction with a true field, or with measured views",
+    "sequence": "reconstruct all frames of a measurement sequence, on one machine or a cluster",
+    "movie": "draw volumes over time as isosurface or slices (.mp4, .gif)",
+    "report": "write an HTML report of a result",
+    "figures": "write the figures of a result as PDF and PNG at journal column widths",
     "export": "write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid",
-    "app": "the whole road in a browser, on this machine: design, images, calibration, runs, results",
-    "info": "print what a measurement, volume or result holds",
+    "app": "open the browser interface: design, images, calibration, runs, results",
+    "info": "describe a measurement, volume or result",
     "demo": "simulate, reconstruct and evaluate a small flame",
 }
-
-
-MENTIONED = 4
-"""Files that are named of those an interrupted command has written."""
-
-ELSEWHERE = {"app": "nerif.app.command"}
-"""Modules of verbs that are no file of nerif.cli.commands."""
+MODULES = {"app": "nerif.app.command"}  # of commands outside nerif.cli.commands
+MAX_FILES_LISTED = 4  # after an interruption
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
-    0 done, 1 no field found (reconstruct) or a fault found (check), 2 bad input, 130 interrupted, 141 nobody reads
-    what it prints any more.
+    0: success; 1: no field (reconstruct, sequence) or a fault in the data (check --strict); 2: bad input;
+    130: interrupted; 141: standard output closed.
     """
     try:
         if arguments is None:
-            _run_nothing_of_the_folder()
+            _ignore_code_in_the_current_folder()
             arguments = sys.argv[1:]
         code = _run(list(arguments))
         sys.stdout.flush()
@@ -60,11 +55,11 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def _run_nothing_of_the_folder() -> None:
-    """Keep code in the current folder, which may be somebody else's, from being run, here and in all child processes.
+def _ignore_code_in_the_current_folder() -> None:
+    """Keep Python and Numba, here and in child processes, from executing files of the current folder.
 
-    Python looks there for modules first where it is started with -c or -m, as workers are. Numba reads there in
-    .numba_config.yaml where its compiled code is, which are pickles.
+    Python started with -c or -m, as workers are, imports from it. Numba reads the place of its compiled code, which is
+    pickled, from .numba_config.yaml in it.
     """
     os.environ["PYTHONSAFEPATH"] = "1"
     os.environ.setdefault("NUMBA_CACHE_DIR", "")
@@ -72,19 +67,18 @@ def _run_nothing_of_the_folder() -> None:
 
 def _run(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
-        print("usage: nerif VERB [options]      (nerif VERB --help tells all options, units and defaults)\n")
+        print("usage: nerif COMMAND [options]      (nerif COMMAND --help: options, units and defaults)\n")
         print("Refractive index, density and temperature in 3-D from background-oriented schlieren images.\n")
-        print("\n".join(f"  {verb:<13} {text}" for verb, text in VERBS.items()))
+        print("\n".join(f"  {command:<13} {text}" for command, text in COMMANDS.items()))
         return 0
     if words[0] == "--version":
         print(f"nerif {__version__}")
         return 0
-    verb = words[0]
-    if verb not in VERBS:
+    if words[0] not in COMMANDS:
         import difflib
 
-        near = difflib.get_close_matches(verb, VERBS, n=1, cutoff=0)
-        return _refuse(f"unknown verb '{verb}'; the nearest known one is '{near[0]}'; see nerif --help")
+        nearest = difflib.get_close_matches(words[0], COMMANDS, n=1, cutoff=0)[0]
+        return _fail(f"unknown command '{words[0]}'; did you mean '{nearest}'? See nerif --help")
 
     from nerif.common.conventions import InputError
     from nerif.common.installation import stranger
@@ -92,36 +86,36 @@ def _run(words: list[str]) -> int:
     if warning := stranger():
         print(f"nerif: {warning}", file=sys.stderr)
     try:
-        command = importlib.import_module(ELSEWHERE.get(verb, f"nerif.cli.commands.{verb}"))
-        importlib.import_module("nerif.reconstruction.device").keep_freed_memory()
-        on_free_cores = importlib.import_module("nerif.reconstruction.device").on_free_cores
-        on_free_cores(command.main)(words[1:])
+        command = importlib.import_module(MODULES.get(words[0], f"nerif.cli.commands.{words[0]}"))
+        device = importlib.import_module("nerif.reconstruction.device")
+        device.keep_freed_memory()
+        device.on_free_cores(command.main)(words[1:])
     except InputError as error:
-        return _refuse(str(error))
+        return _fail(str(error))
     except KeyboardInterrupt as stop:
-        print(f"nerif: interrupted; {stop if str(stop) else _left_behind()}", file=sys.stderr)
+        print(f"nerif: interrupted; {stop if str(stop) else _files_written()}", file=sys.stderr)
         return 130
     except SystemExit as stop:
         return int(stop.code or 0)
     except BrokenPipeError:
         raise
     except OSError as error:
-        return _refuse(f"{error.filename or 'file'}: {error.strerror or error}")
+        return _fail(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0
 
 
-def _left_behind() -> str:
-    """What a command that was broken off has written, and how to go on, where nothing else is known."""
+def _files_written() -> str:
+    """Return what an interrupted command has written, and how to continue."""
     from nerif.common.files import written
 
     if not written:
-        return "nothing was written; the same command starts again"
-    last = ", ".join(dict.fromkeys(map(str, written[-MENTIONED:])))
-    more = f" and {len(written) - MENTIONED} more" if len(written) > MENTIONED else ""
-    return f"written and whole: {last}{more}; the same command with --force does all of it anew"
+        return "nothing was written; run the same command again"
+    files = ", ".join(dict.fromkeys(map(str, written[-MAX_FILES_LISTED:])))
+    more = f" and {len(written) - MAX_FILES_LISTED} more" if len(written) > MAX_FILES_LISTED else ""
+    return f"complete files: {files}{more}; run the same command with --force to start again"
 
 
-def _refuse(message: str) -> int:
+def _fail(message: str) -> int:
     print("nerif: " + " ".join(message.split()), file=sys.stderr)
     return 2
 

@@ -1,4 +1,4 @@
-"""Files for other programs: VTK (.vti, opens in ParaView), NetCDF, NumPy (.npz), MATLAB (.mat), text (.csv)."""
+"""Exports: VTK (.vti for ParaView), NetCDF (.nc), NumPy (.npz), MATLAB (.mat), text (.csv)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,7 @@ __all__ = ["FORMATS", "export", "write_csv", "write_mat", "write_npz"]
 
 
 def export(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write volumes on one grid to `path`, by its ending: one of FORMATS.
-
-    Raises
-    ------
-    InputError
-        If the ending is another.
-    """
+    """Write volumes on one grid in the format of the ending of `path`, one of FORMATS."""
     suffix = Path(path).suffix
     if suffix not in FORMATS:
         raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{suffix}'", field=path)
@@ -38,17 +32,17 @@ def _write_vti(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
 
 
 def _attributes(volumes: list[Volume]) -> dict[str, float | str]:
-    """Attributes of all, then unit and notes of each quantity under density.assumption and the like."""
-    found: dict[str, float | str] = {}
+    """Return the attributes of all, then unit and notes of each quantity as density.assumption and the like."""
+    attributes: dict[str, float | str] = {}
     for v in volumes:
-        found |= v.attributes
+        attributes |= v.attributes
     for v in volumes:
-        found |= {f"{v.quantity}.{name}": value for name, value in {"units": v.unit, **v.notes}.items()}
-    return found
+        attributes |= {f"{v.quantity}.{name}": value for name, value in {"units": v.unit, **v.notes}.items()}
+    return attributes
 
 
 def write_npz(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write arrays [z, y, x] by quantity, x_mm, y_mm, z_mm, and `about`: units and attributes as JSON; no pickles."""
+    """Write arrays [z, y, x] by quantity, x_mm, y_mm, z_mm, and units and attributes as JSON in `about`."""
     import numpy as np
 
     arrays: dict[str, Any] = {v.quantity: v.values.cpu().numpy() for v in volumes}
@@ -59,22 +53,21 @@ def write_npz(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
 
 
 def write_mat(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write a MATLAB 5 file: A(i, j, k) of each quantity stands at x_mm(i), y_mm(j), z_mm(k); `about` holds the rest.
+    """Write a MATLAB 5 file: A(i, j, k) of each quantity is at x_mm(i), y_mm(j), z_mm(k); attributes in `about`.
 
-    MATLAB's plots want rows along y: isosurface(x_mm, y_mm, z_mm, permute(density, [2 1 3]), level).
+    For plots with rows along y: isosurface(x_mm, y_mm, z_mm, permute(density, [2 1 3]), level).
     """
     from scipy.io import savemat
 
     data: dict[str, Any] = {v.quantity: v.values.cpu().numpy().transpose(2, 1, 0) for v in volumes}
     data |= {f"{a}_mm": volumes[0].grid.axis(a).numpy()[:, None] for a in "xyz"}
-    # names of MATLAB: letters, digits, underscores
     data["about"] = {re.sub(r"\W", "_", name): value for name, value in _attributes(volumes).items()}
     with atomic(path) as part, part.open("wb") as file:
         savemat(file, data, do_compression=True, long_field_names=True)
 
 
 def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write one line a voxel: x, y, z in mm, then each quantity with its unit in the header."""
+    """Write one line per voxel: x, y, z in mm, and the quantities."""
     import numpy as np
 
     points = volumes[0].grid.points(torch.float64).reshape(-1, 3)
@@ -85,4 +78,3 @@ def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
 
 
 FORMATS = {".vti": _write_vti, ".nc": write_netcdf, ".npz": write_npz, ".mat": write_mat, ".csv": write_csv}
-"""Endings and their writers."""

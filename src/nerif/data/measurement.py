@@ -1,4 +1,4 @@
-"""A measurement: cameras, and the maps that they recorded by one or several techniques."""
+"""A measurement: cameras, and the maps that they recorded by one technique or several."""
 
 from __future__ import annotations
 
@@ -23,25 +23,20 @@ from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_l
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "Measurement",
-    "Observation",
-    "arguments_of",
-    "cameras_of",
-    "check_maps",
-    "check_observations",
-    "integrals_of",
-]
+__all__ = ["Measurement", "Observation", "integrals_of", "measurement_of"]
+
+WAVELENGTHS_NM = (100.0, 30000.0)  # ultraviolet to thermal infrared
+PIXELS_AT_A_TIME = 1 << 17  # whose rays are traced together
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What the cameras saw by one technique.
+    """The maps of all views by one technique.
 
     Parameters
     ----------
-    technique : what a pixel measures
-    values : (view, row, column, c) in the technique's unit; NaN where not measured
+    technique : quantity that a pixel measures
+    values : (view, row, column, c) in the unit of the technique; NaN: no data
     sigma : (view, row, column, c) standard deviation of the noise, or None
     """
 
@@ -51,29 +46,29 @@ class Observation:
 
     @classmethod
     def of(cls, technique: type[ForwardModel], maps: Mapping[str, Tensor]) -> Observation:
-        """Return the observation that maps hold, by their names in the file."""
+        """Return the observation in maps that have their names in the file."""
         values, sigma = maps[technique.measured], maps.get(technique.sigma)
-        whole = (*values.shape[:3], len(technique.channels))
-        return cls(technique, values.reshape(whole), None if sigma is None else sigma.reshape(whole))
+        shape = (*values.shape[:3], len(technique.channels))
+        return cls(technique, values.reshape(shape), None if sigma is None else sigma.reshape(shape))
 
     @property
     def components(self) -> tuple[str, ...]:
-        """What the channels are called: by their own names, or by what is measured where there is but one."""
+        """Names of the channels; that of the map for a single one."""
         return tuple(name or self.technique.measured for name in self.technique.channels)
 
     @property
     def label(self) -> str:
-        """What stands at a colour bar, with the unit."""
+        """Label of a colour bar."""
         return f"{self.technique.measured} [{self.technique.unit}]"
 
     @property
     def signed(self) -> bool:
-        """Whether what is measured may be negative: not where the field may not."""
+        """Whether values may be negative."""
         return self.technique.bounds[0] < 0 and not self.technique.derived
 
     @property
     def caption(self) -> str:
-        """What images of the views show."""
+        """Caption of a figure of the maps."""
         kind = self.technique
         names = " and ".join(name for name in kind.channels if name)
         unit = f", in {kind.unit}" if unit_shown(kind.unit) else ""
@@ -81,28 +76,27 @@ class Observation:
 
     @property
     def maps(self) -> tuple[str, ...]:
-        """Names of what a file holds of it."""
+        """Names of its variables in a file."""
         return (self.technique.measured, self.technique.sigma, *self.technique.beside)
 
     def alone(self, measurement: Measurement) -> Measurement:
-        """Return the measurement by this technique alone, of the views that measured something by it."""
+        """Return the measurement by this technique only, of the views that have data of it."""
         if len(measurement.observations) == 1:
             return measurement
-        some, kind = _of_views_with(measurement, [self]), self.technique
-        own = {name: value for name, value in some.measured_maps.items() if name in self.maps}
-        return replace(some, cameras=tuple(kind.seen_by(c) for c in some.cameras), **arguments_of(own))
+        part, kind = _of_views_with(measurement, [self]), self.technique
+        maps = {name: value for name, value in part.all_maps.items() if name in self.maps}
+        return replace(part, cameras=tuple(kind.seen_by(c) for c in part.cameras), **_arguments(maps))
 
     def without(self, measurement: Measurement) -> Measurement:
-        """Return the measurement by the other techniques, of the views that measured something by any of them."""
+        """Return the measurement by the other techniques, of the views that have data of them."""
         others = [o for o in measurement.observations if o.technique is not self.technique]
         if len(others) == 1:
             return others[0].alone(measurement)
-        some = _of_views_with(measurement, others)
-        rest = {name: value for name, value in some.measured_maps.items() if name not in self.maps}
-        return replace(some, **arguments_of(rest))
+        part = _of_views_with(measurement, others)
+        return replace(part, **_arguments({n: value for n, value in part.all_maps.items() if n not in self.maps}))
 
-    def measured(self, view: int) -> Bool[Tensor, "row column"]:
-        """Which pixels of a view have a value and, where it is known, a sigma within the limits of the technique."""
+    def valid(self, view: int) -> Bool[Tensor, "row column"]:
+        """Return the pixels of a view whose value and sigma are finite and within the limits of the technique."""
         least, most = self.technique.limits
         mask = (self.values[view].abs() <= most).all(dim=-1)  # NaN compares false
         if self.sigma is not None:
@@ -111,144 +105,55 @@ class Observation:
 
 
 def integrals_of(measurement: Measurement) -> tuple[Observation, ...]:
-    """Return the observations whose values are path integrals: all but images of a pattern.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    found = tuple(o for o in measurement.observations if not o.technique.derived)
-    if not found:
-        names = " and ".join(o.technique.measured for o in measurement.observations)
+    """Return the observations whose values are path integrals: all but images of a pattern."""
+    integrals = tuple(o for o in measurement.observations if not o.technique.derived)
+    if not integrals:
         raise InputError(
-            f"expected displacements, got {names} alone; nerif displacement finds them", field="measurement"
+            f"expected displacements, got {_names(measurement)} only; run nerif displacement", field="measurement"
         )
-    return found
+    return integrals
+
+
+def _names(measurement: Measurement) -> str:
+    return " and ".join(o.technique.measured for o in measurement.observations)
 
 
 def _of_views_with(measurement: Measurement, observations: Sequence[Observation]) -> Measurement:
-    """The measurement of the views that measured something by any of some techniques."""
-    seen = torch.stack([measurement.usable_for(o).flatten(1).any(dim=1) for o in observations]).any(dim=0)
-    return measurement.select([name for name, any_ in zip(measurement.names, seen.tolist(), strict=True) if any_])
+    """Return the measurement of the views that have data of any of the observations."""
+    data = torch.stack([measurement.usable_for(o).flatten(1).any(dim=1) for o in observations]).any(dim=0)
+    return measurement.select([name for name, any_ in zip(measurement.names, data.tolist(), strict=True) if any_])
 
 
-def cameras_of(measurement: Measurement, views: Sequence[int]) -> tuple[Camera, ...]:
-    """Return the cameras of some views, without their backgrounds where none of these measured by one."""
-    cameras = tuple(measurement.cameras[i] for i in views)
-    some = [o for o in measurement.observations if o.technique.background]
-    if len(some) == len(measurement.observations) or any(bool(measurement.usable_for(o)[views].any()) for o in some):
-        return cameras
-    return tuple(c if c.background is None else c.without_background for c in cameras)
-
-
-def arguments_of(maps: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Return maps, by their names in the file, as a Measurement takes them; one channel may have an axis of its own."""
+def _arguments(maps: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return maps by their names in the file as arguments of Measurement, a single channel without its axis."""
     plain = {name: value[..., 0] if value.shape[3:] == (1,) else value for name, value in maps.items()}
     return {"displacement": plain.pop("displacement", None), "sigma": plain.pop("sigma", None), "maps": plain}
 
 
-def check_maps(measurement: Measurement) -> None:
-    """Refuse a measurement of nothing, maps that no technique has, and maps and masks of the wrong shape.
-
-    Raises
-    ------
-    InputError
-        Naming what is wrong.
-    """
-    given, known = measurement.measured_maps, {kind.measured: kind for kind in TECHNIQUES.values()}
-    first = next((name for name in known if name in given), None)
-    if first is None:
-        raise InputError(f"expected one of {', '.join(known)}, got none of them", field="measurement")
-    shape = given[first].shape[:3]
-    if len(measurement.cameras) != shape[0] or not measurement.cameras:
-        raise InputError(f"expected one map a camera ({len(measurement.cameras)}), got {shape[0]}", field=first)
-    expected = {"valid": tuple(shape), "flow_mask": tuple(shape)}
-    for kind in known.values():
-        whole = (*shape, len(kind.channels)) if len(kind.channels) > 1 else tuple(shape)
-        expected |= {kind.measured: whole, kind.sigma: whole}
-        for name, (channels, _) in kind.beside.items():
-            expected[name] = (*shape, channels) if channels > 1 else tuple(shape)
-    for name, value in {**given, "valid": measurement.valid, "flow_mask": measurement.flow_mask}.items():
-        if name not in expected:
-            raise InputError(f"expected names out of {', '.join(sorted(expected))}, got '{name}'", field="maps")
-        if value is not None and tuple(value.shape) != expected[name]:
-            axes = "view, row, column" + ", component" * (len(expected[name]) - 3)
-            raise InputError(f"expected ({axes}) = {expected[name]}, got {tuple(value.shape)}", field=name)
-
-
-def check_observations(measurement: Measurement) -> None:
-    """Refuse what a technique cannot have measured, techniques that do not go together, and maps of none.
-
-    Raises
-    ------
-    InputError
-        Saying what is wrong, and what to do.
-    """
-    observations = measurement.observations
-    names = " and ".join(o.technique.name for o in observations)
-    if len({o.technique.quantity for o in observations}) > 1:
-        raise InputError(
-            f"expected techniques of one field, got {names}; split them into two measurements", field="technique"
-        )
-    _check_backgrounds(measurement, names)
-    for o in observations:
-        forward_model(o.technique, measurement)  # refuses what it lacks
-        for i, (name, usable) in enumerate(zip(measurement.names, measurement.usable_for(o), strict=True)):
-            try:
-                o.technique.check(o.values[i], None if o.sigma is None else o.sigma[i], usable)
-            except InputError as error:
-                raise error.inside(f"view '{name}'") from None
-
-
-def _check_backgrounds(measurement: Measurement, names: str) -> None:
-    needed = any(o.technique.background for o in measurement.observations)
-    for i, camera in enumerate(measurement.cameras):
-        if camera.background is not None and not needed:
-            raise InputError(
-                f"expected none for {names}, got one; leave out background_normal and background_offset",
-                field=f"background of view '{camera.name}'",
-            )
-        for o in measurement.observations:
-            if o.technique.background and camera.background is None and bool(o.measured(i).any()):
-                raise InputError(
-                    f"expected a plane for {o.technique.name}, got none; give "
-                    "background_normal and background_offset, or say which technique it is",
-                    field=f"background of view '{camera.name}'",
-                )
-
-
-LIMITS_NM = (100.0, 30000.0)
-"""Wavelengths from ultraviolet to thermal infrared, nm."""
-
-CHUNK = 1 << 17
-"""Pixels that are traced at a time."""
-
-
 @dataclass(frozen=True)
 class Measurement:
-    """What was measured: cameras, what they saw, and the volume of interest.
+    """Cameras, their maps, and the box to reconstruct.
 
     Parameters
     ----------
-    cameras : one a view; their names are the names of the views
-    displacement : (view, row, column, 2) d = p - p0 on the grid of the flow image, px; NaN where not measured; None for
-        a measurement by other techniques alone
+    cameras : one per view; their names are those of the views
+    displacement : (view, row, column, 2) d = p - p0 on the grid of the flow image, px; NaN: no data; None for other
+        techniques
     box : Box, mm
     n_ambient : refractive index around the flow
-    sigma : (view, row, column, 2) standard deviation of the displacement's noise, px, or None
-    valid : (view, row, column) False where a pixel is not to be used, or None
+    sigma : (view, row, column, 2) standard deviation of the noise of the displacement, px, or None
+    valid : (view, row, column) False for pixels to ignore, or None
     flow_mask : (view, row, column) True where there is flow, or None
     wavelength_nm : of the light, or None
-    ambient_faces : faces of the box on which the index is ambient (the gauge)
-    maps : (view, row, column) of other techniques, by their names in the file: absorbance, absorbance_sigma, radiance,
-        radiance_sigma, fringes, fringes_sigma; NaN where not measured; (view, row, column, c) of one with c channels
+    ambient_faces : faces of the box with ambient index (the gauge)
+    maps : (view, row, column) or (view, row, column, c) of other techniques, by their names in the file, such as
+        absorbance and absorbance_sigma; NaN: no data
 
     Raises
     ------
     InputError
-        If nothing was measured, shapes disagree, a view has no valid pixel, values cannot be what their technique
-        measures, a background is missing, needless or not behind the box, or no ray crosses the box.
+        If there are no data, shapes disagree, a view has no valid pixel, values are impossible for their technique, a
+        background is missing, superfluous or not behind the box, or no ray crosses the box.
     """
 
     cameras: tuple[Camera, ...]
@@ -263,40 +168,85 @@ class Measurement:
     maps: Mapping[str, Float[Tensor, "view row column *c"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._check_shapes()
+        self._check_maps()
+        self._check_views()
         ambient_index(self.n_ambient)
-        if self.wavelength_nm is not None and not LIMITS_NM[0] <= self.wavelength_nm <= LIMITS_NM[1]:
+        if self.wavelength_nm is not None and not WAVELENGTHS_NM[0] <= self.wavelength_nm <= WAVELENGTHS_NM[1]:
             raise InputError(f"expected nanometres such as 532, got {self.wavelength_nm}", field="wavelength_nm")
         parse_faces(self.ambient_faces)
-        check_observations(self)
-        good = self.usable.flatten(1).sum(dim=1)
-        for name, count in zip(self.names, good.tolist(), strict=True):
-            if count == 0:
-                what = " and ".join(o.technique.measured for o in self.observations)
+        self._check_observations()
+        for name, any_ in zip(self.names, self.usable.flatten(1).any(dim=1).tolist(), strict=True):
+            if not any_:
                 raise InputError(
-                    "no valid pixel; leave the view out or mend its mask", field=f"{what} of view '{name}'"
+                    "no valid pixel; leave the view out or correct its mask", field=f"{_names(self)} of view '{name}'"
                 )
         self._check_geometry()
 
-    def _check_shapes(self) -> None:
-        """Refuse maps of the wrong shape or name, before anything asks what was observed."""
-        check_maps(self)
-        shape = self.shape
+    def _check_maps(self) -> None:
+        """Check names and shapes of maps and masks."""
+        maps, kinds = self.all_maps, {kind.measured: kind for kind in TECHNIQUES.values()}
+        first = next((name for name in kinds if name in maps), None)
+        if first is None:
+            raise InputError(f"expected one of {', '.join(kinds)}, got none", field="measurement")
+        shape = tuple(maps[first].shape[:3])
+        if len(self.cameras) != shape[0] or not self.cameras:
+            raise InputError(f"expected one map per camera ({len(self.cameras)}), got {shape[0]}", field=first)
+        channels = {"valid": 1, "flow_mask": 1}
+        for kind in kinds.values():
+            channels |= {kind.measured: len(kind.channels), kind.sigma: len(kind.channels)}
+            channels |= {name: count for name, (count, _) in kind.beside.items()}
+        for name, value in {**maps, "valid": self.valid, "flow_mask": self.flow_mask}.items():
+            if name not in channels:
+                raise InputError(f"expected names out of {', '.join(sorted(channels))}, got '{name}'", field="maps")
+            expected = (*shape, channels[name]) if channels[name] > 1 else shape
+            if value is not None and tuple(value.shape) != expected:
+                axes = "view, row, column" + ", component" * (len(expected) - 3)
+                raise InputError(f"expected ({axes}) = {expected}, got {tuple(value.shape)}", field=name)
+
+    def _check_views(self) -> None:
+        _, rows, columns = self.shape
         if len(set(self.names)) < len(self.names):
             raise InputError(f"expected different names, got {', '.join(self.names)}", field="view")
         if len({camera.lens is None for camera in self.cameras}) > 1:
-            raise InputError(
-                "expected of every view or of none (0 is a thin ray), got it of some", field="aperture_diameter"
-            )
+            raise InputError("expected for all views or none (0: thin rays)", field="aperture_diameter")
         for camera in self.cameras:
-            if camera.image_size[0] > shape[1] or camera.image_size[1] > shape[2]:
+            if camera.image_size[0] > rows or camera.image_size[1] > columns:
                 raise InputError(
-                    f"expected at most {shape[1:3]} (height, width) px, got {camera.image_size}",
+                    f"expected at most {(rows, columns)} (height, width) px, got {camera.image_size}",
                     field=f"image_size of view '{camera.name}'",
                 )
 
+    def _check_observations(self) -> None:
+        """Check that the techniques see the same field, have the backgrounds they need, and possible values."""
+        names = " and ".join(kind.name for kind in self.techniques)
+        if len({kind.quantity for kind in self.techniques}) > 1:
+            raise InputError(
+                f"expected techniques that see the same field, got {names}; split the measurement", field="technique"
+            )
+        for i, camera in enumerate(self.cameras):
+            background = f"background of view '{camera.name}'"
+            if camera.background is not None and not any(kind.background for kind in self.techniques):
+                raise InputError(
+                    f"expected none for {names}, got a plane; remove background_normal and background_offset",
+                    field=background,
+                )
+            for o in self.observations:
+                if o.technique.background and camera.background is None and bool(o.valid(i).any()):
+                    raise InputError(
+                        f"expected a plane for {o.technique.name}, got none; give background_normal and "
+                        "background_offset, or state another technique",
+                        field=background,
+                    )
+        for o in self.observations:
+            forward_model(o.technique, self)  # raises where the technique needs more
+            for i, (name, usable) in enumerate(zip(self.names, self.usable_for(o), strict=True)):
+                try:
+                    o.technique.check(o.values[i], None if o.sigma is None else o.sigma[i], usable)
+                except InputError as error:
+                    raise error.inside(f"view '{name}'") from None
+
     def _check_geometry(self) -> None:
-        """Refuse a background in front of or inside the box, and a box that no ray crosses."""
+        """Check that backgrounds are behind the box and that rays cross it."""
         crossing = False
         for camera in self.cameras:
             camera.check_distortion()
@@ -304,15 +254,16 @@ class Measurement:
             crossing |= bool(rays.crosses.any())
             if background_cuts(camera, self.box, rays):
                 raise InputError(
-                    f"background of view '{camera.name}': expected a plane behind the box as the camera sees it, got "
-                    "one that cuts or stands before the box; check background_normal, background_offset (mm) and box; "
-                    + likely_cause(self.cameras, self.box)
+                    "expected a plane behind the box as the camera sees it, got one that cuts the box or lies in front "
+                    "of it; check background_normal, background_offset (mm) and box; "
+                    + likely_cause(self.cameras, self.box),
+                    field=f"background of view '{camera.name}'",
                 )
         if not crossing:
             raise InputError(
-                f"box: no ray of any view crosses it ({self.box.lower} to {self.box.upper} mm); "
-                "check the box, and that rotation and translation map world to camera; "
-                + likely_cause(self.cameras, self.box)
+                f"no ray crosses it ({self.box.lower} to {self.box.upper} mm); check the box, and that rotation and "
+                "translation map world to camera; " + likely_cause(self.cameras, self.box),
+                field="box",
             )
 
     @property
@@ -322,90 +273,83 @@ class Measurement:
 
     @cached_property
     def observations(self) -> tuple[Observation, ...]:
-        """What was seen, technique by technique; a technique by which no pixel measured anything is none of them."""
-        given = self.measured_maps
-        found = [Observation.of(kind, given) for kind in TECHNIQUES.values() if kind.measured in given]
-        some = [o for o in found if len(found) == 1 or bool(self.usable_for(o).any())]
-        return tuple(some or found)
+        """The maps by technique, those without any usable pixel excluded."""
+        maps = self.all_maps
+        every = [Observation.of(kind, maps) for kind in TECHNIQUES.values() if kind.measured in maps]
+        usable = [o for o in every if len(every) == 1 or bool(self.usable_for(o).any())]
+        return tuple(usable or every)
 
     @property
-    def measured_maps(self) -> dict[str, Tensor]:
-        """What has numbers for each pixel, by its name in the file."""
-        given = {"displacement": self.displacement, "sigma": self.sigma, **self.maps}
-        return {name: value for name, value in given.items() if value is not None}
+    def all_maps(self) -> dict[str, Tensor]:
+        """All maps by their names in the file, masks excluded."""
+        maps = {"displacement": self.displacement, "sigma": self.sigma, **self.maps}
+        return {name: value for name, value in maps.items() if value is not None}
 
     @property
     def displacements(self) -> Float[Tensor, "view row column 2"]:
-        """The displacement.
-
-        Raises
-        ------
-        InputError
-            If none was measured.
-        """
+        """The displacement; an InputError where there is none."""
         if self.displacement is None:
-            names = " and ".join(o.technique.measured for o in self.observations)
-            raise InputError(f"expected a measurement of displacements, got {names}", field="displacement")
+            raise InputError(f"expected displacements, got {_names(self)}", field="displacement")
         return self.displacement
 
     @property
     def techniques(self) -> tuple[type[ForwardModel], ...]:
-        """The techniques that something was measured by."""
+        """The techniques of the observations."""
         return tuple(o.technique for o in self.observations)
 
     @property
     def quantity(self) -> str:
-        """The field that can be reconstructed."""
+        """The field to reconstruct."""
         return self.observations[0].technique.quantity
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Views, rows and columns of the maps."""
-        views, rows, columns, *_ = next(iter(self.measured_maps.values())).shape
+        views, rows, columns, *_ = next(iter(self.all_maps.values())).shape
         return views, rows, columns
 
     def observed(self, values: Mapping[str, Tensor], sigmas: Mapping[str, Tensor | None] | None = None) -> Measurement:
-        """Return the measurement with other values (view, row, column, c), and other sigmas, by technique name.
+        """Return the measurement with other values (view, row, column, c) and sigmas, by technique name.
 
         A technique that is not named keeps its values; where sigmas are given, it loses its sigma.
         """
-        new: dict[str, Tensor] = {}
+        maps: dict[str, Tensor] = {}
         for o in self.observations:
-            new[o.technique.measured] = values.get(o.technique.name, o.values)
+            maps[o.technique.measured] = values.get(o.technique.name, o.values)
             sigma = o.sigma if sigmas is None else sigmas.get(o.technique.name)
             if sigma is not None:
-                new[o.technique.sigma] = sigma
-            new |= {name: self.maps[name] for name in o.technique.beside if name in self.maps}
-        return replace(self, **arguments_of(new))
+                maps[o.technique.sigma] = sigma
+            maps |= {name: self.maps[name] for name in o.technique.beside if name in self.maps}
+        return replace(self, **_arguments(maps))
 
     @property
     def usable(self) -> Bool[Tensor, "view row column"]:
-        """Pixels inside their image, valid, by which one of the techniques measured something."""
-        mask = self._called_valid
+        """Valid pixels inside their image with data of any technique."""
+        mask = self._unmasked
         for i in range(len(mask)):
-            mask[i] &= self._measured(i)
+            mask[i] &= self._with_data(i)
         return mask
 
     def usable_for(self, observation: Observation) -> Bool[Tensor, "view row column"]:
-        """Pixels inside their image, valid, by which one technique measured something."""
-        mask = self._called_valid
+        """Return the valid pixels inside their image with data of one technique."""
+        mask = self._unmasked
         for i in range(len(mask)):
-            mask[i] &= observation.measured(i)
+            mask[i] &= observation.valid(i)
         return mask
 
     @property
     def bad_pixels(self) -> int:
-        """Pixels called valid that measured nothing (NaN, infinite or impossible numbers): masked, but worth a line."""
-        mask = self._called_valid
-        return sum(int((mask[i] & ~self._measured(i)).sum()) for i in range(len(mask)))
+        """Number of pixels that are masked since they have no data: NaN, infinite or impossible numbers."""
+        mask = self._unmasked
+        return sum(int((mask[i] & ~self._with_data(i)).sum()) for i in range(len(mask)))
 
     @property
-    def _called_valid(self) -> Bool[Tensor, "view row column"]:
+    def _unmasked(self) -> Bool[Tensor, "view row column"]:
         mask = self._inside
         return mask if self.valid is None else mask.logical_and_(self.valid)
 
-    def _measured(self, view: int) -> Bool[Tensor, "row column"]:
-        first, *others = (o.measured(view) for o in self.observations)
+    def _with_data(self, view: int) -> Bool[Tensor, "row column"]:
+        first, *others = (o.valid(view) for o in self.observations)
         for other in others:
             first |= other
         return first
@@ -419,9 +363,9 @@ class Measurement:
 
     @property
     def pixel_sizes(self) -> tuple[float, ...]:
-        """Width of a pixel of each view in the middle of the box, mm."""
-        middle = torch.tensor(self.box.centre, dtype=torch.float64)
-        return tuple(float(camera.pixel_size(middle)) for camera in self.cameras)
+        """Width of a pixel of each view at the centre of the box, mm."""
+        centre = torch.tensor(self.box.centre, dtype=torch.float64)
+        return tuple(float(camera.pixel_size(centre)) for camera in self.cameras)
 
     @cached_property
     def sees_box(self) -> Bool[Tensor, "view row column"]:
@@ -434,11 +378,11 @@ class Measurement:
     def rays(
         self, observation: Observation | None = None
     ) -> tuple[Rays, Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
-        """Return the usable rays that cross the box, what they measured by one technique, and its sigma or None.
+        """Return the usable rays that cross the box, their values by one technique, and sigma or None.
 
         Parameters
         ----------
-        observation : the first of the measurement where None
+        observation : the first of the measurement by default
         """
         observation = observation or self.observations[0]
         mask = self.usable_for(observation)
@@ -450,17 +394,17 @@ class Measurement:
     def _traced(
         self, mask: Bool[Tensor, "view row column"], kind: type[ForwardModel], sensitivity: bool = True
     ) -> Iterator[tuple[Rays, Bool[Tensor, " n"]]]:
-        """Trace the pixels of a mask, some at a time, tell whose ray crosses the box, and clear the others in the mask.
+        """Yield the rays of a mask in blocks, and which of them cross the box; clear the others in the mask.
 
-        Rays are made in double precision: cameras stand far off, and positions lose digits in single precision.
+        In double precision: cameras are far away, so positions in single precision would lose digits.
         """
-        for view, (camera, wanted) in enumerate(zip(self.cameras, mask, strict=True)):
-            if not bool(wanted.any()):
+        for view, (camera, pixels_of_view) in enumerate(zip(self.cameras, mask, strict=True)):
+            if not bool(pixels_of_view.any()):
                 continue
             camera = kind.seen_by(camera)
-            rows = max(1, CHUNK // wanted.shape[1])
-            for first in range(0, wanted.shape[0], rows):
-                block = wanted[first : first + rows]  # a view, through which the mask is changed
+            rows = max(1, PIXELS_AT_A_TIME // pixels_of_view.shape[1])
+            for first in range(0, pixels_of_view.shape[0], rows):
+                block = pixels_of_view[first : first + rows]  # shares its memory with the mask
                 row, column = block.nonzero().unbind(-1)
                 pixels = torch.stack([column, row + first], dim=-1).to(camera.intrinsics.dtype)
                 rays = camera.rays(pixels, sensitivity, view).clip(self.box)
@@ -469,13 +413,7 @@ class Measurement:
                 yield rays, keep
 
     def select(self, names: Sequence[str]) -> Measurement:
-        """Return the measurement of the named views only.
-
-        Raises
-        ------
-        InputError
-            If there is no view of that name, or none is left.
-        """
+        """Return the measurement of some views, in their order here."""
         for name in names:
             if name not in self.names:
                 raise InputError(f"expected one of {', '.join(self.names)}, got '{name}'", field="view")
@@ -490,7 +428,7 @@ class Measurement:
 
         return replace(
             self,
-            cameras=cameras_of(self, index),
+            cameras=self._cameras_of(index),
             displacement=pick(self.displacement),
             sigma=pick(self.sigma),
             maps={name: value[index] for name, value in self.maps.items()},
@@ -498,30 +436,31 @@ class Measurement:
             flow_mask=pick(self.flow_mask),
         )
 
-    def without(self, withheld: Sequence[str]) -> Measurement:
-        """Return the measurement that is left to reconstruct from when some views are held out.
+    def _cameras_of(self, views: Sequence[int]) -> tuple[Camera, ...]:
+        """Return the cameras of some views, without backgrounds if none of the views has data that need one."""
+        cameras = tuple(self.cameras[i] for i in views)
+        needing = [o for o in self.observations if o.technique.background]
+        if len(needing) == len(self.observations) or any(bool(self.usable_for(o)[views].any()) for o in needing):
+            return cameras
+        return tuple(c if c.background is None else c.without_background for c in cameras)
 
-        Raises
-        ------
-        InputError
-            If there is no view of that name, or none is left.
-        """
+    def without(self, withheld: Sequence[str]) -> Measurement:
+        """Return the measurement of the other views."""
         for name in withheld:
             if name not in self.names:
                 raise InputError(f"expected views out of {', '.join(self.names)}, got '{name}'", field="withhold")
-        kept = [name for name in self.names if name not in withheld]
-        if not kept:
-            raise InputError("every view is held out, so none is left to reconstruct from", field="withhold")
-        return self.select(kept)
+        training = [name for name in self.names if name not in withheld]
+        if not training:
+            raise InputError("all views are withheld; leave one to reconstruct from", field="withhold")
+        return self.select(training)
 
     def summary(self, withheld: int = 0) -> list[tuple[str, str]]:
-        """Return what was measured as names and values with units; `withheld` of the views were not used."""
+        """Return names and values with units of a short description; `withheld`: number of views not used."""
         from nerif.data.measurement_summary import summary
 
         return summary(self, withheld)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the maps of the views, and the summary."""
         from nerif.data.measurement_summary import as_html
 
         return as_html(self)
@@ -538,13 +477,7 @@ class Measurement:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Measurement:
-        """Read a measurement file.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, foreign, truncated, or breaks the contract; the message names the variable.
-        """
+        """Read a measurement file."""
         from nerif.data.measurement_file import CONVENTIONS
 
         with opened(path, f"a measurement (NetCDF-4, {CONVENTIONS})") as dataset:
@@ -558,13 +491,7 @@ class Measurement:
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> Measurement:
-        """Return the measurement that such variables and attributes describe.
-
-        Raises
-        ------
-        InputError
-            If they break the contract; the message names the variable.
-        """
+        """Return the measurement with such variables and attributes."""
         from nerif.data.measurement_file import from_dataset
 
         return cls(**from_dataset(dataset))
@@ -578,11 +505,11 @@ def measurement_of(
     wavelength_nm: float | None = None,
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
 ) -> Measurement:
-    """Return a measurement by one technique or more, with sigma 1 where there are more, from its values."""
+    """Return a measurement of values by technique; with sigma 1 where there are several techniques."""
     maps = {kind.measured: value for kind, value in values.items()}
     if len(values) > 1:
         maps |= {kind.sigma: torch.ones_like(value) for kind, value in values.items()}
     return Measurement(
         tuple(cameras), box=box, n_ambient=n_ambient, wavelength_nm=wavelength_nm, ambient_faces=ambient_faces,
-        **arguments_of(maps),
+        **_arguments(maps),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a Measurement tells of itself: the rows of its summary, and what a notebook shows."""
+"""A short description of a measurement, and its display in a notebook."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ __all__ = ["as_html", "summary"]
 
 
 def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]]:
-    """Return what was measured as names and values with units; `withheld` of the views were not used."""
+    """Return names and values with units; `withheld`: number of views not used."""
     cameras = measurement.cameras
     sizes = sorted({c.image_size for c in cameras})
     inside = sum(height * width for height, width in (c.image_size for c in cameras))
-    held = f", of which {withheld} held out" if withheld else ""
+    unused = f" ({withheld} withheld)" if withheld else ""
     light = f" at {measurement.wavelength_nm:g} nm" if measurement.wavelength_nm else ""
     of_index = measurement.quantity == Deflection.quantity
     ambient = [("Ambient index", f"{measurement.n_ambient:.7g}{light}")] if of_index else []
     return [
-        ("Views", f"{len(cameras)}{held}, of {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
+        ("Views", f"{len(cameras)}{unused}, {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
         *(row for observation in measurement.observations for row in _sizes(measurement, observation)),
         ("Usable pixels", f"{max(int(measurement.usable.sum()), 1) / inside:.1%}"),
         *_lenses(measurement),
@@ -32,13 +32,14 @@ def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]
 
 
 def _lenses(measurement: Measurement) -> list[tuple[str, str]]:
-    """How wide the lenses are, where that is known."""
-    wide = sorted({c.lens.diameter for c in measurement.cameras if c.lens is not None} - {0.0})
-    return [("Aperture", " to ".join(f"{d:.3g}" for d in wide[:: max(len(wide) - 1, 1)]) + " mm")] if wide else []
+    diameters = sorted({c.lens.diameter for c in measurement.cameras if c.lens is not None} - {0.0})
+    if not diameters:
+        return []
+    return [("Aperture", " to ".join(f"{d:.3g}" for d in diameters[:: max(len(diameters) - 1, 1)]) + " mm")]
 
 
 def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str, str]]:
-    """How large values and noise of a technique are."""
+    """Return the sizes of values and noise of a technique."""
     kind, usable = observation.technique, measurement.usable_for(observation)
     squares, noise, largest = 0.0, 0.0, 0.0
     for i, mask in enumerate(usable):  # view by view: images may be large
@@ -52,18 +53,18 @@ def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str
     rms, sigma, most = (with_unit(number(size, 3), kind.unit) for size in sizes)
     return [
         (kind.measured.capitalize(), f"rms {rms}, up to {most}"),
-        ("Noise σ", "not known" if observation.sigma is None else f"rms {sigma}"),
+        ("Noise σ", "unknown" if observation.sigma is None else f"rms {sigma}"),
     ]
 
 
 def as_html(measurement: Measurement) -> str:
-    """Return what a notebook shows: the maps of the views by every technique, and the summary."""
-    shown = [(_image(measurement, o), o.caption) for o in measurement.observations]
-    return panel("Measurement", measurement.summary(), *shown)
+    """Return the maps of the views by every technique, and the summary."""
+    images = [(_image(measurement, o), o.caption) for o in measurement.observations]
+    return panel("Measurement", measurement.summary(), *images)
 
 
 def _image(measurement: Measurement, observation: Observation) -> str:
-    """The maps of the views that measured something by a technique, coarsened."""
+    """Return the coarsened maps of the views with data of a technique."""
     usable, names, maps = measurement.usable_for(observation), [], []
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size

@@ -21,25 +21,25 @@ QUANTITIES = {
     "extinction": ("mm-1", "extinction coefficient"),
     "emission": ("mm-1", "radiance per length"),
 }
-"""Unit and long name of what a volume may hold."""
+"""Unit and long name of the quantities of volumes."""
 
 INDEX = "index_excess"
-OF_AN_INDEX = (INDEX, "n", "density", "temperature")
+INDEX_QUANTITIES = (INDEX, "n", "density", "temperature")
 
 
 def quantities_of(quantity: str) -> tuple[str, ...]:
-    """Return what can be given of a reconstructed field: of an index excess all that follows from it, else itself."""
-    return OF_AN_INDEX if quantity == INDEX else (quantity,)
+    """Return the quantities that follow from a reconstructed field."""
+    return INDEX_QUANTITIES if quantity == INDEX else (quantity,)
 
 
 def field_of(quantities: Iterable[str]) -> str | None:
-    """Return which of the quantities of one result is the reconstructed field: none of what follows from an index."""
-    known = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and q not in OF_AN_INDEX[1:]]
-    return INDEX if INDEX in known else next(iter(known), None)
+    """Return which of the quantities of a result is the reconstructed field."""
+    fields = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and q not in INDEX_QUANTITIES[1:]]
+    return INDEX if INDEX in fields else next(iter(fields), None)
 
 
 def name_of(quantity: str) -> str:
-    """Return what a field of a quantity is called: an excess is one of refractive index."""
+    """Return the name of the reconstructed field, such as refractive index."""
     return describe("n" if quantity == INDEX else quantity)[1]
 
 
@@ -60,10 +60,10 @@ class Volume:
     ----------
     values : (z, y, x) at voxel centres, in `unit`
     grid : Grid, mm
-    quantity : what it is, e.g. "index_excess"
+    quantity : name, such as index_excess
     unit : of the values
-    attributes : numbers and texts that belong to the whole field, such as n_ambient
-    notes : those that belong to this quantity, such as what was assumed for it and how many voxels are masked
+    attributes : numbers and texts of the whole result, such as n_ambient
+    notes : those of this quantity, such as assumptions and the number of masked voxels
     """
 
     values: Float[Tensor, "z y x"]
@@ -82,40 +82,31 @@ class Volume:
 
     @classmethod
     def of(cls, values: Float[Tensor, "z y x"], grid: Grid, quantity: str, n_ambient: float) -> Volume:
-        """Return a reconstructed field, or what follows from it, with its unit and, of an index, the ambient."""
-        attributes: dict[str, float | str] = {"n_ambient": n_ambient} if quantity in OF_AN_INDEX else {}
+        """Return a volume with the unit of its quantity and, of an index, the ambient index."""
+        attributes: dict[str, float | str] = {"n_ambient": n_ambient} if quantity in INDEX_QUANTITIES else {}
         return cls(values, grid, quantity, describe(quantity)[0], attributes)
 
     @property
     def n_ambient(self) -> float | None:
-        """Refractive index around the flow, from which an excess is counted; None where nobody said."""
+        """Ambient refractive index; None if unknown."""
         value = self.attributes.get("n_ambient")
         return None if value is None else ambient_index(value, "attribute n_ambient")
 
     def relative_to(self, n_ambient: float) -> Volume:
-        """Return the index excess over `n_ambient`: n - n_ambient, with n = excess + n_ambient of the volume itself.
-
-        Raises
-        ------
-        InputError
-            If it holds another quantity, or an excess and nobody said over which ambient.
-        """
+        """Return the index excess n - n_ambient of a volume of n, or of the excess over its own ambient index."""
         if self.quantity not in ("index_excess", "n"):
             raise InputError(f"expected index_excess or n, got '{self.quantity}'")
-        own = 0.0 if self.quantity == "n" else self.n_ambient
-        if own is None:
-            raise InputError(
-                "expected the attribute n_ambient, from which its index_excess is counted, got none; add it, or give n"
-            )
-        if own == n_ambient:
+        ambient = 0.0 if self.quantity == "n" else self.n_ambient
+        if ambient is None:
+            raise InputError("expected the attribute n_ambient beside index_excess, got none; add it, or give n")
+        if ambient == n_ambient:
             return self
-        values = (self.values.double() + (own - n_ambient)).float()
-        return replace(
-            self, values=values, quantity="index_excess", attributes={**self.attributes, "n_ambient": n_ambient}
-        )
+        values = (self.values.double() + (ambient - n_ambient)).float()
+        attributes = {**self.attributes, "n_ambient": n_ambient}
+        return replace(self, values=values, quantity="index_excess", attributes=attributes)
 
     def summary(self) -> list[tuple[str, str]]:
-        """Return what it holds as names and values with units."""
+        """Return names and values with units of a short description."""
         from nerif.plotting.drawing import LABELS, shown
         from nerif.plotting.notebook import span
 
@@ -124,12 +115,9 @@ class Volume:
         _, unit = LABELS.get(self.quantity, ("", self.unit))
         name = "n − 1" if self.quantity == "n" else self.quantity.replace("_", " ").capitalize()
         rows = [(name, span(shown(self), unit)), ("Voxels", f"{shape} (x, y, z)"), ("Volume", f"{edges} mm (x, y, z)")]
-        if self.n_ambient is not None:
-            rows.append(("Ambient index", f"{self.n_ambient:.7g}"))
-        return rows
+        return rows + ([] if self.n_ambient is None else [("Ambient index", f"{self.n_ambient:.7g}")])
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the three middle slices, and the summary."""
         from nerif.plotting.notebook import panel, show_slices
 
         title = describe(self.quantity)[1].capitalize()

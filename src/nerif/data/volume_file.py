@@ -1,10 +1,11 @@
-"""The files of volumes: NetCDF written and read, VTK images read."""
+"""Files of volumes: NetCDF written and read, VTK images read."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,12 +23,13 @@ if TYPE_CHECKING:
 
 __all__ = ["REFERENCES", "read_volume", "read_volumes", "write_netcdf"]
 
-CELL_METHODS = {"mean": "mean", "std": "standard_deviation"}  # that CF has names for
+CELL_METHODS = {"mean": "mean", "std": "standard_deviation"}  # of CF
 REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
+Content = tuple[dict[str, Tensor], Grid, dict[str, float | str]]  # arrays, grid, attributes
 
 
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write volumes on one grid to a NetCDF-4 file by the CF conventions, coordinates in mm, atomically."""
+    """Write volumes on one grid to a NetCDF-4 file with CF conventions, coordinates in mm, atomically."""
     from datetime import UTC, datetime
 
     import xarray as xr
@@ -50,41 +52,40 @@ def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
         data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), about)
         attributes |= v.attributes
     dataset = xr.Dataset(data, coords=coordinates)
-    title = f"Field of {name_of(field_of(data) or volumes[0].quantity)}"
-    written = f"{datetime.now(UTC).isoformat(timespec='seconds')} written by nerif {__version__}"
-    dataset.attrs = {"Conventions": "CF-1.11", "title": title, "source": f"nerif {__version__}", "history": written}
-    dataset.attrs |= {"references": REFERENCES, **attributes}
-    # the box cannot be told from one voxel centre alone
-    dataset.attrs["box_lower_mm"], dataset.attrs["box_upper_mm"] = list(grid.box.lower), list(grid.box.upper)
+    dataset.attrs = {
+        "Conventions": "CF-1.11",
+        "title": f"Field of {name_of(field_of(data) or volumes[0].quantity)}",
+        "source": f"nerif {__version__}",
+        "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} written by nerif {__version__}",
+        "references": REFERENCES,
+        **attributes,
+        # a single voxel centre does not determine the box
+        "box_lower_mm": list(grid.box.lower),
+        "box_upper_mm": list(grid.box.upper),
+    }
     with atomic(path) as part:
         dataset.to_netcdf(part, engine="h5netcdf", encoding={k: {"zlib": True, "complevel": 4} for k in data})
 
 
 def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
-    """How CF says that one variable is the spread of another."""
+    """Return the CF attributes that relate a quantity and its statistics."""
     base, _, statistic = quantity.rpartition("_")
     if statistic in STATISTICS and base in QUANTITIES:
         return {"cell_methods": f"realization: {CELL_METHODS[statistic]}"} if statistic in CELL_METHODS else {}
-    beside = [v.quantity for v in volumes if v.quantity in [f"{quantity}_{name}" for name in STATISTICS]]
-    return {"ancillary_variables": " ".join(beside)} if beside else {}
+    statistics = [v.quantity for v in volumes if v.quantity in [f"{quantity}_{name}" for name in STATISTICS]]
+    return {"ancillary_variables": " ".join(statistics)} if statistics else {}
 
 
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
-    """Read one quantity of a .nc or .vti file as a Volume.
+    """Read one quantity of a .nc or .vti file.
 
-    Without `quantity`, index_excess is taken, or n, or another reconstructed field, or the only variable. n becomes the
-    index excess where the file says its n_ambient, and stays n, in double precision, where it does not.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, of another kind, or lacks the quantity.
+    By default index_excess, else n, another reconstructed field, or the only variable. n becomes the index excess where
+    the file has n_ambient, else it stays n in double precision.
     """
     arrays, grid, attributes = _read(Path(path))
     if quantity is None:
-        known = [q for q in ("index_excess", "n") if q in arrays]
         only = next(iter(arrays)) if len(arrays) == 1 else field_of(q for q in arrays if q in QUANTITIES)
-        quantity = known[0] if known else only
+        quantity = next((q for q in ("index_excess", "n") if q in arrays), only)
     if quantity is None or quantity not in arrays:
         raise InputError(
             f"expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}",
@@ -93,10 +94,10 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     volume = _volume(quantity, arrays[quantity], grid, attributes)
     index = quantity in ("index_excess", "n")
     if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
-        raise InputError(f"variable '{quantity}' holds NaN or infinite values; fill them first", field=path)
+        raise InputError(f"variable '{quantity}': expected finite values, got NaN or infinity; fill them", field=path)
     if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
         raise InputError(
-            f"variable '{quantity}': expected refractive indices, got some beyond {LARGEST_INDEX}", field=path
+            f"variable '{quantity}': expected refractive indices, got values beyond {LARGEST_INDEX}", field=path
         )
     try:
         n_ambient = volume.n_ambient
@@ -108,46 +109,41 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
 
 
 def read_volumes(path: str | os.PathLike[str]) -> dict[str, Volume]:
-    """Read every quantity of a .nc or .vti file, masked voxels as NaN.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind.
-    """
+    """Read every quantity of a .nc or .vti file, masked voxels as NaN."""
     arrays, grid, attributes = _read(Path(path))
     return {quantity: _volume(quantity, values, grid, attributes) for quantity, values in arrays.items()}
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
-    """Arrays by name, and attributes: those of one quantity as density.assumption and the like."""
+def _read(path: Path) -> Content:
+    """Return the content of a file; attributes of one quantity under density.assumption and the like."""
     if not path.is_file():
         raise InputError("no such file; expected a volume (.nc or .vti)", field=path)
     if path.suffix == ".nc":
         with opened(path, "a volume (.nc or .vti)") as dataset:
-            return _contents(dataset)
+            return _content(dataset)
     if path.suffix == ".vti":
         return read_vti(path)
     raise InputError(f"expected a volume in .nc or .vti, got '{path.suffix or path.name}'", field=path)
 
 
-def _volume(quantity: str, values: Tensor, grid: Grid, attributes: dict[str, float | str]) -> Volume:
-    own = f"{quantity}."
-    notes = {k.removeprefix(own): v for k, v in attributes.items() if k.startswith(own) and k != f"{own}units"}
+def _volume(quantity: str, values: Tensor, grid: Grid, attributes: Mapping[str, float | str]) -> Volume:
+    prefix = f"{quantity}."
+    notes = {k.removeprefix(prefix): v for k, v in attributes.items() if k.startswith(prefix) and k != f"{prefix}units"}
     shared = {k: v for k, v in attributes.items() if "." not in k}
     values = values.double() if quantity == "n" else values.float()
     return Volume(values, grid, quantity, describe(quantity)[0], shared, notes)
 
 
-def _contents(dataset: xr.Dataset) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
+def _content(dataset: xr.Dataset) -> Content:
     for axis in "zyx":
         if axis not in dataset.coords:
             raise InputError(f"expected a volume with coordinates z, y, x in mm, got {list(dataset.coords)}")
-    ends = [_ends(dataset, axis) for axis in "xyz"]
-    lower, upper = zip(*ends, strict=True)
+    lower, upper = zip(*(_ends(dataset, axis) for axis in "xyz"), strict=True)
     grid = Grid(Box(lower, upper), (dataset.sizes["z"], dataset.sizes["y"], dataset.sizes["x"]))
-    arrays = {}
+    arrays: dict[str, Tensor] = {}
+    every: dict[str, Any] = {str(k): v for k, v in dataset.attrs.items()}
     for key, variable in dataset.data_vars.items():
+        every |= {f"{key}.{k}": v for k, v in variable.attrs.items()}
         name, unit = str(key), variable.attrs.get("units")
         if set(variable.dims) == {"z", "y", "x"}:
             expected = describe(name)[0]
@@ -156,33 +152,30 @@ def _contents(dataset: xr.Dataset) -> tuple[dict[str, Tensor], Grid, dict[str, f
             numbers = values(variable.transpose("z", "y", "x"))
             kind = np.float32 if numbers.dtype.itemsize <= 4 else np.float64
             arrays[name] = torch.from_numpy(np.ascontiguousarray(numbers.astype(kind)))
-    found = dict(dataset.attrs)
-    for key, variable in dataset.data_vars.items():
-        found |= {f"{key}.{k}": v for k, v in variable.attrs.items()}
     attributes: dict[str, float | str] = {
-        str(k): v if isinstance(v, str) else float(v)
-        for k, v in found.items()
+        k: v if isinstance(v, str) else float(v)
+        for k, v in every.items()
         if isinstance(v, str | int | float | np.number)
     }
     return arrays, grid, attributes
 
 
 def _ends(dataset: xr.Dataset, axis: str) -> tuple[float, float]:
-    """Where the box begins and ends along an axis, mm, by the attributes where they fit, else by the voxel centres."""
-    unit = dataset[axis].attrs.get("units", "mm")
+    """Return the limits of the box along an axis, mm: from the attributes if consistent, else from voxel centres."""
+    unit, field = dataset[axis].attrs.get("units", "mm"), f"coordinate '{axis}'"
     if not (isinstance(unit, str) and unit == "mm"):
-        raise InputError(f"expected units 'mm', got '{unit}'", field=f"coordinate '{axis}'")
+        raise InputError(f"expected units 'mm', got '{unit}'", field=field)
     centres = values(dataset[axis]).astype(np.float64)
     if not (np.abs(centres) <= LARGEST_LENGTH).all():
-        raise InputError(f"expected voxel centres in mm, got {centres.tolist()[:4]} ...", field=f"coordinate '{axis}'")
+        raise InputError(f"expected voxel centres in mm, got {centres.tolist()[:4]} ...", field=field)
     corners = [np.asarray(dataset.attrs.get(name)) for name in ("box_lower_mm", "box_upper_mm")]
     if len(centres) and all(c.shape == (3,) and c.dtype.kind in "fiu" for c in corners):
         lower, upper = (float(c["xyz".index(axis)]) for c in corners)
         edge = (upper - lower) / len(centres)
-        # a part cut out of the volume has the whole's attributes, but not its coordinates
+        # a part of a volume has the attributes of the whole, but not its coordinates
         if np.allclose(centres, lower + (np.arange(len(centres)) + 0.5) * edge, rtol=0, atol=1e-3 * abs(edge)):
             return lower, upper
     steps = np.diff(centres)
     if len(steps) == 0 or not steps.mean() > 0 or not np.allclose(steps, steps.mean(), rtol=1e-3):
-        raise InputError(f"expected equally spaced, rising voxel centres along {axis} (mm)")
+        raise InputError("expected equally spaced, increasing voxel centres, mm", field=field)
     return float(centres[0] - steps.mean() / 2), float(centres[-1] + steps.mean() / 2)

@@ -1,4 +1,4 @@
-"""Volumes over time: a Zarr store with a chunk for each frame (time, z, y, x), which xarray opens at any time."""
+"""Volumes over time: a Zarr store with a chunk per frame (time, z, y, x), which xarray can open at any time."""
 
 from __future__ import annotations
 
@@ -25,18 +25,17 @@ if TYPE_CHECKING:
 __all__ = ["FIELDS", "ViewScores", "VolumeSequence", "score_names"]
 
 FIELDS = ("fields over time", "box_lower_mm")
-"""What such a store is, and an attribute that tells it from others."""
+"""Content of such a store, and an attribute that marks it."""
 
 
 @dataclass(frozen=True)
 class ViewScores:
-    """What the views measured by one technique against what is re-projected, on disc.
+    """Agreement of the re-projection with the views by one technique, on disk.
 
     Parameters
     ----------
-    technique : what a pixel measures
-    cc : (time, view) correlation (zarr.Array); NaN where a view measured nothing by it
-    rms : (time, view) rms difference in the technique's unit (zarr.Array), likewise
+    technique : quantity that a pixel measures
+    cc, rms : (time, view) correlation, and rms difference in the unit of the technique (zarr.Array); NaN: no data
     """
 
     technique: type[ForwardModel]
@@ -45,26 +44,16 @@ class ViewScores:
 
 
 def score_names(kinds: Sequence[type[ForwardModel]]) -> dict[type[ForwardModel], tuple[str, str]]:
-    """Return the names of the arrays of correlation and rms difference: those after the first have what is measured."""
-    found: dict[type[ForwardModel], tuple[str, str]] = {}
+    """Return the names of the arrays of correlation and rms difference; with a suffix after the first technique."""
+    names: dict[type[ForwardModel], tuple[str, str]] = {}
     for kind in kinds:
-        of = f"_{kind.measured}" if found else ""
-        found[kind] = f"cc{of}", f"{'rms_px' if kind.in_pixels() else 'rms'}{of}"
-    return found
+        suffix = f"_{kind.measured}" if names else ""
+        names[kind] = f"cc{suffix}", f"{'rms_px' if kind.in_pixels() else 'rms'}{suffix}"
+    return names
 
 
 class VolumeSequence:
-    """A store of volumes on one grid.
-
-    Parameters
-    ----------
-    path : of the Zarr store
-
-    Raises
-    ------
-    InputError
-        If there is no such store, or it holds no volumes over time.
-    """
+    """A Zarr store of volumes on one grid."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         require_zarr()
@@ -76,10 +65,10 @@ class VolumeSequence:
         with reading(f"{path}: expected volumes over time, written by nerif"):
             self.group: zarr.Group = zarr.open_group(self.path, mode="r+", zarr_format=ZARR_FORMAT)
             self.attributes: dict[str, Any] = dict(self.group.attrs)
-        if missing := {"box_lower_mm", "box_upper_mm", "n_ambient"} - set(self.attributes):
+        if absent := {"box_lower_mm", "box_upper_mm", "n_ambient"} - set(self.attributes):
             raise InputError(
-                f"expected volumes over time, written by nerif, got a store without {min(missing)}; "
-                "nerif sequence makes volumes of measurements",
+                f"expected volumes over time, written by nerif, got a store without {min(absent)}; "
+                "run nerif sequence on measurements",
                 field=path,
             )
         with reading(f"{path}: expected volumes over time, written by nerif"):
@@ -99,19 +88,14 @@ class VolumeSequence:
         n_ambient: float,
         attributes: Mapping[str, Any] | None = None,
     ) -> VolumeSequence:
-        """Make a store with nothing in it yet; what is there is replaced.
+        """Make an empty store in place of an earlier one.
 
         Parameters
         ----------
         times : of the frames, s
         grid : of the volumes, mm
         quantities : such as index_excess, density
-        attributes : whatever else is to be kept, JSON
-
-        Raises
-        ------
-        InputError
-            If anything but a store of fields is there, which is replaced.
+        attributes : further attributes, JSON
         """
         import numpy as np
         import xarray as xr
@@ -136,24 +120,17 @@ class VolumeSequence:
             group = zarr.open_group(part, mode="r+")
             for quantity in quantities:
                 unit, name = describe(quantity)
-                add_frames(
-                    group, quantity, len(times), grid.shape, ("z", "y", "x"), "float32", units=unit, long_name=name
-                )
+                about = {"units": unit, "long_name": name}
+                add_frames(group, quantity, len(times), grid.shape, ("z", "y", "x"), "float32", **about)
         return cls(path)
 
-    def array(self, name: str) -> Any:  # zarr's own types do not know what an index gives
-        """Return one of the arrays (zarr.Array) of the store."""
+    def array(self, name: str) -> Any:  # the types of zarr do not cover indexing
+        """Return an array of the store (zarr.Array)."""
         with reading(f"{self.path}: '{name}': cannot be read; is it damaged?"):
             return self.group[name]
 
     def read(self, name: str, index: int | slice) -> np.ndarray:
-        """Return what one of the arrays holds of one frame, or of several.
-
-        Raises
-        ------
-        InputError
-            If it is missing or damaged.
-        """
+        """Return the values of an array in one frame, or in several."""
         import numpy as np
 
         with reading(f"{self.path}: '{name}': cannot be read; is it damaged?"):
@@ -161,15 +138,14 @@ class VolumeSequence:
 
     @property
     def view_scores(self) -> list[ViewScores]:
-        """How what is re-projected compares with what the views measured, technique by technique; none of volumes."""
-        names = self.attributes.get("techniques", [ASSUMED.name])
-        named = score_names([technique(name) for name in names])
-        there = [(kind, cc, rms) for kind, (cc, rms) in named.items() if cc in self.group]
-        return [ViewScores(kind, self.array(cc), self.array(rms)) for kind, cc, rms in there]
+        """Agreement of re-projection and views by technique; empty for a store of volumes only."""
+        names = score_names([technique(name) for name in self.attributes.get("techniques", [ASSUMED.name])])
+        present = [(kind, cc, rms) for kind, (cc, rms) in names.items() if cc in self.group]
+        return [ViewScores(kind, self.array(cc), self.array(rms)) for kind, cc, rms in present]
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What is there over time and space."""
+        """Names of the volumes."""
         volumes = ("time", "z", "y", "x")
         return tuple(name for name, _ in self.group.arrays() if self.array(name).metadata.dimension_names == volumes)
 
@@ -182,13 +158,7 @@ class VolumeSequence:
             self.array(volume.quantity)[index] = volume.values.float().numpy()
 
     def volume(self, index: int, quantity: str) -> Volume:
-        """Return one quantity of one frame, NaN where it is masked or the frame is not there.
-
-        Raises
-        ------
-        InputError
-            If the store lacks the quantity.
-        """
+        """Return one quantity of one frame; NaN where it is masked or the frame is missing."""
         import torch
 
         if quantity not in self.quantities:

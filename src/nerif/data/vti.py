@@ -18,16 +18,16 @@ from nerif.geometry import Box, Grid
 
 __all__ = ["read_vti", "write_vti"]
 
-BLOCK = 1 << 20  # bytes that are compressed at a time
-LEVEL = 5  # of zlib, that of VTK
+BLOCK_BYTES = 1 << 20
+ZLIB_LEVEL = 5  # as in VTK
 
 
 def write_vti(
     path: str | os.PathLike[str], arrays: dict[str, Tensor], grid: Grid, attributes: dict[str, float | str]
 ) -> None:
-    """Write (z, y, x) arrays as point data of a VTK image, x fastest, atomically; lengths in mm.
+    """Write (z, y, x) arrays as point data of a VTK image, x fastest, lengths in mm, atomically.
 
-    Source: VTK XML file formats, docs.vtk.org (ImageData, appended raw data in blocks packed by zlib).
+    Source: VTK XML file formats, docs.vtk.org (ImageData; appended raw data in blocks compressed by zlib).
     """
     nz, ny, nx = grid.shape
     extent = f"0 {nx - 1} 0 {ny - 1} 0 {nz - 1}"
@@ -35,15 +35,17 @@ def write_vti(
         "VTKFile", type="ImageData", version="1.0", byte_order="LittleEndian", header_type="UInt64",
         compressor="vtkZLibDataCompressor",
     )  # fmt: skip
-    first = [grid.axis(a)[0] for a in "xyz"]
-    origin, spacing = (" ".join(repr(float(x)) for x in numbers) for numbers in (first, grid.spacing))
+    corner = [grid.axis(a)[0] for a in "xyz"]
+    origin, spacing = (" ".join(repr(float(x)) for x in numbers) for numbers in (corner, grid.spacing))
     image = ElementTree.SubElement(root, "ImageData", WholeExtent=extent, Origin=origin, Spacing=spacing)
-    packed: list[bytes] = []
+    appended: list[bytes] = []
 
     def add(parent: ElementTree.Element, tag: str, kind: str, name: str, content: bytes, **more: str) -> None:
-        where = {"type": kind, "Name": name, **more, "format": "appended", "offset": str(sum(map(len, packed)))}
-        ElementTree.SubElement(parent, tag, where)
-        packed.append(_pack(content))
+        offset = str(sum(map(len, appended)))
+        ElementTree.SubElement(
+            parent, tag, {"type": kind, "Name": name, **more, "format": "appended", "offset": offset}
+        )
+        appended.append(_compress(content))
 
     about = ElementTree.SubElement(image, "FieldData")
     for name, value in attributes.items():
@@ -60,31 +62,23 @@ def write_vti(
     ElementTree.SubElement(root, "AppendedData", encoding="raw").text = "_"
     before, after = ElementTree.tostring(root).split(b"_</AppendedData>")
     with atomic(path) as part, part.open("wb") as file:
-        file.write(before + b"_")
-        for content in packed:
-            file.write(content)
-        file.write(b"</AppendedData>" + after)
+        file.writelines([before + b"_", *appended, b"</AppendedData>" + after])
 
 
-def _pack(content: bytes) -> bytes:
-    """Compress by zlib in blocks, behind the header of VTK: number of blocks, size of each and of the last, sizes."""
-    blocks = [content[at : at + BLOCK] for at in range(0, len(content), BLOCK)]
-    packed = [zlib.compress(block, LEVEL) for block in blocks]
-    header = [len(blocks), BLOCK, len(content) % BLOCK, *map(len, packed)]
-    return np.array(header, "<u8").tobytes() + b"".join(packed)
+def _compress(content: bytes) -> bytes:
+    """Compress in blocks after VTK's header: number of blocks, size of each and of the last, compressed sizes."""
+    blocks = [content[at : at + BLOCK_BYTES] for at in range(0, len(content), BLOCK_BYTES)]
+    compressed = [zlib.compress(block, ZLIB_LEVEL) for block in blocks]
+    header = [len(blocks), BLOCK_BYTES, len(content) % BLOCK_BYTES, *map(len, compressed)]
+    return np.array(header, "<u8").tobytes() + b"".join(compressed)
 
 
 def read_vti(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
     """Read the point data of a VTK image as (z, y, x) arrays, their grid and the field data.
 
-    VTK's own reader ends the process on a damaged file, so it is not used.
+    The reader of VTK itself ends the process on a damaged file.
 
-    Raises
-    ------
-    InputError
-        If the file is no VTK image, is in several pieces, or is turned out of the axes.
-
-    Source: VTK XML file formats, docs.vtk.org (ImageData; ascii, base64 and raw data, plain or by zlib).
+    Source: VTK XML file formats, docs.vtk.org (ImageData; ascii, base64 and raw data, plain or compressed by zlib).
     """
     content = Path(path).read_bytes()
     try:
@@ -100,7 +94,7 @@ TYPES |= {f"{sign}Int{8 * n}": f"{code}{n}" for sign, code in (("", "i"), ("U", 
 
 
 class _Image:
-    """The content of a file, taken apart: XML first, then the data behind it, if they stand there."""
+    """The XML of a file, and the data appended to it."""
 
     def __init__(self, content: bytes) -> None:
         at = content.find(b"<AppendedData")
@@ -115,11 +109,11 @@ class _Image:
         self.root = ElementTree.fromstring(content)
         if self.root.tag != "VTKFile" or self.root.get("type") != "ImageData":
             raise ValueError("no ImageData in it")
-        order = ">" if self.root.get("byte_order") == "BigEndian" else "<"
-        self.order, self.word = order, np.dtype(order + TYPES[self.root.get("header_type", "UInt32")])
+        self.order = ">" if self.root.get("byte_order") == "BigEndian" else "<"
+        self.word = np.dtype(self.order + TYPES[self.root.get("header_type", "UInt32")])
         self.compressor = self.root.get("compressor")
         if self.compressor not in (None, "vtkZLibDataCompressor"):
-            raise InputError(f"expected data that are not compressed, or by zlib, got {self.compressor}; save it anew")
+            raise InputError(f"expected data without compression or by zlib, got {self.compressor}; save it again")
 
     def read(self) -> tuple[dict[str, Tensor], Grid, dict[str, float | str]]:
         image = self.root[0]
@@ -128,7 +122,7 @@ class _Image:
         if len(pieces) != 1 or _numbers(pieces[0], "Extent", 6) != extent:
             raise InputError(f"expected an image in one piece, got {len(pieces)}")
         if _numbers(image, "Direction", 9, "1 0 0 0 1 0 0 0 1") != [1, 0, 0, 0, 1, 0, 0, 0, 1]:
-            raise InputError("expected an image along the axes x, y, z, got a turned one")
+            raise InputError("expected an image along the axes x, y, z, got a rotated one")
         origin, spacing = _numbers(image, "Origin", 3, "0 0 0"), _numbers(image, "Spacing", 3, "1 1 1")
         nx, ny, nz = (int(last - first) + 1 for first, last in zip(extent[::2], extent[1::2], strict=True))
         x, y, z = (o + s * (e - 0.5) for o, s, e in zip(origin, spacing, extent[::2], strict=True))
@@ -157,46 +151,51 @@ class _Image:
         return np.dtype(self.order + TYPES[element.get("type", "")])
 
     def data(self, element: ElementTree.Element) -> bytes:
-        """The bytes of an array, wherever they stand."""
+        """Return the bytes of an array."""
         form, text = element.get("format", "ascii"), (element.text or "").strip()
         if form == "ascii":
             return np.array(text.split(), dtype=np.float64).astype(self.kind(element)).tobytes()
         if form == "binary":
-            return self._unpack(text.encode(), False)
+            return self._decode(text.encode(), False)
         offset = int(element.get("offset", "0"))
         if not 0 <= offset < len(self.appended):
             raise ValueError(f"data at {offset} are beyond the end")
-        return self._unpack(self.appended[offset:], self.raw)
+        return self._decode(self.appended[offset:], self.raw)
 
-    def _unpack(self, source: bytes, raw: bool) -> bytes:
-        """Data behind their header: the number of bytes, or numbers and sizes of compressed blocks."""
+    def _decode(self, source: bytes, raw: bool) -> bytes:
+        """Return the data after a header: the number of bytes, or number and sizes of compressed blocks.
+
+        In base64, header and compressed data are separate groups of 4 characters for 3 bytes.
+        """
         size = self.word.itemsize
 
-        def words(count: int) -> list[int]:
-            part = source[: count * size] if raw else base64.b64decode(source[: -(-count * size // 3) * 4])
-            return np.frombuffer(part, self.word, count).tolist()
-
-        if self.compressor is None:
-            (length,) = words(1)
+        def part(count: int, start: int = 0) -> bytes:
+            """Return `count` bytes after a group of `start` bytes."""
             if raw:
-                whole = source[size : size + length]
-            else:
-                whole = base64.b64decode(source[: -(-(size + length) // 3) * 4])[size : size + length]
-            if len(whole) != length:
-                raise ValueError("an array is cut short")
-            return whole
-        count, block, _ = words(3)
-        header = words(3 + count)
-        packed = (
-            source[len(header) * size :]
-            if raw
-            else base64.b64decode(source[-(-len(header) * size // 3) * 4 :][: -(-sum(header[3:]) // 3) * 4])
-        )
-        parts, at = [], 0
-        for length in header[3:]:
-            parts.append(zlib.decompressobj().decompress(packed[at : at + length], block))
+                return source[start : start + count]
+            return base64.b64decode(source[_base64_length(start) :][: _base64_length(count)])[:count]
+
+        def words(count: int) -> list[int]:
+            return np.frombuffer(part(count * size), self.word, count).tolist()
+
+        if self.compressor is None:  # header and data are one group
+            (length,) = words(1)
+            content = part(size + length)[size:]
+            if len(content) != length:
+                raise ValueError("an array is truncated")
+            return content
+        blocks, block_size, _ = words(3)
+        lengths = words(3 + blocks)[3:]
+        compressed = part(sum(lengths), (3 + blocks) * size)
+        contents, at = [], 0
+        for length in lengths:
+            contents.append(zlib.decompressobj().decompress(compressed[at : at + length], block_size))
             at += length
-        return b"".join(parts)
+        return b"".join(contents)
+
+
+def _base64_length(count: int) -> int:
+    return -(-count // 3) * 4
 
 
 def _numbers(element: ElementTree.Element, name: str, count: int, default: str = "") -> list[float]:

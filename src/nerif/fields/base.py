@@ -1,4 +1,4 @@
-"""What every field of refractive index answers: phantom, network and voxel grid alike."""
+"""Interface of a field: phantom, network or voxels."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Field(ABC):
         return self.value_and_gradient(points)[1]
 
     def to(self, device: torch.device | str) -> Field:
-        """Return the same field on a device; one whose parameters follow the points it is asked is on every device."""
+        """Return the field on a device; itself if its parameters follow the points."""
         return self
 
     @torch.no_grad()
@@ -44,7 +44,7 @@ class Field(ABC):
 
 
 def in_chunks(points: Tensor, size: int = 1 << 13) -> Iterator[Tensor]:
-    """Split along the first axis, so that what is computed of each chunk stays in cache; pause before each."""
+    """Split along the first axis into chunks that fit the cache; pause before each."""
     for part in torch.split(points, size):
         pause()
         yield part

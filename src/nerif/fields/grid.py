@@ -1,4 +1,4 @@
-"""Fields given by one coefficient a voxel: B-splines of degree 1 (trilinear) or 3 (twice differentiable).
+"""Fields with one coefficient per voxel: B-splines of degree 1 (trilinear) or 3 (twice differentiable).
 
     n(x) = sum_ijk c_ijk b(x / hx - i) b(y / hy - j) b(z / hz - k),      x measured from the first voxel centre
 
@@ -24,13 +24,12 @@ DEGREES = {"linear": 1, "cubic": 3}
 
 
 class VoxelField(Field):
-    """A B-spline over the voxels of a grid; beyond the box it is that of the nearest point of the box.
+    """A B-spline over the voxels of a grid; points outside the box have the value at the nearest point of the box.
 
     Parameters
     ----------
     coefficients : (z + 2 p, y + 2 p, x + 2 p) at the voxel centres, p = (degree + 1) / 2 layers beyond each face
-    grid : Grid
-    degree : 1, where the coefficients are the values, or 3
+    degree : 1 (coefficients are values) or 3
     """
 
     def __init__(self, coefficients: Float[Tensor, "zp yp xp"], grid: Grid, degree: int) -> None:
@@ -39,23 +38,20 @@ class VoxelField(Field):
         self.grid, self.degree, self.layers = grid, degree, (degree + 1) // 2
         shape = tuple(n + 2 * self.layers for n in grid.shape)
         if tuple(coefficients.shape) != shape:
-            raise InputError(
-                f"expected the shape {shape} (z, y, x), got {tuple(coefficients.shape)}", field="coefficients"
-            )
+            got = tuple(coefficients.shape)
+            raise InputError(f"expected the shape {shape} (z, y, x), got {got}", field="coefficients")
         self.coefficients = coefficients
 
     @classmethod
     def of(cls, coefficients: Float[Tensor, "z y x"], grid: Grid, degree: int, boundary: Boundary) -> VoxelField:
-        """Return the spline of coefficients that go on beyond the box as the boundary has it."""
+        """Return the spline of coefficients, which the boundary extends beyond the box."""
         return cls(boundary.extend(coefficients, (degree + 1) // 2), grid, degree)
 
     @classmethod
     def through(cls, values: Float[Tensor, "z y x"], grid: Grid) -> VoxelField:
         """Return the cubic spline that passes through `values` at the voxel centres, mirrored about the outermost."""
         if tuple(values.shape) != grid.shape:
-            raise InputError(
-                f"expected values of shape {grid.shape} (z, y, x), got {tuple(values.shape)}", field="volume"
-            )
+            raise InputError(f"expected the shape {grid.shape} (z, y, x), got {tuple(values.shape)}", field="volume")
         coefficients = values.to(torch.float64)
         for axis in range(3):
             coefficients = _prefilter(coefficients, axis)
@@ -63,7 +59,7 @@ class VoxelField(Field):
         return cls(coefficients.to(values.dtype), grid, 3)
 
     def to(self, device: torch.device | str) -> VoxelField:
-        """Return the same field with its coefficients on another device."""
+        """Return the field with its coefficients on a device."""
         return VoxelField(self.coefficients.to(device), self.grid, self.degree)
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
@@ -76,7 +72,7 @@ class VoxelField(Field):
         slopes = slopes / p.new_tensor(self.grid.spacing)[:, None] * (inside == p)[..., None]
         _, ny, nx = self.coefficients.shape
         count = self.degree + 1
-        # the first coefficient that counts, among those of all layers
+        # index of the first contributing coefficient
         ix, iy, iz = (cell.long() + self.layers - self.degree // 2).unbind(-1)
         along_x = ix[:, None] + torch.arange(count, device=p.device)
         flat = self.coefficients.to(p).reshape(-1)
@@ -95,15 +91,15 @@ class VoxelField(Field):
 
 @dataclass(frozen=True)
 class Boundary:
-    """How coefficients go on beyond the faces of the box, and with that the gauge.
+    """Coefficients beyond the faces of the box, which impose the gauge.
 
-    Where the index is ambient on a face they are mirrored with the sign changed, so that the field is 0 on that face;
-    on any other face they are mirrored as they are, so that it ends with zero slope.
+    On an ambient face they are mirrored with opposite sign, so that the field is 0 there; on other faces they are
+    mirrored, so that its slope is 0.
 
     Parameters
     ----------
     ambient_faces : names such as "x-"
-    around : whether what lies beyond one face along y is what lies within the other, as of an angle
+    around : whether the field is periodic along y, as of an angle
     """
 
     ambient_faces: tuple[str, ...] = ()
@@ -118,7 +114,7 @@ class Boundary:
     def extend(
         self, values: Float[Tensor, "z y x"], layers: int, axes: Sequence[int] = (0, 1, 2)
     ) -> Float[Tensor, "zp yp xp"]:
-        """Return the values with `layers` more beyond each face, or those across some of the axes z, y, x."""
+        """Return the values with `layers` more beyond each face across the axes (0, 1, 2: z, y, x)."""
         if min(values.shape[axis] for axis in axes) < layers:
             raise InputError(
                 f"expected at least {layers} voxels along each edge, got {tuple(values.shape)}", field="grid"
@@ -135,7 +131,7 @@ class Boundary:
     def fold(
         self, extended: Float[Tensor, "zp yp xp"], layers: int, axes: Sequence[int] = (0, 1, 2)
     ) -> Float[Tensor, "z y x"]:
-        """Return the adjoint of `extend`: what lies beyond a face is added to the voxel it mirrors."""
+        """Apply the adjoint of `extend`: add values beyond a face to the voxels they mirror."""
         for axis in axes:
             n = extended.shape[axis] - 2 * layers
             before, after = extended.narrow(axis, 0, layers), extended.narrow(axis, n + layers, layers)
@@ -150,9 +146,9 @@ class Boundary:
 
 
 def spline_weights(t: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """Weights of the neighbours of a point a fraction t beyond the one before it, and their slopes in t.
+    """Return weights of the 2 or 4 nearest neighbours on a new last axis, and their derivatives.
 
-    The two nearest neighbours for degree 1, four for degree 3; they stand along a new last axis.
+    t is the distance from the neighbour before, in voxels.
     """
     s = 1 - t
     if degree == 1:
@@ -167,17 +163,16 @@ def _prefilter(values: Tensor, axis: int) -> Tensor:
     n = values.shape[axis]
     if n == 1:
         return values
-    moved = values.movedim(axis, 0)
-    core = moved.reshape(n, -1)
+    first = values.movedim(axis, 0)
     matrix = torch.zeros(n, n, dtype=values.dtype, device=values.device)
     matrix.diagonal().fill_(4 / 6)
     matrix.diagonal(1).fill_(1 / 6)
     matrix.diagonal(-1).fill_(1 / 6)
     matrix[0, 1] = matrix[-1, -2] = 2 / 6
-    return torch.linalg.solve(matrix, core).reshape(moved.shape).movedim(0, axis)
+    return torch.linalg.solve(matrix, first.reshape(n, -1)).reshape(first.shape).movedim(0, axis)
 
 
 def _mirrored(n: int, layers: int) -> Tensor:
-    """Indices 0 ... n - 1 with `layers` more at both ends, folded back about the end samples."""
+    """Indices 0 ... n - 1 and `layers` more at both ends, mirrored about the end samples."""
     index = torch.arange(-layers, n + layers).abs()
     return torch.where(index < n, index, 2 * (n - 1) - index).clamp(0, n - 1)

@@ -1,8 +1,8 @@
-"""Phantoms of flows with an axis: functions of z and of r^2, smooth on the axis, which runs upward through the box.
+"""Axisymmetric phantoms: functions of z and r^2, smooth on the axis, which is the vertical centre line of the box.
 
-gaussian-jet    a jet that spreads from a virtual origin
-plume           the hot gas above a candle, within a thin edge
-underexpanded   a supersonic jet with shock cells
+gaussian-jet    jet that spreads from a virtual origin
+plume           hot gas above a candle, with a thin edge
+underexpanded   supersonic jet with shock cells
 """
 
 from __future__ import annotations
@@ -21,28 +21,21 @@ __all__ = ["AXISYMMETRIC", "Axisymmetric", "GaussianJet", "Plume", "Underexpande
 
 
 class Axisymmetric(Field):
-    """A field around the axis of a box, n - n_ambient = f(r^2, z).
+    """A field around the axis of a box (mm), n - n_ambient = f(r^2, h), scaled by a contrast A.
 
-    Lengths of a flow are shares of a, half the shorter edge across the axis, and heights h are shares of the height of
-    the box, from 0 at the bottom to 1 at the top.
-
-    Parameters
-    ----------
-    box : Box, mm
+    Lengths are in units of a, half the shorter horizontal edge; the height h is 0 at the bottom of the box, 1 at the
+    top.
     """
 
-    def __init__(self, box: Box) -> None:
+    contrast: float
+
+    def __init__(self, box: Box, contrast: float | None = None) -> None:
         self.box, self.unit = box, min(box.edges[:2]) / 2
+        self.contrast = self.contrast if contrast is None else contrast
 
     @abstractmethod
     def profile(self, r2: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return f (1), df/d(r^2) and df/dh.
-
-        Parameters
-        ----------
-        r2 : square of the distance from the axis, in squares of a
-        h : height, in heights of the box
-        """
+        """Return f (1), df/d(r^2) and df/dh."""
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
         p = points - points.new_tensor(self.box.centre)
@@ -55,22 +48,14 @@ class Axisymmetric(Field):
 class GaussianJet(Axisymmetric):
     """A round jet that spreads from a virtual origin, n - n_ambient = A (w_0 / w) exp(-r^2 / (2 w^2)).
 
-    The width w = w_0 + k h grows with height and the value on the axis falls as 1 / w, as that of a scalar does in a
-    self-similar jet.
-
-    Parameters
-    ----------
-    box : Box, mm
-    contrast : A, index excess on the axis at the bottom; helium into air by default
+    The width w = w_0 + k h grows and the value on the axis falls as 1 / w, as for a scalar in a self-similar jet. A is
+    the index excess on the axis at the bottom, by default of helium into air.
 
     Source: Pope, Turbulent Flows (2000), section 5.1, for the self-similar round jet.
     """
 
+    contrast = -2.2e-4
     width, spreading = 0.08, 0.16  # w_0 and k
-
-    def __init__(self, box: Box, contrast: float = -2.2e-4) -> None:
-        super().__init__(box)
-        self.contrast = contrast
 
     def profile(self, r2: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         w = self.width + self.spreading * h
@@ -80,24 +65,18 @@ class GaussianJet(Axisymmetric):
 
 
 class Plume(Axisymmetric):
-    """The hot gas above a candle within a thin edge, n - n_ambient = -A exp(-c h) (1 + tanh s) / 2.
+    """Hot gas above a candle with a thin edge, n - n_ambient = -A exp(-c h) (1 + tanh s) / 2.
 
         s = (R^2 - r^2) / (2 R d),      R = R_0 exp(g h + b sin(3 pi h))
 
     s is (R - r) / d at the edge. The plume is narrow at the wick, widens, necks and widens again, and cools upward.
-
-    Parameters
-    ----------
-    box : Box, mm
-    contrast : A, index lost from cold to hot; 2.2e-4 of 2.7e-4 is a density ratio of 5.5
+    A = 2.2e-4 of 2.7e-4 is a density ratio of 5.5.
     """
+
+    contrast = 2.2e-4
 
     radius, widening, necking = 0.13, 1.17, 0.4  # R_0, g, b
     edge, cooling = 0.024, 0.35  # d, c
-
-    def __init__(self, box: Box, contrast: float = 2.2e-4) -> None:
-        super().__init__(box)
-        self.contrast = contrast
 
     def profile(self, r2: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         angle = 3 * math.pi * h
@@ -117,28 +96,21 @@ class UnderexpandedJet(Axisymmetric):
 
     S is a rounded saw tooth between -1 and 1: each cell expands slowly and is compressed in a thin front. The fronts
     are cones that cross on the axis once in each of the N cells and reach the boundary J half a cell later. The
-    boundary bulges with the cells, and its shear layer d thickens.
-
-    Parameters
-    ----------
-    box : Box, mm
-    contrast : A, index excess of the first cells; densities of 0.5 to 1.7 times that of the ambient air
+    boundary bulges with the cells, and its shear layer d thickens. A is the index excess of the first cells; densities
+    are 0.5 to 1.7 times that of the ambient air.
 
     Source: Pack, Q. J. Mech. Appl. Math. 3 (1950) 173, for cells that are periodic along the axis.
     """
 
+    contrast = 1.6e-4
     cells, decay, mean, sharpness = 3.5, 0.8, 0.2, 0.9  # N, h_d, m, k
     radius, growth, bulge = 0.28, 0.07, 0.05  # R_0, g, b
     layer, thickening = 0.02, 0.06  # d_0, d_1
 
-    def __init__(self, box: Box, contrast: float = 1.6e-4) -> None:
-        super().__init__(box)
-        self.contrast = contrast
-
     def profile(self, r2: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         wave = 2 * math.pi * self.cells
         phase, fading = wave * h - 0.5 * math.pi, torch.exp(-h / self.decay)
-        r = (r2 + 1e-6).sqrt()  # the sum of both saw teeth is even in r
+        r = (r2 + 1e-6).sqrt()  # rounded: the sum of both saw teeth is even in r
         q = (math.pi / self.radius) * r
         ahead, behind = self._saw_tooth(phase + q), self._saw_tooth(phase - q)
         pattern = 0.5 * fading * (ahead[0] + behind[0])
@@ -174,9 +146,7 @@ def _within(r2: Tensor, radius: Tensor, edge: Tensor) -> tuple[Tensor, Tensor, T
     return 0.5 * (1 + inside), -steep / (2 * radius * edge), by_radius, -steep * s / edge
 
 
-AXISYMMETRIC: dict[str, type[GaussianJet | Plume | UnderexpandedJet]] = {
-    "gaussian-jet": GaussianJet,
-    "plume": Plume,
-    "underexpanded": UnderexpandedJet,
-}
-"""The phantoms by the names that settings have for them."""
+AXISYMMETRIC: dict[str, type[Axisymmetric]] = {
+    "gaussian-jet": GaussianJet, "plume": Plume, "underexpanded": UnderexpandedJet,
+}  # fmt: skip
+"""The phantoms by name."""

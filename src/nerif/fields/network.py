@@ -1,9 +1,8 @@
 """The paper's network (App. A): sinusoidal encoding, fully connected layers with a skip, heads for n and grad(n).
 
-The encoding runs along the axes, as in the paper (Eq. (postionencode)), and along the diagonals, so that oblique
-fronts are represented too. The gradient of the n head is the reverse pass written out as forward operations, one more
-pass through the transposed layers. The training loss, which contains this gradient, then needs a single call of
-autograd and can be compiled (`torch.compile` cannot differentiate twice).
+The encoding runs along the axes, as in the paper (Eq. (postionencode)), and along diagonals, for oblique fronts. The
+gradient of the n head is the reverse pass written out as forward operations. The training loss, which contains this
+gradient, then needs a single call of autograd and can be compiled (`torch.compile` cannot differentiate twice).
 """
 
 from __future__ import annotations
@@ -25,42 +24,29 @@ from nerif.fields.base import Field
 from nerif.geometry import Box
 
 __all__ = [
-    "ACTIVATIONS",
-    "DIRECTIONS",
-    "Network",
-    "NetworkShape",
-    "NeuralField",
-    "encode",
-    "encode_pullback",
-    "encoded_width",
-    "wave_vectors",
-]
+    "ACTIVATIONS", "DIRECTIONS", "UNBOUNDED", "Network", "NetworkShape", "NeuralField", "encode", "encode_pullback",
+    "encoded_width", "wave_vectors",
+]  # fmt: skip
 
 
 def _unit(count: int) -> list[tuple[float, ...]]:
-    """Directions, up to their sign, with so many components other than 0, all equal in size."""
-    found = [v for v in itertools.product((1, 0, -1), repeat=3) if sum(map(abs, v)) == count]
-    return [tuple(x / math.sqrt(count) for x in v) for v in found if v > tuple(-x for x in v)]
+    """Directions, up to their sign, with `count` nonzero components of equal size."""
+    vectors = [v for v in itertools.product((1, 0, -1), repeat=3) if sum(map(abs, v)) == count]
+    return [tuple(x / math.sqrt(count) for x in v) for v in vectors if v > tuple(-x for x in v)]
 
 
 AXES = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
 DIRECTIONS = {3: AXES, 9: [*AXES, *_unit(2)], 13: [*AXES, *_unit(2), *_unit(3)]}
-"""By their number: the axes of the box; with the diagonals of the faces of a cube; with those of the cube as well."""
-
-
-def check_directions(count: int) -> None:
-    """Raise InputError unless there are DIRECTIONS of that number."""
-    if count not in DIRECTIONS:
-        raise InputError(f"expected one of {', '.join(map(str, DIRECTIONS))}, got {count}", field="directions")
+"""By their number: the axes of the box; with the face diagonals of a cube; with its space diagonals as well."""
 
 
 def wave_vectors(octaves: int, directions: int) -> tuple[Float[Tensor, "w 3"], Int[Tensor, " w"]]:
     """Return 2^k pi e for k = 0 .. octaves - 1 and each direction e, those along the axes first, and k of each."""
     unit, waves, octave = torch.tensor(DIRECTIONS[directions], dtype=torch.float64), [], []
-    for some in (unit[:3], unit[3:]):
+    for group in (unit[:3], unit[3:]):
         for k in range(octaves):
-            waves.append(math.pi * 2.0**k * some)
-            octave += [k] * len(some)
+            waves.append(math.pi * 2.0**k * group)
+            octave += [k] * len(group)
     if not waves:
         return torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
     return torch.cat(waves).float(), torch.tensor(octave)
@@ -74,16 +60,9 @@ def encoded_width(octaves: int, directions: int) -> int:
 def encode(
     p: Float[Tensor, "n 3"], waves: Float[Tensor, "w 3"], gains: Float[Tensor, " w"] | None = None
 ) -> Float[Tensor, "n e"]:
-    """Return (p, g sin(k . p), g cos(k . p)) for each wave vector k and its gain g.
-
-    Parameters
-    ----------
-    p : (n, 3) coordinates, the box mapped to [-1, 1]
-    waves : (w, 3) see wave_vectors
-    gains : (w,) weights of the waves; the paper's are all 1
-    """
+    """Return (p, g sin(k . p), g cos(k . p)) for coordinates p in [-1, 1], wave vectors k and gains g (paper: 1)."""
     x, y, z = waves.to(p).unbind(-1)
-    # written out, since a matrix product in reduced precision would turn the phases
+    # written out, since a matrix product in reduced precision would change the phases
     phase = torch.addcmul(torch.addcmul(p[:, :1] * x, p[:, 1:2], y), p[:, 2:], z)
     sine, cosine = phase.sin(), phase.cos()
     if gains is not None:
@@ -101,8 +80,11 @@ def encode_pullback(
     w = len(waves)
     sine, cosine = encoded[:, 3 : 3 + w], encoded[:, 3 + w :]
     swirl = cotangent[:, 3 : 3 + w] * cosine - cotangent[:, 3 + w :] * sine
-    # written out as well, so that no product is rounded
+    # written out as well, so that no product is in reduced precision
     return cotangent[:, :3] + torch.stack([(swirl * k).sum(dim=1) for k in waves.to(encoded).T], dim=1)
+
+
+Activation = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def _silu(a: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,38 +93,24 @@ def _silu(a: Tensor) -> tuple[Tensor, Tensor]:
     return h, s + h * (1 - s)
 
 
-def _softplus(a: Tensor) -> tuple[Tensor, Tensor]:
-    # sharpness 10 on a scaled argument: close to ReLU, but with a second derivative to learn from
-    return torch.nn.functional.softplus(a, beta=10.0), torch.sigmoid(10.0 * a)
-
-
 def _tanh(a: Tensor) -> tuple[Tensor, Tensor]:
     h = torch.tanh(a)
     return h, 1 - h * h
 
 
-def _relu(a: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.relu(a), (a > 0).to(a)
-
-
-def _sine(a: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.sin(a), torch.cos(a)
-
-
-ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
+ACTIVATIONS: dict[str, Activation] = {
     "silu": _silu,
-    "softplus": _softplus,
+    # sharpness 10: close to ReLU, but with a second derivative
+    "softplus": lambda a: (torch.nn.functional.softplus(a, beta=10.0), torch.sigmoid(10.0 * a)),
     "tanh": _tanh,
-    "relu": _relu,
-    "sine": _sine,
+    "relu": lambda a: (torch.relu(a), (a > 0).to(a)),
+    "sine": lambda a: (torch.sin(a), torch.cos(a)),
 }
-"""Each gives the activation and its derivative."""
-
+"""Each returns the activation and its derivative."""
 
 UNBOUNDED = (-math.inf, math.inf)
-SHARPNESS = 10.0  # of the bounds: within 0.3 units of one the output bends towards it
-
-ATTENUATION = 0.3  # of a signal by one layer with torch's initial weights; deeper networks than 4 make up for it
+SHARPNESS = 10.0  # of the bounds: the output bends within 0.3 units of one
+ATTENUATION = 0.3  # of a signal by one layer with torch's initial weights; compensated in networks deeper than 4
 
 
 @dataclass(frozen=True)
@@ -156,9 +124,9 @@ class NetworkShape:
     octaves: int = 5
     """N of the sinusoidal encoding; octaves beyond the fifth are weighted down, see Network."""
     directions: int = 13
-    """That each octave runs along: 3 the axes (the paper's), 9 also the diagonals of a cube's faces, 13 its own too."""
+    """Directions of the waves of each octave: 3 axes (the paper's), 9 with face diagonals, 13 with space diagonals."""
     skip: int = 0
-    """The encoding is joined to the output of this layer (paper: 4); 0 for none."""
+    """Layer to whose output the encoding is joined (paper: 4); 0 for none."""
     head_width: int = 0
     """Neurons of each head (paper: 64); 0 for one linear output."""
     gradient_head: bool = False
@@ -166,56 +134,57 @@ class NetworkShape:
     activation: str = "silu"
     """Silu, softplus, tanh, relu or sine."""
     octave_decay: float = 0.0
-    """Octave k of the encoding is weighted 2^(-k octave_decay) (paper: 0)."""
+    """Weight 2^(-k octave_decay) of octave k of the encoding (paper: 0)."""
 
     def __post_init__(self) -> None:
         if self.activation not in ACTIVATIONS:
             raise InputError(f"expected one of {', '.join(ACTIVATIONS)}, got '{self.activation}'", field="activation")
+        if self.directions not in DIRECTIONS:
+            raise InputError(
+                f"expected one of {', '.join(map(str, DIRECTIONS))}, got {self.directions}", field="directions"
+            )
         for name, least in (("depth", 1), ("width", 1), ("octaves", 0), ("skip", 0), ("head_width", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"expected at least {least}, got {getattr(self, name)}", field=name)
-        check_directions(self.directions)
 
     def without_waves_below(self, length: float) -> NetworkShape:
-        """Return it without octaves whose waves, 2^(1 - k) long in coordinates in [-1, 1], are shorter; one stays."""
+        """Return the shape without octaves with wavelengths 2^(1 - k) below a length; one octave stays."""
         finest = sum(2.0 ** (1 - k) >= length for k in range(self.octaves))
         return replace(self, octaves=min(self.octaves, max(finest, 1)))
 
     @classmethod
-    def of(cls, kept: dict[str, Any]) -> NetworkShape:
-        """Return the shape of what a file keeps of it; one that tells no directions is of encodings along the axes."""
-        return cls(**{"directions": 3, **kept})
+    def of(cls, settings: dict[str, Any]) -> NetworkShape:
+        """Return the shape stored in a file; older files have no directions, which are then the axes."""
+        return cls(**{"directions": 3, **settings})
 
 
 class Network(nn.Module):
-    """Maps coordinates in [-1, 1] to the scaled index excess and, by its own heads, the scaled gradient.
+    """Maps coordinates in [-1, 1] to the scaled index excess and, by separate heads, its gradient.
 
-    Octave k of the encoding is given to the first layer times 2^(-k octave_decay), and from the sixth on (k > 4) times
-    4^(4 - k) as well: its slope grows like 2^k, and is noise until the octaves below have found the field.
+    Octave k of the encoding is weighted 2^(-k octave_decay), and from the sixth on (k > 4) 4^(4 - k) as well: its slope
+    grows like 2^k, and is noise until the lower octaves represent the field.
 
-    Where there are bounds a <= N <= b, the n head is not the last layer's output v but one that cannot leave them:
+    With bounds a <= N <= b the n head is not the last layer's output v but
 
         N = a + (softplus(k (v - a)) - softplus(k (v - b))) / k,     N = v far from both
 
     Parameters
     ----------
-    shape : NetworkShape
-    encoded : numbers that the first layer is given; 0 for those of the encoding
     bounds : lowest and highest value of the n head
     """
 
     layered: ClassVar[bool] = True
-    """Whether the n head is one of the last layer alone."""
+    """Whether the n head is a function of the last layer only."""
     gains: Tensor
     bounds: Tensor
     waves: Tensor
     octave: Tensor
 
-    def __init__(self, shape: NetworkShape, encoded: int = 0, bounds: tuple[float, float] = UNBOUNDED) -> None:
+    def __init__(self, shape: NetworkShape, bounds: tuple[float, float] = UNBOUNDED) -> None:
         super().__init__()
         self.shape, self.limits = shape, bounds
         self.register_buffer("bounds", torch.tensor(bounds, dtype=torch.float64))
-        e, w = encoded or encoded_width(shape.octaves, shape.directions), shape.width
+        e, w = encoded_width(shape.octaves, shape.directions), shape.width
         waves, octave = wave_vectors(shape.octaves, shape.directions)
         self.register_buffer("waves", waves, persistent=False)
         self.register_buffer("octave", octave, persistent=False)
@@ -226,25 +195,24 @@ class Network(nn.Module):
         self.heads = nn.ModuleList(nn.Linear(inputs[-1], shape.head_width) for _ in range(hidden_heads))
         self.outputs = nn.ModuleList(nn.Linear(shape.head_width or inputs[-1], 1) for _ in range(outputs))
         k = torch.arange(shape.octaves)
-        even = NetworkShape.octaves  # so many count alike; those above would be steeper than the field itself
-        beyond = 4.0 ** -(k - (even - 1)).clamp(min=0)
+        # octaves above those of the reference would be steeper than the field
+        beyond = 4.0 ** -(k - (NetworkShape.octaves - 1)).clamp(min=0)
         self.register_buffer("gains", beyond * 2.0 ** (-shape.octave_decay * k))
-        if shape.depth > NetworkShape.depth:
-            # a signal passes with the strength it has after the layers of the network of reference
+        if shape.depth > NetworkShape.depth:  # the signal is as strong as after the layers of the reference
             lost = (shape.depth - NetworkShape.depth) / (shape.depth - 1)
             with torch.no_grad():
                 for layer in self.layers[1:]:
                     _linear(layer).weight.mul_(ATTENUATION**-lost)
 
-    def forward(self, p: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
+    def forward(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the scaled index excess."""
         h, _ = self._trunk(p, [])
         return self.bounded(self._value(p, h)[0])[0]
 
     def value_and_gradient(
-        self, p: Float[Tensor, "n k"], heads: bool = False
+        self, p: Float[Tensor, "n 3"], heads: bool = False
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
-        """Return the n head, its exact gradient, and what the gradient heads say (None unless asked)."""
+        """Return the n head, its exact gradient, and the gradient heads (None unless `heads`)."""
         slopes: list[Tensor] = []
         h, encoded = self._trunk(p, slopes)
         value, cotangent, beside = self._value(p, h)
@@ -265,9 +233,8 @@ class Network(nn.Module):
         return value, gradient, self._gradient_heads(p, h) if heads else None
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
-        """Weights without gains are of networks whose octaves count alike but for octave_decay."""
-        alike = 2.0 ** (-self.shape.octave_decay * torch.arange(self.shape.octaves))
-        state_dict.setdefault(f"{prefix}gains", alike)
+        """Load weights; older files have no gains and weight octaves by octave_decay only, and have no bounds."""
+        state_dict.setdefault(f"{prefix}gains", 2.0 ** (-self.shape.octave_decay * torch.arange(self.shape.octaves)))
         low, high = state_dict.setdefault(f"{prefix}bounds", torch.tensor(UNBOUNDED, dtype=torch.float64)).tolist()
         self.limits = low, high
         super()._load_from_state_dict(state_dict, prefix, *others)
@@ -284,14 +251,14 @@ class Network(nn.Module):
                 beyond = SHARPNESS * sign * (bound - v)  # above 0 beyond the bound
                 value = value + sign * torch.nn.functional.softplus(beyond) / SHARPNESS
                 slope = slope - torch.sigmoid(beyond)
-        return value.clamp(low, high), slope  # of rounding alone
+        return value.clamp(low, high), slope  # clamps rounding errors only
 
-    def encode(self, p: Float[Tensor, "n k"]) -> Float[Tensor, "n e"]:
-        """Return what the first layer is given of points."""
+    def encode(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n e"]:
+        """Return the input of the first layer at points."""
         return encode(p, self.waves, self.gains[self.octave].to(p))
 
     def pull_back(self, p: Tensor, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
-        """Return the slope along x, y, z, at points, of that along what the first layer is given."""
+        """Return the derivative by x, y, z from that by the input of the first layer."""
         return encode_pullback(encoded, cotangent, self.waves)
 
     def _trunk(self, p: Tensor, slopes: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -306,27 +273,22 @@ class Network(nn.Module):
         return h, encoded
 
     def _value(self, p: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Output v of the n head, its derivative with respect to h, and its slope in p beside that by way of h."""
-        return *self._head(0, h, ACTIVATIONS[self.shape.activation]), None
+        """Output v of the n head, its derivative by h, and its direct derivative by p."""
+        return *self._head(0, h), None
 
-    def _head(
-        self, index: int, h: Tensor, activate: Callable[[Tensor], tuple[Tensor, Tensor]]
-    ) -> tuple[Tensor, Tensor]:
-        """Output `index` and its derivative with respect to h."""
+    def _head(self, index: int, h: Tensor) -> tuple[Tensor, Tensor]:
+        """Output `index` and its derivative by h."""
         output = _linear(self.outputs[index])
         if not self.shape.head_width:
             return output(h)[:, 0], output.weight.expand(h.shape[0], -1)
         head = _linear(self.heads[index])
-        inner, slope = activate(head(h))
+        inner, slope = ACTIVATIONS[self.shape.activation](head(h))
         return output(inner)[:, 0], (slope * output.weight) @ head.weight
 
     def _gradient_heads(self, p: Tensor, h: Tensor) -> Tensor:
         if not self.shape.gradient_head:
-            raise InputError(
-                "this network was made without gradient heads, so they cannot be asked", field="gradient_head"
-            )
-        activate = ACTIVATIONS[self.shape.activation]
-        return torch.stack([self._head(i, h, activate)[0] for i in (1, 2, 3)], dim=1)
+            raise InputError("expected a network with gradient heads, got one without", field="gradient_head")
+        return torch.stack([self._head(i, h)[0] for i in (1, 2, 3)], dim=1)
 
 
 def _linear(module: nn.Module) -> nn.Linear:
@@ -339,10 +301,9 @@ class NeuralField(Field):
 
     Parameters
     ----------
-    network : Network
-    box : Box, mm; its longest edge is mapped to [-1, 1]
+    box : mm; its longest edge is mapped to [-1, 1]
     scale : field of one unit of network output
-    offset : network output that counts as ambient (the gauge)
+    offset : network output of the ambient field (the gauge)
     """
 
     def __init__(self, network: Network, box: Box, scale: float, offset: float = 0.0) -> None:
@@ -351,31 +312,28 @@ class NeuralField(Field):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Lowest and highest value that the network can give, to six digits."""
+        """Lowest and highest possible value, to six digits."""
         low, high = (float(f"{limit * self.scale:.6g}") for limit in self.network.limits)
         return low, high
 
     def to(self, device: torch.device | str) -> NeuralField:
-        """Return the same field on a device: a copy of the network, or the field itself where it is there already."""
+        """Return the field with a copy of its network on a device, or itself if it is there."""
         if next(self.network.parameters()).device == torch.device(device):
             return self
-        moved = copy.copy(self)
-        moved.network = copy.deepcopy(self.network).to(device)
-        return moved
+        field = copy.copy(self)
+        field.network = copy.deepcopy(self.network).to(device)
+        return field
 
     def normalise(self, points: Points) -> Points:
         """Map points in mm to the coordinates of the network."""
         return (points - constant(self.box.centre, points)) / self.half_edge
 
-    def _inputs(self, points: Points) -> Float[Tensor, "n k"]:
-        """What the network is asked of points in mm."""
-        return self.normalise(points.reshape(-1, 3))
-
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
-        value, gradient, _ = self.network.value_and_gradient(self._inputs(points))
+        value, gradient, _ = self.network.value_and_gradient(self.normalise(points.reshape(-1, 3)))
         value = self.scale * (value - self.offset)
         gradient = gradient * (self.scale / self.half_edge)
         return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
 
     def __call__(self, points: Points) -> Values:
-        return (self.scale * (self.network(self._inputs(points)) - self.offset)).reshape(points.shape[:-1])
+        value = self.network(self.normalise(points.reshape(-1, 3)))
+        return (self.scale * (value - self.offset)).reshape(points.shape[:-1])

@@ -1,17 +1,17 @@
-"""Phantoms: analytic fields with exact gradients, to simulate measurements of which the truth is known.
+"""Phantoms: analytic fields with exact gradients, for simulated measurements.
 
-gaussians    randomly placed Gaussian balls (paper, Phantom 1)
-flame        a turbulent Bunsen flame (in the place of the paper's Phantoms 2-7)
+gaussians    random Gaussian balls (paper, Phantom 1)
+flame        turbulent Bunsen flame (in place of the paper's Phantoms 2-7)
 octahedron   paper, Eq. (SRphantom), for the spatial resolution
-turbulence   a plume with the spectrum of the inertial range down to the pixel (turbulence.py)
-fire         the folded front of a buoyant fire (turbulence.py)
-gaussian-jet, plume, underexpanded
-             flows around an axis (jets.py)
+turbulence, fire                      turbulent plume and fire front (turbulence.py)
+gaussian-jet, plume, underexpanded    axisymmetric flows (jets.py)
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -27,14 +27,7 @@ __all__ = ["Flame", "GaussianBalls", "Octahedron", "Scaled", "make_phantom"]
 
 
 class GaussianBalls(Field):
-    """A sum of Gaussian balls, n - n_ambient = sum_k a_k exp(-|x - c_k|^2 / (2 w_k^2)).
-
-    Parameters
-    ----------
-    centres : (k, 3) mm
-    widths : (k,) standard deviations w, mm
-    amplitudes : (k,) index excess at the centre
-    """
+    """A sum of Gaussian balls, n - n_ambient = sum_k a_k exp(-|x - c_k|^2 / (2 w_k^2)), c and w in mm."""
 
     def __init__(
         self, centres: Float[Tensor, "k 3"], widths: Float[Tensor, " k"], amplitudes: Float[Tensor, " k"]
@@ -43,17 +36,12 @@ class GaussianBalls(Field):
 
     @classmethod
     def random(cls, box: Box, seed: int, count: int = 12, contrast: float = -2.2e-4) -> GaussianBalls:
-        """Place `count` balls at random, the tails below 1e-4 of the peak on the side faces.
+        """Return `count` random balls, below 1e-4 of their peaks on the side faces.
 
-        Widths are 5-9 % of the shortest edge, peaks 50-100 % of `contrast`, and the sum of overlapping balls stays an
-        index of a gas lighter than the ambient one.
+        Widths are 5-9 % of the shortest edge, peaks 50-100 % of `contrast`; sums of overlapping balls stay the index of
+        a gas lighter than the ambient one.
         """
-        generator = torch.Generator().manual_seed(seed)
-
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-        edge = min(box.edges)
+        uniform, edge = _uniform(seed), min(box.edges)
         widths = edge * (0.05 + 0.04 * uniform(count))
         room = torch.tensor(box.edges, dtype=torch.float64) / 2 - 4.3 * widths[:, None]
         centres = torch.tensor(box.centre, dtype=torch.float64) + (2 * uniform(count, 3) - 1) * room
@@ -72,17 +60,13 @@ class GaussianBalls(Field):
 
 
 class Flame(Field):
-    """A wrinkled Bunsen flame: cold core, hot products, ambient around.
+    """A wrinkled Bunsen flame: cold core, hot products, ambient gas around.
 
     n - n_ambient = -A H((r - R_i(z) + a) / d_i) H((R_o(z) - r + b) / d_o),   H(s) = (1 + tanh s) / 2
 
     The flame front R_i is a cone closed at the tip, the outer edge R_o of the products widens upward. The wrinkles
-    a, b are sums of plane waves over an 8 : 1 range of wavelengths, convected upward at `speed` and slowly changing.
-
-    Parameters
-    ----------
-    time : s
-    contrast : A, the index lost from cold to hot; 2.2e-4 of 2.7e-4 is a density ratio of 5.5
+    a, b are sums of plane waves over an 8 : 1 range of wavelengths, convected upward at `speed` and changing slowly.
+    A, the contrast, is the index decrease from cold to hot; 2.2e-4 of 2.7e-4 is a density ratio of 5.5.
     """
 
     shortest, longest = 3.5, 28.0  # wavelengths of the wrinkles, mm
@@ -96,12 +80,8 @@ class Flame(Field):
 
     def __init__(self, box: Box, time: float = 0.0, seed: int = 0, contrast: float = 2.2e-4) -> None:
         self.box, self.contrast = box, contrast
-        generator = torch.Generator().manual_seed(seed)
-
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-        # lengths above are for a 50 mm box; a smaller or larger flame is scaled to its box
+        uniform = _uniform(seed)
+        # lengths above are for a 50 mm box; other flames are scaled to their box
         self.scale = min(box.edges[:2]) / 50.0
         ratio = torch.linspace(0, 1, self.waves, dtype=torch.float64)
         wavelength = self.longest * (self.shortest / self.longest) ** ratio
@@ -153,7 +133,7 @@ class Flame(Field):
 class Octahedron(Field):
     """n - n_ambient = amplitude (1.5 - |x| - |y| - |z|) inside the octahedron, 0 outside (paper, Eq. (SRphantom)).
 
-    The paper's 4 x 4 x 4 units are laid into the box, so one unit is a quarter of its shortest edge.
+    The paper's 4 x 4 x 4 units fill the box: one unit is a quarter of its shortest edge.
     """
 
     def __init__(self, box: Box, amplitude: float = 2.2e-4 / 1.5) -> None:
@@ -167,13 +147,7 @@ class Octahedron(Field):
 
 
 class Scaled(Field):
-    """Another field times a factor: the burnt fraction of a flame as its extinction or emission.
-
-    Parameters
-    ----------
-    field : Field
-    factor : in the unit wanted over that of the field
-    """
+    """Another field times a factor, such as the burnt fraction of a flame as its extinction or emission."""
 
     def __init__(self, field: Field, factor: float) -> None:
         self.field, self.factor = field, factor
@@ -183,33 +157,29 @@ class Scaled(Field):
         return self.factor * value, self.factor * gradient
 
 
-FLAME_INTERVAL = 1e-4  # s between the six instants that stand for the paper's Phantoms 2-7
+def _uniform(seed: int) -> Callable[..., Tensor]:
+    """Random numbers in [0, 1) of any shape."""
+    return partial(torch.rand, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+FLAME_INTERVAL = 1e-4  # s between the six instants in place of the paper's Phantoms 2-7
 
 
 def make_phantom(name: str, box: Box, seed: int = 0, time: float = 0.0) -> Field:
-    """Return the phantom called `name`, one of those above, or of the paper's number 1-7.
-
-    Raises
-    ------
-    InputError
-        If there is no phantom of that name.
-    """
-    if name in ("gaussians", "1"):
-        return GaussianBalls.random(box, seed)
-    if name == "flame":
-        return Flame(box, time, seed)
+    """Return the phantom called `name`: one of those above, or the paper's number 1-7."""
     if name in ("2", "3", "4", "5", "6", "7"):
         return Flame(box, (int(name) - 2) * FLAME_INTERVAL + time, seed)
-    if name == "octahedron":
-        return Octahedron(box)
-    if name == "turbulence":
-        return TurbulentPlume(box, seed)
-    if name == "fire":
-        return Fire(box, seed)
-    if name in AXISYMMETRIC:
-        return AXISYMMETRIC[name](box)
-    raise InputError(
-        f"expected gaussians, flame, octahedron, turbulence, fire, {', '.join(AXISYMMETRIC)}, "
-        f"1-7 (the paper's) or a .nc or .vti volume, got '{name}'",
-        field="phantom",
-    )
+    makers: dict[str, Callable[[], Field]] = {
+        "gaussians": lambda: GaussianBalls.random(box, seed),
+        "flame": lambda: Flame(box, time, seed),
+        "octahedron": lambda: Octahedron(box),
+        "turbulence": lambda: TurbulentPlume(box, seed),
+        "fire": lambda: Fire(box, seed),
+        **{name: partial(phantom, box) for name, phantom in AXISYMMETRIC.items()},
+    }
+    name = "gaussians" if name == "1" else name
+    if name not in makers:
+        raise InputError(
+            f"expected {', '.join(makers)}, 1-7 (the paper's) or a .nc or .vti volume, got '{name}'", field="phantom"
+        )
+    return makers[name]()

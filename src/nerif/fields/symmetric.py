@@ -1,4 +1,4 @@
-"""Fields that are alike around an axis or along a line (geometry/symmetry.py), by a network or by splines of (r, h)."""
+"""Axisymmetric and planar fields (geometry/symmetry.py): networks and splines of (r, h)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,11 @@ __all__ = ["SymmetricNetwork", "SymmetricVoxels", "symmetry_of_field"]
 
 
 class SymmetricNetwork(Network):
-    """A network of (r, h): v(x) = sum_k D_k(x) f_k(r, h), one output f_k a number that the field has there.
+    """A network of (r, h): v(x) = sum_k D_k(x) f_k(r, h), with one output for each f_k.
 
     Parameters
     ----------
-    shape : NetworkShape
-    symmetry : Symmetry, in the coordinates of the network
-    bounds : lowest and highest value of the n head
+    symmetry : in network coordinates
     """
 
     def __init__(self, shape: NetworkShape, symmetry: Symmetry, bounds: tuple[float, float] = UNBOUNDED) -> None:
@@ -35,7 +33,7 @@ class SymmetricNetwork(Network):
         self.layered = symmetry.angles == 1  # type: ignore[misc]
         if not self.layered:
             if shape.gradient_head:
-                raise InputError("expected none with harmonics of the angle (--symmetry axis+N)", field="gradient_head")
+                raise InputError("not available with harmonics of the angle (--symmetry axis+N)", field="gradient_head")
             output = self.outputs[0]
             assert isinstance(output, nn.Linear)
             self.outputs[0] = nn.Linear(output.in_features, symmetry.angles)
@@ -67,7 +65,7 @@ class SymmetricNetwork(Network):
 
 
 def symmetry_of_field(field: Field) -> Symmetry | None:
-    """Return the symmetry that a field is made with, mm; None where it has none."""
+    """Return the symmetry that a field has by construction, mm, or None."""
     if isinstance(field, SymmetricVoxels):
         return field.symmetry
     if isinstance(field, NeuralField) and isinstance(field.network, SymmetricNetwork):
@@ -82,24 +80,24 @@ class SymmetricVoxels(Field):
 
     Parameters
     ----------
-    parts : VoxelField of each f_k over (r, -, h), all on one grid
-    symmetry : Symmetry, mm
+    parts : f_k over (r, -, h), all on one grid
+    symmetry : mm
     """
 
     def __init__(self, parts: Sequence[VoxelField], symmetry: Symmetry) -> None:
         if len(parts) != symmetry.angles:
-            raise InputError(f"expected {symmetry.angles} of the symmetry, got {len(parts)}", field="parts")
+            raise InputError(f"expected {symmetry.angles} for the symmetry, got {len(parts)}", field="parts")
         self.parts, self.symmetry = tuple(parts), symmetry
 
     @classmethod
     def through(
         cls, field: Field, symmetry: Symmetry, grid: Grid, device: torch.device | str = "cpu"
     ) -> SymmetricVoxels:
-        """Return the splines through a symmetric field's values on a grid of (r, -, h), on both sides of an axis.
+        """Return the splines through the values of a symmetric field on a grid.
 
         Parameters
         ----------
-        grid : of (r, -, h), with two voxels across; about an axis r begins as far below 0 as it ends above
+        grid : of (r, -, h), with two voxels across; about an axis r from -r_max to r_max
         """
         h, r = torch.meshgrid(grid.axis("z"), grid.axis("x"), indexing="ij")
         field, parts = field.to(device), []
@@ -119,21 +117,22 @@ class SymmetricVoxels(Field):
 
     @property
     def padded(self) -> Float[Tensor, "z k x"]:
-        """Coefficients (h, k, r), with those beyond the grid across h and r."""
+        """Coefficients (h, k, r) with the layers beyond the grid in h and r."""
         return torch.stack([part.coefficients[:, part.layers] for part in self.parts], dim=1)
 
     def to(self, device: torch.device | str) -> SymmetricVoxels:
-        """Return the same field with its coefficients on another device."""
+        """Return the field with its coefficients on a device."""
         return SymmetricVoxels([part.to(device) for part in self.parts], self.symmetry)
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
         w = self.symmetry.local(points)
         place = self.symmetry.of_local(w)
-        found = [part.value_and_gradient(place) for part in self.parts]
-        if len(found) == 1:
-            value, slope = found[0]
+        results = [part.value_and_gradient(place) for part in self.parts]
+        if len(results) == 1:
+            value, slope = results[0]
             return value, self.symmetry.turned_back(w, slope)
         share, rise = self.symmetry.shares(w)
-        values, slopes = torch.stack([v for v, _ in found], dim=-1), torch.stack([s for _, s in found], dim=-2)
+        values = torch.stack([value for value, _ in results], dim=-1)
+        slopes = torch.stack([slope for _, slope in results], dim=-2)
         slope = self.symmetry.turned_back(w, (share[..., None] * slopes).sum(dim=-2))
         return (share * values).sum(dim=-1), slope + (rise * values[..., None]).sum(dim=-2)

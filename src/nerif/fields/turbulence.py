@@ -1,4 +1,4 @@
-"""Turbulent phantoms: a scalar with the spectrum of the inertial range, as it is and as the fronts of a fire."""
+"""Turbulent phantoms from a scalar with the spectrum of the inertial range: a plume, and the fronts of a fire."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nerif.geometry import Box, Grid
 __all__ = ["Fire", "TurbulentPlume", "inertial_scalar"]
 
 LONGEST, SHORTEST = 0.5, 0.0112
-"""Wavelengths of the inertial range, shares of the shortest edge: at 50 mm 25 mm and two pixels of the paper's rig."""
+"""Wavelengths of the inertial range, shares of the shortest edge: of 50 mm, 25 mm and two pixels of the paper's rig."""
 
 
 def inertial_scalar(
@@ -23,19 +23,8 @@ def inertial_scalar(
 ) -> VoxelField:
     """Return a homogeneous, isotropic Gaussian field of mean 0 and variance 1 with E(k) ~ k^-slope.
 
-    The spectrum reaches from `longest` to `shortest` and is 0 beyond; the field is periodic in the box.
-
-    Parameters
-    ----------
-    box : Box, mm
-    seed : of the phases
-    shortest, longest : wavelengths at which the spectrum ends and begins, shares of the shortest edge
-    slope : 5/3 in the inertial range
-
-    Raises
-    ------
-    InputError
-        If the range of wavelengths is empty.
+    The spectrum is 0 outside the wavelengths `shortest` to `longest`, shares of the shortest edge. The field is
+    periodic in the box.
     """
     if not 0 < shortest < longest:
         raise InputError(f"expected a share of the edge between 0 and {longest}, got {shortest}", field="shortest")
@@ -55,13 +44,9 @@ def inertial_scalar(
 
 
 class TurbulentPlume(Field):
-    """A hot plume that is turbulent down to the pixel: n - n_ambient = -A exp(-r^2 / (2 w^2)) (1 + tanh(b g)) / 2.
+    """A hot plume, turbulent down to the pixel: n - n_ambient = -A exp(-r^2 / (2 w^2)) (1 + tanh(b g)) / 2.
 
-    Parameters
-    ----------
-    box : Box, mm
-    seed, shortest : of the turbulence g, see `inertial_scalar`
-    contrast : A, the most index that is lost
+    g is an `inertial_scalar` with `seed` and `shortest`, A the contrast.
     """
 
     width, intensity = 0.13, 0.6  # w in shortest edges; b
@@ -80,17 +65,12 @@ class TurbulentPlume(Field):
 
 
 class Fire(Field):
-    """A buoyant fire: hot gas within a thin, folded front, pockets apart from it,
+    """A buoyant fire: hot gas within a thin, folded front, with detached pockets,
 
-        n - n_ambient = -A (1 + tanh(h / d)) / 2,      h = R(z) - r + b g,
+        n - n_ambient = -A (1 + tanh(h / d)) / 2,      h = R(z) - r + b g.
 
-    where g is a scalar of the inertial range and R the radius of the plume, which necks and widens.
-
-    Parameters
-    ----------
-    box : Box, mm
-    seed, shortest : of the turbulence g, see `inertial_scalar`
-    contrast : A, index excess lost from cold to hot
+    g is an `inertial_scalar` with `seed` and `shortest`, A the contrast, and R the radius of the plume, which necks and
+    widens.
     """
 
     front, wrinkling = 0.012, 0.07  # d and b, shares of the shortest edge

@@ -1,10 +1,9 @@
-"""Absorption: light or X-rays that a medium attenuates by its extinction coefficient mu, 1/mm (Beer-Lambert).
+"""Absorption: light or X-rays attenuated by the extinction coefficient mu, 1/mm (Beer-Lambert).
 
     A = -ln(I / I0) = integral mu ds
 
-Where A is large few quanta are left, and their logarithm is skewed. Then what has even noise is compared instead of A:
-transmittances, where the noise is the detector's (`intensity`), or their square roots, where it is that of quanta
-(`poisson`).
+Where A is large few quanta are left, and the noise of A is skewed. Transmittances (`intensity`) have uniform noise if
+it is that of the detector, their square roots (`poisson`) if it is shot noise.
 """
 
 from __future__ import annotations
@@ -16,18 +15,18 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.forward.base import ForwardModel, Light
-from nerif.forward.line_integral import IMPOSSIBLE, LineIntegral, share_below
+from nerif.forward.base import ForwardModel, Light, Map, Mask, PerRay
+from nerif.forward.line_integral import MAX_NOISE, LineIntegral, share_below
 from nerif.geometry import Rays
 
-__all__ = ["Absorption", "Intensity", "absorbance"]
+__all__ = ["Absorption", "absorbance"]
 
-TOLERATED = 0.01  # share of pixels with what cannot be
-LEAST = -0.25  # absorbance by which light that varies from image to image leads below 0
+MAX_SHARE = 0.01  # of the pixels with impossible values
+MIN_ABSORBANCE = -0.25  # from light that varies between images
 
 
 @dataclass(frozen=True)
@@ -46,101 +45,75 @@ class Absorption(LineIntegral):
     def of(cls, light: Light, model: str) -> ForwardModel:
         return MODELS[model]()
 
-    @property
-    def weight(self) -> float:
-        return 1.0
-
     @classmethod
-    def check(
-        cls,
-        values: Float[Tensor, "row column c"],
-        sigma: Float[Tensor, "row column c"] | None,
-        usable: Bool[Tensor, "row column"],
-    ) -> None:
-        share = share_below(LEAST, values, sigma, usable)
-        if share > TOLERATED:
+    def check(cls, values: Map, sigma: Map | None, usable: Mask) -> None:
+        share = share_below(MIN_ABSORBANCE, values, sigma, usable)
+        if share > MAX_SHARE:
             raise InputError(
-                f"expected -ln(I / I0) of 0 or more, as I is at most I0; {share:.0%} of the pixels are "
-                f"far below (to {float(values[usable].min()):.3g}): subtract the offset of pixels beside the medium",
+                f"expected -ln(I / I0) of 0 or more, as I is at most I0, got much less (to "
+                f"{float(values[usable].min()):.3g}) at {share:.0%} of the pixels; subtract the offset of pixels "
+                "beside the medium",
                 field="absorbance",
             )
 
     @classmethod
-    def detected(
-        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
-        """Return absorbances of so many quanta a pixel without the medium; the reference has no noise."""
+    def detect(cls, values: Tensor, counts: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return absorbances with the shot noise of `counts` quanta a pixel without the medium, and none of I0."""
         passed = torch.poisson(counts * torch.exp(-values.nan_to_num()), generator)
-        found, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_images=math.inf)
-        seen = torch.where(values.isnan(), values, torch.from_numpy(found).to(values))
-        return seen, torch.from_numpy(sigma).to(values)
+        noisy, sigma = absorbance(passed.numpy(), np.full(passed.shape, counts), reference_images=math.inf)
+        result = torch.where(values.isnan(), values, torch.from_numpy(noisy).to(values))
+        return result, torch.from_numpy(sigma).to(values)
 
 
 @dataclass(frozen=True)
 class Intensity(Absorption):
-    """A power of the transmittance, y = exp(-p A), instead of A, with sigma_y = p y sigma_A.
+    """A power of the transmittance, y = exp(-p A), with sigma_y = p y sigma_A.
 
-    p = 1 has even noise where that is the detector's, p = 1/2 where it is that of counted quanta: the variance of the
-    square root of a Poisson variable is 1/4, however large it is (Bartlett, J. R. Stat. Soc. Suppl. 3, 1936).
-
-    Parameters
-    ----------
-    power : p
+    p = 1 has uniform noise if it is that of the detector, p = 1/2 if it is shot noise: the variance of the square root
+    of a Poisson variable is 1/4, whatever its mean (Bartlett, J. R. Stat. Soc. Suppl. 3, 1936).
     """
 
     linear = False
-    power: float = 1.0
+    power: float = 1.0  # p
 
     @property
     def linear_twin(self) -> ForwardModel:
         return Absorption()
 
-    def read(self, prediction: Float[Tensor, "n k"], rays: Rays) -> Float[Tensor, "n c"]:
+    def read(self, prediction: PerRay, rays: Rays) -> PerRay:
         return torch.exp(-self.power * prediction)
 
-    def reading(
-        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None, rays: Rays
-    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
+    def reading(self, values: PerRay, sigma: PerRay | None, rays: Rays) -> tuple[PerRay, PerRay | None]:
         read = self.read(values, rays)
         return read, None if sigma is None else self.power * read * sigma
 
 
+# readings by the names that settings have for them, the default first
 MODELS: dict[str, Callable[[], Absorption]] = {
-    "absorbance": Absorption,
-    "intensity": Intensity,
-    "poisson": partial(Intensity, 0.5),
-}
-"""What is compared: absorbances, or the transmittances that they stand for, or their square roots."""
+    "absorbance": Absorption, "intensity": Intensity, "poisson": partial(Intensity, 0.5)
+}  # fmt: skip
 
 
 def absorbance(
-    intensity: Float[np.ndarray, "*n"],
-    reference: Float[np.ndarray, "*n"],
-    dark: Float[np.ndarray, "*n"] | float = 0.0,
-    electrons_per_count: float = 1.0,
-    read_noise: float = 0.0,
+    intensity: Float[np.ndarray, "*n"], reference: Float[np.ndarray, "*n"],
+    dark: Float[np.ndarray, "*n"] | float = 0.0, electrons_per_count: float = 1.0, read_noise: float = 0.0,
     reference_images: float = 1.0,
-) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:  # fmt: skip
     """Return absorbance and its standard deviation from images with and without the medium.
 
         A = -ln((I - D) / (I0 - D)),    sigma^2 = var(I) / (I - D)^2 + var(I0) / (I0 - D)^2 / N,
         var(I) = (I - D) / g + r^2
 
-    Where no light is left half a quantum is taken, with the variance of a whole one: such a pixel says that the
-    absorbance is large, and without it the brighter ones beside it would be left. Pixels without a reference are NaN.
+    Where no light is left, I - D is half a quantum, with the variance of a whole one: such a pixel shows that the
+    absorbance is large, and omitting it would bias towards its brighter neighbours. Pixels without a reference are NaN.
+    It is an error if, by more than their noise, intensities are negative or I exceeds I0.
 
     Parameters
     ----------
-    intensity, reference : I and I0, counts
-    dark : D, counts without light
-    electrons_per_count : g, the detected quanta that one count stands for
+    intensity, reference, dark : I, I0 and D, counts
+    electrons_per_count : g, detected quanta per count
     read_noise : r, standard deviation, counts
-    reference_images : N, images that the reference is the mean of
-
-    Raises
-    ------
-    InputError
-        If shapes disagree, intensities are negative, or I exceeds I0, by more than their noise.
+    reference_images : N, images averaged in the reference
     """
     for name, image in (("reference", reference), ("dark", np.asarray(dark))):
         if image.shape != intensity.shape and (name, image.shape) != ("dark", ()):
@@ -152,12 +125,12 @@ def absorbance(
     one, many = (np.maximum(x, quantum) * quantum + read_noise**2 for x in (passed, whole))
     noise = [one, many / reference_images]
     for name, x, variance in (("intensity", passed, noise[0]), ("reference", whole, noise[1])):
-        negative = float(np.mean(x < -IMPOSSIBLE * np.sqrt(variance)))
-        if negative > TOLERATED:
-            where = f"{negative:.0%} of the pixels"
-            raise InputError(f"expected counts of 0 or more, got negative ones at {where}; is dark right?", field=name)
-    brighter = float(np.mean(passed - whole > IMPOSSIBLE * np.sqrt(noise[0] + noise[1])))
-    if brighter > TOLERATED:
+        share = float(np.mean(x < -MAX_NOISE * np.sqrt(variance)))
+        if share > MAX_SHARE:
+            message = f"expected counts of 0 or more, got negative ones at {share:.0%} of the pixels; is dark right?"
+            raise InputError(message, field=name)
+    brighter = float(np.mean(passed - whole > MAX_NOISE * np.sqrt(noise[0] + noise[1])))
+    if brighter > MAX_SHARE:
         raise InputError(
             f"expected at most the reference I0, got more at {brighter:.0%} of the pixels; "
             "are the two exchanged, or did the light change? Scale them by pixels beside the medium",

@@ -1,12 +1,12 @@
-"""The forward model: what the pixels see of a field along their rays. One file beside this one is one technique.
+"""The forward model: the measured quantity of the pixels as a function of the field along their rays.
 
-A linear model says what each sample x_m of a ray counts for, in each of its channels:
+A linear model gives quadrature weights for the samples x_m of a ray, in each of its channels:
 
     prediction = sum_m a_m f(x_m) + b_m . grad f(x_m),      a_m = w_m A,   b_m = w_m B
 
-w is the profile along the ray, A and B belong to the ray. The loss of the network, the voxel operator and its adjoint,
-re-projection, the check of views and simulation take these weights from here and from nowhere else. A model that is not
-linear moves the samples first (`bend`), or makes of the integral what the pixel reads (`read`).
+w is the profile along the ray, A and B belong to the ray. The loss of the network, the voxel operator, re-projection,
+simulation and the check of views all use these weights. A nonlinear model moves the samples first (`bend`), or
+transforms the integral (`read`).
 """
 
 from __future__ import annotations
@@ -24,48 +24,40 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.geometry import Camera, Rays
 
-__all__ = ["ForwardModel", "Light", "Weights", "midpoints"]
+__all__ = ["ForwardModel", "Light", "Map", "Mask", "PerRay", "SampleVectors", "Samples", "Weights", "midpoints"]
 
-GRAZING = 1e-3  # of the longest way through the box, below which a ray says nothing of the size of the field
+MIN_PATH = 1e-3  # of the longest path through the box; shorter rays are not used to estimate the size of the field
+
+PerRay = Float[Tensor, "n _"]  # a column per channel, or per integral
+Samples = Float[Tensor, "n m"]
+SampleVectors = Float[Tensor, "n m 3"]
+Map = Float[Tensor, "row column _"]
+Mask = Bool[Tensor, "row column"]
 
 
 class Light(Protocol):
-    """What a forward model has to know of a measurement."""
+    """The part of a measurement on which forward models depend; `maps` are by their names in the file."""
 
     @property
-    def n_ambient(self) -> float:
-        """Refractive index around the flow."""
-
+    def n_ambient(self) -> float: ...
     @property
-    def wavelength_nm(self) -> float | None:
-        """Wavelength of the light, nm."""
-
+    def wavelength_nm(self) -> float | None: ...
     @property
-    def cameras(self) -> Sequence[Camera]:
-        """Of the views."""
-
+    def cameras(self) -> Sequence[Camera]: ...
     @property
-    def maps(self) -> Mapping[str, Tensor]:
-        """What has a value a pixel, displacements apart, by its name in the file."""
+    def maps(self) -> Mapping[str, Tensor]: ...
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What the samples of rays count for: a_m = profile_m value, b_m = profile_m slope.
+    """Quadrature weights of the samples of rays: a_m = profile_m value, b_m = profile_m slope."""
 
-    Parameters
-    ----------
-    profile : (n, m) along each ray; holds the length that a sample stands for
-    value : (n, c) of f, or None for 0
-    slope : (n, c, 3) of grad f, or None for 0
-    """
-
-    profile: Float[Tensor, "n m"]
-    value: Float[Tensor, "n c"] | None = None
-    slope: Float[Tensor, "n c 3"] | None = None
+    profile: Float[Tensor, "n m"]  # includes the length of each sample
+    value: Float[Tensor, "n c"] | None = None  # of f; None for 0
+    slope: Float[Tensor, "n c 3"] | None = None  # of grad f; None for 0
 
     def __call__(self, value: Tensor | None, gradient: Tensor | None) -> Float[Tensor, "n c"]:
-        """Return the prediction from f (n, m) and grad f (n, m, 3) at the samples; what does not count may be None."""
+        """Return the prediction from f (n, m) and grad f (n, m, 3) at the samples; one without weights may be None."""
         total: Tensor | None = None
         if self.slope is not None:
             assert gradient is not None
@@ -74,19 +66,16 @@ class Weights:
             assert value is not None
             part = (self.profile * value).sum(dim=1, keepdim=True) * self.value
             total = part if total is None else total + part
-        assert total is not None, "a model sees the field or its gradient"
+        assert total is not None, "a model depends on the field or its gradient"
         return total
 
     def in_units(self, value: float, gradient: float) -> Weights:
-        """Return the weights of a field and a gradient given in such units."""
-        return Weights(
-            self.profile,
-            None if self.value is None else self.value * value,
-            None if self.slope is None else self.slope * gradient,
-        )
+        """Return the weights of a field and a gradient in these units."""
+        a, b = self.value, self.slope
+        return Weights(self.profile, None if a is None else a * value, None if b is None else b * gradient)
 
     def sizes(self, length: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """Return the prediction, rms over channels, of a field of 1 whose gradient is 1 over a length (mm)."""
+        """Return the prediction, rms over channels, for a field of 1 whose gradient is 1 over a length (mm)."""
         along = self.profile.abs().sum(dim=1)
         size = torch.zeros_like(along)
         if self.value is not None:
@@ -97,224 +86,154 @@ class Weights:
 
 
 class ForwardModel(ABC):
-    """A technique: what is reconstructed, what a pixel measures of it, and how the one gives the other."""
+    """A technique: its field, its measured quantity, and the relation between them."""
 
-    name: ClassVar[str]
-    """Of the technique, as attribute `technique` of a measurement file has it."""
-    tomography: ClassVar[str] = "tomography"
-    """What reconstructing a volume by it is called."""
-    measured: ClassVar[str]
-    """What a pixel measures: the variable of the file."""
-    sigma: ClassVar[str]
-    """The variable with its standard deviation."""
-    beside: ClassVar[Mapping[str, tuple[int, str]]] = {}
-    """Further maps that it takes: numbers a pixel and unit, by their names."""
-    channels: ClassVar[tuple[str, ...]]
-    """Names of the components of what a pixel measures."""
-    integrals: ClassVar[int] = 0
-    """Numbers that the path integral of a pixel has; 0 for one a channel."""
-    unit: ClassVar[str]
-    """Of what a pixel measures."""
-    misscaled: ClassVar[str] = "another scale"
-    """What may make all values of one view too large or too small."""
-    limits: ClassVar[tuple[float, float]]
-    """Least sigma, and largest value and sigma, that can have been measured."""
-    quantity: ClassVar[str]
-    """The field that is reconstructed (volume.QUANTITIES)."""
-    gauge: ClassVar[bool] = False
-    """Whether the measurement leaves a constant of the field open."""
-    background: ClassVar[bool] = False
-    """Whether the cameras have to look at a background."""
-    bounds: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
-    """Lowest and highest value that the field can have, in its unit."""
-    traced: ClassVar[bool] = False
-    """Whether rays can be followed through the field, bent to every order (physics/ray_tracing.py)."""
-    straight: ClassVar[bool] = True
-    """Whether samples stand on the straight ray."""
+    name: ClassVar[str]  # value of attribute `technique` of measurement files
+    tomography: ClassVar[str] = "tomography"  # name of the reconstruction of a volume
+    measured: ClassVar[str]  # variable of the file with the measured quantity
+    sigma: ClassVar[str]  # variable with its standard deviation
+    beside: ClassVar[Mapping[str, tuple[int, str]]] = {}  # further maps: components and unit, by variable
+    channels: ClassVar[tuple[str, ...]]  # names of the components of the measured quantity
+    integrals: ClassVar[int] = 0  # components of the path integral of a pixel; 0 for one per channel
+    unit: ClassVar[str]  # of the measured quantity
+    misscaled: ClassVar[str] = "another scale"  # likely cause if all values of one view are too large or too small
+    limits: ClassVar[tuple[float, float]]  # smallest plausible sigma; largest plausible value and sigma
+    quantity: ClassVar[str]  # the field (volume.QUANTITIES)
+    gauge: ClassVar[bool] = False  # the data leave a constant of the field undetermined
+    background: ClassVar[bool] = False  # the cameras need a background
+    bounds: ClassVar[tuple[float, float]] = (-math.inf, math.inf)  # lowest and highest possible value of the field
+    traced: ClassVar[bool] = False  # there is a model with rays traced through the field (ray_tracing.py)
+    straight: ClassVar[bool] = True  # samples lie on the straight ray
+    # a pixel is a sum of a non-negative field with positive weights (on a grid with ambient faces, where the spline is
+    # mirrored, weights may be as low as minus a hundredth of the largest)
     additive: ClassVar[bool] = False
-    """Whether a pixel sees a sum, with weights above 0, of a field that is never negative (on a grid, of faces that are
-    ambient, weights may be a hundredth of the largest below 0: the spline is mirrored there)."""
-    fill: ClassVar[float] = 1.0
-    """Share of the path through the box that counts towards what is measured, at about: for the size of the field."""
-    gains: ClassVar[bool] = False
-    """Whether cameras may be of different brightness, which a fit can tell."""
-    averaged: ClassVar[bool] = True
-    """Whether the mean over neighbouring pixels is what their mean ray measures."""
-    windowed: ClassVar[bool] = False
-    """Whether a pixel may have measured the mean over a window of pixels."""
-    derived: ClassVar[str] = ""
-    """Technique whose values are found in these, such as displacements in images, by a window's reach of them."""
-    guess: ClassVar[str] = ""
-    """Map that holds what those values are about."""
-    outlier: ClassVar[float] = math.inf
-    """Residuals, in sigma, beyond which a pixel counts by their size and not by its square (Huber)."""
-    settles: ClassVar[bool] = False
-    """Whether something of what is measured beside the field has to be fitted to a prediction (`settle`)."""
-    linear: ClassVar[bool] = True
-    """Whether the weights say all: neither `bend` nor `read` changes anything."""
+    fill: ClassVar[float] = 1.0  # approximate share of the path through the box that contributes: for the field's size
+    gains: ClassVar[bool] = False  # intensity gains of cameras can be fitted
+    averaged: ClassVar[bool] = True  # the mean over neighbouring pixels is the measurement of their mean ray
+    windowed: ClassVar[bool] = False  # a pixel may be the mean over a correlation window
+    derived: ClassVar[str] = ""  # technique whose values are computed from these, such as displacements from images
+    guess: ClassVar[str] = ""  # map with approximate values of the path integral
+    outlier: ClassVar[float] = math.inf  # residual in sigma beyond which the loss is linear (Huber)
+    settles: ClassVar[bool] = False  # parameters of the images have to be fitted beside the field (`settle`)
+    linear: ClassVar[bool] = True  # the weights are the whole model, without `bend` and `read`
 
     @classmethod
     @abstractmethod
     def of(cls, light: Light, model: str) -> ForwardModel:
-        """Return the model of the technique in a light; `model` names one of several where there are such."""
+        """Return the model of the technique for a measurement; `model` selects one of several."""
 
     @abstractmethod
-    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
-        """Return what samples at path lengths s (mm) count for, each of which stands for a length (mm)."""
+    def weights(self, rays: Rays, s: Samples, step: Samples) -> Weights:
+        """Return the weights of samples at path lengths s, each for a length `step`, mm."""
 
     @classmethod
     def in_pixels(cls) -> bool:
-        """Return whether values are lengths in the image, which shrink with it."""
+        """Return whether values are lengths in the image."""
         return cls.unit == "px"
 
     @property
     def linear_twin(self) -> ForwardModel:
-        """The linear model of the same integral: itself, if it is linear."""
+        """The linear model of the same integral."""
         assert self.linear, f"{type(self).__name__} has to name its linear twin"
         return self
 
     @property
     def integral(self) -> ForwardModel:
-        """The model of the path integral alone, before it is read: itself, where the maps of files hold integrals."""
+        """The model of the path integral alone; itself where that is the measured quantity."""
         return self
 
     @property
     def constants(self) -> dict[str, Any]:
-        """What it knows of the light, by names."""
+        """The properties of the measurement on which the model depends, by name."""
         return dict(vars(self))
 
     @property
     def patch(self) -> int:
-        """Edge (px) of the squares of pixels that one ray through their middle stands for, each with its own value."""
+        """Edge (px) of the squares of pixels that share one ray, each with its own value."""
         return 1
 
     @classmethod
     def seen_by(cls, camera: Camera) -> Camera:
-        """Return the camera, without the background or the window that the technique does not look at."""
+        """Return the camera without the background or window that does not apply to the technique."""
         camera = camera if cls.background or camera.background is None else camera.without_background
         return camera if cls.windowed else camera.without_window
 
     def bend(
-        self,
-        value: Float[Tensor, "n m"],
-        gradient: Float[Tensor, "n m 3"],
-        rays: Rays,
-        s: Float[Tensor, "n m"],
-        step: Float[Tensor, "n m"],
-    ) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"]]:
-        """Return by how much (mm) samples leave the straight ray, and what is to be taken off the gradient there.
+        self, value: Samples, gradient: SampleVectors, rays: Rays, s: Samples, step: Samples
+    ) -> tuple[SampleVectors, SampleVectors]:
+        """Return the offset of the samples from the straight ray (mm), and a vector to subtract from their gradient.
 
-        Asked only of a model that is not `straight`, and given the field and its gradient on the straight ray.
+        For models that are not `straight`, from field and gradient on the straight ray.
         """
-        raise NotImplementedError(f"{type(self).__name__} has straight rays")
+        raise NotImplementedError
 
     @classmethod
-    def check(
-        cls,
-        values: Float[Tensor, "row column c"],
-        sigma: Float[Tensor, "row column c"] | None,
-        usable: Bool[Tensor, "row column"],
-    ) -> None:
-        """Refuse the map of a view that cannot be what the technique measures.
-
-        Raises
-        ------
-        InputError
-            Saying what is wrong, and what to do.
-        """
+    def check(cls, values: Map, sigma: Map | None, usable: Mask) -> None:
+        """Raise InputError for a map of a view that is not physically possible."""
         return
 
     @classmethod
-    def detected(
-        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
-        """Return what is measured with so many detected quanta, and its sigma.
-
-        Raises
-        ------
-        InputError
-            If the noise of the technique is not that of quanta.
-        """
+    def detect(cls, values: Tensor, counts: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return values (..., c) with the shot noise of a number of detected quanta, and sigma."""
         raise InputError(f"expected a technique that counts quanta, got {cls.name}; give --noise", field="counts")
 
-    def reading(
-        self, values: Float[Tensor, "n c"], sigma: Float[Tensor, "n c"] | None, rays: Rays
-    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
-        """Return what was measured, and its sigma, as `read` has it."""
+    def reading(self, values: PerRay, sigma: PerRay | None, rays: Rays) -> tuple[PerRay, PerRay | None]:
+        """Return measured values and sigma in the form that `read` predicts."""
         return values, sigma
 
-    def read(self, prediction: Float[Tensor, "n k"], rays: Rays) -> Float[Tensor, "n c"]:
-        """Return what the pixels of rays read of the integral: the integral itself."""
+    def read(self, prediction: PerRay, rays: Rays) -> PerRay:
+        """Return the reading of pixels from their path integral."""
         return prediction
 
-    def residual(
-        self, prediction: Float[Tensor, "n k"], measured: Float[Tensor, "n c"], rays: Rays
-    ) -> Float[Tensor, "n c"]:
-        """Return the difference of what pixels read of the integral and what was measured, as `reading` has it."""
+    def residual(self, prediction: PerRay, measured: PerRay, rays: Rays) -> PerRay:
+        """Return the predicted minus the measured reading."""
         return self.read(prediction, rays) - measured
 
-    def settle(
-        self,
-        prediction: Float[Tensor, "n k"],
-        measured: Float[Tensor, "n c"],
-        inverse_sigma: Float[Tensor, "n c"],
-        rays: Rays,
-    ) -> None:
-        """Fit what is open beside the field, such as the brightness of images, to the integral that is predicted."""
+    def settle(self, prediction: PerRay, measured: PerRay, inverse_sigma: PerRay, rays: Rays) -> None:
+        """Fit parameters of the images, such as their brightness, to a predicted path integral."""
         return
 
     @property
-    def settled(self) -> Tensor:
-        """What `settle` fitted, view by view."""
-        raise NotImplementedError(f"{type(self).__name__} settles nothing")
+    def brightness(self) -> Tensor:
+        """The parameters from `settle`, view by view."""
+        raise NotImplementedError
 
-    def adopt(self, settled: Tensor) -> None:
-        """Take over what `settle` fitted elsewhere."""
-        raise NotImplementedError(f"{type(self).__name__} settles nothing")
+    def adopt(self, brightness: Tensor) -> None:
+        """Set the parameters to those of another fit."""
+        raise NotImplementedError
 
     @classmethod
-    def completed(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return the maps, and those that attributes of their file stand for.
-
-        Raises
-        ------
-        InputError
-            If an attribute is not what it should be.
-        """
+    def complete(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return the maps, with those that are given by attributes of their file."""
         return dict(maps)
 
     @classmethod
-    def softened(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
-        """Return maps blurred by a Gaussian of that standard deviation; as they are, where that makes them no easier.
-
-        Parameters
-        ----------
-        sizes : (height, width) of each view, px
-        """
+    def blur(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
+        """Return maps of views of (height, width) px, blurred by a Gaussian if that helps to fit them."""
         return dict(maps)
 
     def prepare(self) -> None:
-        """Compute what the maps of all views share, before threads make them side by side."""
+        """Compute what the maps of all views share, before threads compute them in parallel."""
         return
 
-    def mapped(self, integral: Float[Tensor, "row column k"], view: int) -> Float[Tensor, "row column c"]:
-        """Return what the map of a view holds of the integral: the integral itself."""
+    def to_map(self, integral: Map, view: int) -> Map:
+        """Return the map of a view from its path integrals."""
         return integral
 
-    def field_scale(self, rays: Rays, measured: Float[Tensor, "n c"]) -> float:
-        """Return the size of field that makes measurements of the size given; 0 where all of them are 0."""
+    def field_scale(self, rays: Rays, measured: PerRay) -> float:
+        """Return the typical size of a field with measured values of this size; 0 if all are 0."""
         length = rays.far - rays.near
-        through = length > GRAZING * length.max()
+        through = length > MIN_PATH * length.max()
         rays, measured, length = rays[through], measured[through], length[through]
         middle = 0.5 * (rays.near + rays.far)
         sizes = self.weights(rays, middle[:, None], length[:, None]).sizes(length)
         return float((measured / sizes[:, None]).square().mean().sqrt()) / self.fill
 
 
-def midpoints(rays: Rays, samples: int, of_pixel: int = 1) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+def midpoints(rays: Rays, samples: int, of_pixel: int = 1) -> tuple[Samples, Samples]:
     """Return the midpoints of `samples` equal intervals between near and far, and their length, both mm.
 
-    Where several rays in a row are those of a pixel, the samples of each stand elsewhere in their intervals, evenly.
+    Successive rays of one pixel have their samples at different, evenly spaced positions in the intervals.
     """
     step = ((rays.far - rays.near) / samples)[:, None].expand(-1, samples)
     place = (torch.arange(of_pixel, dtype=rays.near.dtype, device=rays.near.device) + 0.5) / of_pixel

@@ -1,11 +1,11 @@
-"""Deflection: background-oriented schlieren. The pattern behind the flow seems displaced, by d px.
+"""Deflection: background-oriented schlieren, the apparent displacement d (px) of a pattern behind the flow.
 
     d = integral (s_b - s) S grad(n) / n_ambient ds      lever_arm (default)
     d = (s_b - s_mid) integral S grad(n) / n_ambient ds  paraxial: one lever arm for the whole ray (paper, Eq. (3))
     d = integral (s_b - s) S [grad(n)(x + delta) - theta dn/ds] / n ds
                                                          curved: the ray bent by delta and theta, to second order
 
-In a gas n is within 3e-4 of n_ambient. Rays are traced through, to every order, in physics/ray_tracing.py.
+In a gas n is within 3e-4 of n_ambient. ray_tracing.py has rays to every order.
 """
 
 from __future__ import annotations
@@ -15,10 +15,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from nerif.forward.base import ForwardModel, Light, Weights
+from nerif.forward.base import ForwardModel, Light, Samples, SampleVectors, Weights
 from nerif.geometry import Rays
 
 __all__ = ["Curved", "Deflection", "LeverArm", "Paraxial"]
@@ -26,14 +24,7 @@ __all__ = ["Curved", "Deflection", "LeverArm", "Paraxial"]
 
 @dataclass(frozen=True)
 class Deflection(ForwardModel):
-    """Displacement of a background by refraction.
-
-    Parameters
-    ----------
-    n_ambient : refractive index the excess is counted from
-
-    Source: the forward model in docs/conventions.md; paper, Eqs. (1) and (3).
-    """
+    """Displacement of a background by refraction (docs/conventions.md; paper, Eqs. (1) and (3))."""
 
     name = "deflection"
     tomography = "background-oriented schlieren tomography"
@@ -43,10 +34,7 @@ class Deflection(ForwardModel):
     misscaled = "binning, or another lever arm"
     limits = (1e-6, 1e5)
     quantity = "index_excess"
-    gauge = True
-    background = True
-    traced = True
-    windowed = True
+    gauge = background = traced = windowed = True
 
     n_ambient: float = 1.0
 
@@ -55,18 +43,18 @@ class Deflection(ForwardModel):
         return MODELS[model](light.n_ambient)
 
     @abstractmethod
-    def lever(self, rays: Rays, s: Float[Tensor, "n m"]) -> Float[Tensor, "n m"]:
-        """Return the distance (mm) over which a deflection at path length s moves the background point."""
+    def lever(self, rays: Rays, s: Samples) -> Samples:
+        """Return the lever arm (mm) of a deflection at path length s."""
 
-    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
+    def weights(self, rays: Rays, s: Samples, step: Samples) -> Weights:
         return Weights(self.lever(rays, s) * step, slope=rays.ends.sensitivity / self.n_ambient)
 
 
 @dataclass(frozen=True)
 class LeverArm(Deflection):
-    """Each sample by its own lever arm: exact to first order in the deflection."""
+    """A lever arm for each sample: exact to first order in the deflection."""
 
-    def lever(self, rays: Rays, s: Float[Tensor, "n m"]) -> Float[Tensor, "n m"]:
+    def lever(self, rays: Rays, s: Samples) -> Samples:
         return rays.ends.distance[:, None] - s
 
 
@@ -74,29 +62,23 @@ class LeverArm(Deflection):
 class Paraxial(Deflection):
     """One lever arm for the whole ray (paper, Eq. (3))."""
 
-    def lever(self, rays: Rays, s: Float[Tensor, "n m"]) -> Float[Tensor, "n m"]:
+    def lever(self, rays: Rays, s: Samples) -> Samples:
         return (rays.ends.distance - 0.5 * (rays.near + rays.far))[:, None].expand_as(s)
 
 
 @dataclass(frozen=True)
 class Curved(LeverArm):
-    """Each sample where the ray as the field bends it passes, right to second order in the deflection."""
+    """Samples on the ray as bent by the field: correct to second order in the deflection."""
 
-    straight = False
-    linear = False
+    straight = linear = False
 
     @property
     def linear_twin(self) -> ForwardModel:
         return LeverArm(self.n_ambient)
 
     def bend(
-        self,
-        value: Float[Tensor, "n m"],
-        gradient: Float[Tensor, "n m 3"],
-        rays: Rays,
-        s: Float[Tensor, "n m"],
-        step: Float[Tensor, "n m"],
-    ) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"]]:
+        self, value: Samples, gradient: SampleVectors, rays: Rays, s: Samples, step: Samples
+    ) -> tuple[SampleVectors, SampleVectors]:
         """Return delta (mm) and theta dn/ds + grad(n) (n - n_ambient) / n_ambient (1/mm).
 
         theta(s) = integral_near^s grad_perp(n) / n ds',   delta(s) = integral_near^s (s - s') grad_perp(n) / n ds'
@@ -110,5 +92,5 @@ class Curved(LeverArm):
         return offset + turn * (step / 8)[..., None], angle * along[..., None] + slower
 
 
+# by the names that settings have for them, the default first
 MODELS: dict[str, type[Deflection]] = {"lever_arm": LeverArm, "paraxial": Paraxial, "curved": Curved}
-"""The models of deflection by the names that settings have for them."""

@@ -1,4 +1,4 @@
-"""Emission: light that a medium gives off, such as chemiluminescence, radiance per length e.
+"""Emission: light emitted by a medium, such as chemiluminescence; e is radiance per length.
 
 L = integral e ds,       optically thin: the medium does not absorb its own light
 """
@@ -9,61 +9,47 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.forward.base import ForwardModel, Light
+from nerif.forward.base import ForwardModel, Light, Map, Mask
 from nerif.forward.line_integral import LineIntegral, share_below
 
 __all__ = ["Emission"]
 
-NEGATIVE = 0.05  # of the largest radiance, by which a dark image may be a little off
-TOLERATED = 0.01  # share of such pixels
+MAX_OFFSET = 0.05  # of the largest radiance: tolerated error of the dark image
+MAX_SHARE = 0.01  # of the pixels that are more negative
 
 
 @dataclass(frozen=True)
 class Emission(LineIntegral):
-    """Radiance, the integral of what is given off along the ray."""
+    """Radiance, the integral of the emission along the ray."""
 
     name = "emission"
     tomography = "emission tomography"
     measured, sigma = "radiance", "radiance_sigma"
     quantity = "emission"
     misscaled = "another gain or exposure"
-    additive = True
-    gains = True
+    additive = gains = True
     bounds = (0.0, math.inf)
 
     @classmethod
     def of(cls, light: Light, model: str) -> ForwardModel:
         return cls()
 
-    @property
-    def weight(self) -> float:
-        return 1.0
-
     @classmethod
-    def detected(
-        cls, values: Float[Tensor, "*n c"], counts: float, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "*n c"], Float[Tensor, "*n c"]]:
-        """Return radiances of so many quanta where they are largest; sigma is that of a quantum at least."""
+    def detect(cls, values: Tensor, counts: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return radiances with shot noise, `counts` quanta at the largest; sigma is at least that of one quantum."""
         quantum = float(values.nan_to_num().max()) / counts or 1.0
-        seen = torch.poisson((values.nan_to_num() / quantum).clamp_min(0), generator) * quantum
-        return torch.where(values.isnan(), values, seen), (seen * quantum).clamp_min(quantum**2).sqrt()
+        noisy = torch.poisson((values.nan_to_num() / quantum).clamp_min(0), generator) * quantum
+        return torch.where(values.isnan(), values, noisy), (noisy * quantum).clamp_min(quantum**2).sqrt()
 
     @classmethod
-    def check(
-        cls,
-        values: Float[Tensor, "row column c"],
-        sigma: Float[Tensor, "row column c"] | None,
-        usable: Bool[Tensor, "row column"],
-    ) -> None:
+    def check(cls, values: Map, sigma: Map | None, usable: Mask) -> None:
         largest = float(values[usable].abs().max()) if bool(usable.any()) else 0.0
-        share = share_below(-NEGATIVE * largest, values, sigma, usable)
-        if share > TOLERATED:
+        share = share_below(-MAX_OFFSET * largest, values, sigma, usable)
+        if share > MAX_SHARE:
             raise InputError(
-                f"expected 0 or more, got less at {share:.0%} of the pixels; "
-                "is the dark image that was subtracted the right one?",
+                f"expected 0 or more, got less at {share:.0%} of the pixels; is the subtracted dark image right?",
                 field="radiance",
             )

@@ -1,4 +1,4 @@
-"""Interferometry: the phase, in fringes, by which light through the flow lags behind light through the ambient.
+"""Interferometry: the phase, in fringes, of light through the flow relative to light through the ambient.
 
 y = (1 / wavelength) integral (n - n_ambient) ds
 """
@@ -9,30 +9,24 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.forward.base import ForwardModel, Light
-from nerif.forward.line_integral import LineIntegral
+from nerif.forward.base import ForwardModel, Light, Map, Mask
+from nerif.forward.line_integral import GAUSSIAN, LineIntegral
 
 __all__ = ["Interferometry"]
 
 MM_PER_NM = 1e-6
-WITHIN = (0.8, 1.01)  # fringes from the least to the largest of a wrapped phase
-JUMP, LARGEST_JUMP, NOISE = 0.6, 0.8, 5.0  # fringes between neighbours; where there is noise, so many of its deviations
-ENOUGH = 100_000  # pixels to tell the noise from
-TOLERATED = 0.1  # jumps, times the shorter side of the image: fewer than the outline of a small spot
+WRAPPED_RANGE = (0.8, 1.01)  # fringes between the lowest and the highest value of a wrapped phase
+MIN_JUMP, CERTAIN_JUMP = 0.6, 0.8  # fringes between neighbours; more than the second is a jump whatever the noise
+JUMP_NOISE = 5.0  # standard deviations of the noise of a difference, beyond which it is a jump
+NOISE_PIXELS = 100_000  # for the estimate of the noise
+MAX_JUMPS = 0.1  # times the shorter side of the image: fewer than around a small spot
 
 
 @dataclass(frozen=True)
 class Interferometry(LineIntegral):
-    """Unwrapped phase in fringes; where rays pass the ambient alone it is 0, which fixes the index.
-
-    Parameters
-    ----------
-    wavelength_nm : of the light in vacuum, nm
-    """
+    """Unwrapped phase in fringes; it is 0 on rays through the ambient alone, which fixes the index."""
 
     name = "interferometry"
     tomography = "interferometric tomography"
@@ -40,7 +34,7 @@ class Interferometry(LineIntegral):
     quantity = "index_excess"
     misscaled = "another wavelength, or a double pass"
 
-    wavelength_nm: float = 532.0
+    wavelength_nm: float = 532.0  # in vacuum
 
     @classmethod
     def of(cls, light: Light, model: str) -> ForwardModel:
@@ -53,35 +47,28 @@ class Interferometry(LineIntegral):
         return 1 / (self.wavelength_nm * MM_PER_NM)
 
     @classmethod
-    def check(
-        cls,
-        values: Float[Tensor, "row column c"],
-        sigma: Float[Tensor, "row column c"] | None,
-        usable: Bool[Tensor, "row column"],
-    ) -> None:
+    def check(cls, values: Map, sigma: Map | None, usable: Mask) -> None:
         values = torch.where(usable[..., None], values, torch.nan)
-        for fringe, unit, remedy in (
-            (1.0, "fringes", "skimage.restoration.unwrap_phase(2 pi fringes) / 2 pi"),
-            (2 * math.pi, "radians", "skimage.restoration.unwrap_phase(radians) / 2 pi"),
-        ):
+        for fringe, unit in ((1.0, "fringes"), (2 * math.pi, "radians")):
             if _wrapped(values / fringe):
+                phase = "2 pi fringes" if unit == "fringes" else unit
                 raise InputError(
-                    f"expected an unwrapped phase in fringes, got one in {unit} that jumps by a whole fringe "
-                    f"between neighbours and stays within one; unwrap it ({remedy})",
+                    f"expected an unwrapped phase in fringes, got one in {unit} that jumps by a whole fringe between "
+                    f"neighbours; unwrap it (skimage.restoration.unwrap_phase({phase}) / 2 pi)",
                     field="fringes",
                 )
 
 
-def _wrapped(values: Float[Tensor, "row column c"]) -> bool:
-    """Whether a phase in fringes, NaN where it is not known, stays within one and jumps by nearly one along lines."""
-    known = values[values.isfinite()]
-    if not len(known) or not WITHIN[0] < float(known.max() - known.min()) < WITHIN[1]:
+def _wrapped(values: Map) -> bool:
+    """Whether a phase in fringes, NaN where not usable, spans about one fringe and jumps by nearly one along lines."""
+    finite = values[values.isfinite()]
+    if not len(finite) or not WRAPPED_RANGE[0] < float(finite.max() - finite.min()) < WRAPPED_RANGE[1]:
         return False
-    tolerated = 1 + TOLERATED * min(values.shape[:2])
-    jumps = torch.cat([(d := values.diff(dim=dim).abs())[d > JUMP] for dim in (0, 1)])
-    if len(jumps) <= tolerated:
+    most = 1 + MAX_JUMPS * min(values.shape[:2])
+    jumps = torch.cat([(d := values.diff(dim=dim).abs())[d > MIN_JUMP] for dim in (0, 1)])
+    if len(jumps) <= most:
         return False
     bends = torch.cat([(d := values.diff(n=2, dim=dim).abs())[d.isfinite()] for dim in (0, 1)])
-    bends = bends[:: 1 + len(bends) // ENOUGH]  # where the phase is smooth they are noise alone
-    noise = 1.4826 / math.sqrt(3) * float(bends.median()) if len(bends) else 0.0  # of a step
-    return int((jumps > min(NOISE * noise, LARGEST_JUMP)).sum()) > tolerated
+    bends = bends[:: 1 + len(bends) // NOISE_PIXELS]  # noise alone where the phase is smooth
+    noise = GAUSSIAN / math.sqrt(3) * float(bends.median()) if len(bends) else 0.0  # of a difference
+    return int((jumps > min(JUMP_NOISE * noise, CERTAIN_JUMP)).sum()) > most

@@ -1,4 +1,4 @@
-"""The path integral of a forward model along each ray: what the pixels measure of a field."""
+"""The path integral of a forward model along each ray: the projections of a field."""
 
 from __future__ import annotations
 
@@ -19,33 +19,25 @@ from nerif.geometry import Rays
 
 __all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]
 
-LENS_RAYS = 16
-"""Rays through the lens of a pixel, each with half as many samples as a thin ray."""
+LENS_RAYS = 16  # through the lens of a pixel, each with half as many samples as a thin ray
+CHUNK_RAYS = {"cpu": 32, "cuda": 4096}  # arrays that stay in the cache of a CPU, and fill a GPU
 
 
 class Projector(ABC):
-    """From a field and rays to what the pixels see."""
+    """The projections of a field along rays that are clipped to the box."""
 
-    channels: int
-    """Numbers that a pixel measures."""
+    channels: int  # components of the measured quantity
 
     @abstractmethod
-    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]:
-        """Return what the pixels of rays that are clipped to the box see."""
+    def __call__(self, field: Field, rays: Rays) -> Float[Tensor, "n c"]: ...
 
 
 @dataclass(frozen=True)
 class PathIntegral(Projector):
-    """The integral of a forward model by midpoints of equal intervals; through a lens the mean over its rays.
-
-    Parameters
-    ----------
-    model : ForwardModel
-    samples : number of samples along a ray
-    """
+    """The integral of a forward model by midpoints of equal intervals; through a lens the mean over its rays."""
 
     model: ForwardModel
-    samples: int = 200
+    samples: int = 200  # along a ray
 
     def __post_init__(self) -> None:
         if self.samples < 1:
@@ -65,7 +57,7 @@ class PathIntegral(Projector):
     def along(
         self, field: Field, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]
     ) -> Float[Tensor, "n c"]:
-        """Return the integral along thin rays by samples at path lengths s, each of which stands for a length, mm."""
+        """Return the integral along thin rays from samples at path lengths s, each for a length `step`, mm."""
         model = self.model
         points, tilt = places(model, rays, s, step, field.value_and_gradient)
         weights = model.weights(rays, s, step)
@@ -76,18 +68,12 @@ class PathIntegral(Projector):
 
 
 def places(
-    model: ForwardModel,
-    rays: Rays,
-    s: Float[Tensor, "n m"],
-    step: Float[Tensor, "n m"],
+    model: ForwardModel, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"],
     look: Callable[[Float[Tensor, "n m 3"]], tuple[Float[Tensor, "n m"], Float[Tensor, "n m 3"]]],
-) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"] | None]:
-    """Return where the samples of rays stand (mm), and what is to be taken off the gradient there; None for nothing.
+) -> tuple[Float[Tensor, "n m 3"], Float[Tensor, "n m 3"] | None]:  # fmt: skip
+    """Return the positions of samples (mm), and a vector to subtract from their gradient, or None.
 
-    Parameters
-    ----------
-    s, step : path lengths of the samples, and the length that each stands for, mm
-    look : gives the field and its gradient (1/mm) at points; asked only where rays are not straight
+    For rays that are not straight `look` returns the field and its gradient (1/mm) at points.
     """
     points = rays.at(s)
     if model.straight:
@@ -100,9 +86,8 @@ def places(
 def project(
     projector: Projector, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int | None = None
 ) -> Float[Tensor, "n c"]:
-    """Return what many rays see of a field, chunk by chunk, where the rays are; 0 where a ray misses the box."""
-    if chunk is None:  # arrays that stay in the cache of a CPU, and fill a GPU
-        chunk = 32 if torch.device(device).type == "cpu" else 4096
+    """Return the projections of a field along many rays, in chunks, on the device of the rays; 0 outside the box."""
+    chunk = chunk or CHUNK_RAYS["cpu" if torch.device(device).type == "cpu" else "cuda"]
     if rays.lens is not None:
         chunk = max(1, chunk * 2 // LENS_RAYS)
     result = rays.origin.new_zeros(len(rays), projector.channels)

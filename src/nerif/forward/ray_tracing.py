@@ -31,10 +31,10 @@ __all__ = ["CurvedRays", "background_points", "trace"]
 def trace(
     field: Field, rays: Rays, steps: int = 150, n_ambient: float = 1.0
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Follow rays through the box and return where (mm) and in which unit direction they leave it.
+    """Trace rays through the box; return their position (mm) and unit direction at its far side.
 
-    Positions and directions are kept in double precision: a deflection is 1e-4 of a direction. The field is asked in
-    the precision of `rays`. Outside the box the index is ambient, and its faces do not refract.
+    Positions and directions are in double precision, since a deflection is 1e-4 of a direction; the field is evaluated
+    in the precision of `rays`. Outside the box the index is ambient, and its faces do not refract.
     """
     single, double = rays.origin.dtype, torch.float64
     step = ((rays.far - rays.near) / steps).to(double)[:, None] / n_ambient
@@ -59,32 +59,26 @@ def trace(
 
 
 def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: float = 1.0) -> Float[Tensor, "n 3"]:
-    """Return how far (mm) refraction moves the background point of each ray, seen across the undisturbed ray.
+    """Return the shift (mm) of each ray's background point by refraction, across the undisturbed ray.
 
-    The bent ray goes on straight to where it comes nearest to the background point of the straight one; the pixel
-    does not see a movement along its own line of sight.
+    The bent ray continues straight to its point closest to the background point of the straight one; a shift along the
+    line of sight is invisible.
     """
     position, heading = trace(field, rays, steps, n_ambient)
     origin, direction = rays.origin.to(position), rays.direction.to(position)
-    travelled = ((position - origin) * direction).sum(-1)
+    path = ((position - origin) * direction).sum(-1)
     cosine = (heading * direction).sum(-1)
-    reach = (rays.ends.distance.to(position) - travelled) / cosine
+    reach = (rays.ends.distance.to(position) - path) / cosine
     return position + reach[:, None] * heading - (origin + rays.ends.distance.to(position)[:, None] * direction)
 
 
 @dataclass(frozen=True)
 class CurvedRays(Projector):
-    """The `traced` model: d = S (X - X0) with X the background point that the bent ray finds.
-
-    Parameters
-    ----------
-    steps : Runge-Kutta steps through the box
-    n_ambient : refractive index the excess is counted from
-    """
+    """The `traced` model: d = S (X - X0) with X the background point of the bent ray."""
 
     channels = 2
 
-    steps: int = 150
+    steps: int = 150  # of Runge-Kutta through the box
     n_ambient: float = 1.0
 
     def __post_init__(self) -> None:
@@ -95,5 +89,5 @@ class CurvedRays(Projector):
         if rays.lens is not None:
             spread = rays.spread(LENS_RAYS)
             return spread.mean_of(LENS_RAYS, self(field, spread))
-        moved = background_points(field, rays, self.steps, self.n_ambient)
-        return torch.einsum("nij,nj->ni", rays.ends.sensitivity.to(moved), moved).to(rays.origin.dtype)
+        shift = background_points(field, rays, self.steps, self.n_ambient)
+        return torch.einsum("nij,nj->ni", rays.ends.sensitivity.to(shift), shift).to(rays.origin.dtype)

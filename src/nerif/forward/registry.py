@@ -1,4 +1,4 @@
-"""The techniques, and the models that settings choose from by name."""
+"""The techniques and their models, by name."""
 
 from __future__ import annotations
 
@@ -18,64 +18,51 @@ __all__ = [
     "technique", "technique_of",
 ]  # fmt: skip
 
+# by their names in files; a technique of your own is one more entry
 TECHNIQUES: dict[str, type[ForwardModel]] = {
     c.name: c for c in (Deflection, Images, Absorption, Emission, Interferometry)
 }
-"""By the name that files have for them; a technique of your own is one entry more."""
-
-ASSUMED = Deflection
-"""The technique of what names none: versions 1.0 of files, and stores, knew no other."""
-
+ASSUMED = Deflection  # of files without the attribute: version 1.0, and stores
 AUTO = "auto"
+# names of the models of techniques that have several, the default first
 MODELS: dict[str, tuple[str, ...]] = {
-    Deflection.name: tuple(deflection.MODELS),
-    Images.name: ("lever_arm",),
-    Absorption.name: tuple(absorption.MODELS),
-}
-"""Names of the models of those techniques that have several, the default first."""
+    Deflection.name: tuple(deflection.MODELS), Images.name: ("lever_arm",), Absorption.name: tuple(absorption.MODELS)
+}  # fmt: skip
 
 
 def technique(name: str) -> type[ForwardModel]:
-    """Return a technique by its name.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+    """Return a technique by its name."""
     if name not in TECHNIQUES:
         raise InputError(f"expected one of {', '.join(TECHNIQUES)}, got '{name}'", field="technique")
     return TECHNIQUES[name]
 
 
 def check_simulated(kinds: Sequence[type[ForwardModel]]) -> None:
-    """Refuse techniques whose maps need more than field and cameras, such as images of a pattern."""
+    """Raise InputError for techniques whose maps need more than field and cameras, such as images of a pattern."""
     for kind in kinds:
         if kind.derived:
-            raise InputError(
-                f"{kind.name} show a pattern, and are made by nerif render; got '{kind.name}'", field="technique"
-            )
+            raise InputError(f"{kind.name} need a pattern; simulate them with nerif render", field="technique")
 
 
 def technique_of(quantity: str) -> type[ForwardModel]:
-    """Return the first technique that sees a field of that quantity."""
+    """Return the first technique whose field is the quantity."""
     return next(kind for kind in TECHNIQUES.values() if kind.quantity == quantity)
 
 
 def check_model(model: str) -> None:
-    """Refuse a name that no technique has a model of."""
-    known = (AUTO, *(name for names in MODELS.values() for name in names))
-    if model not in known:
-        raise InputError(f"expected one of {', '.join(known)}, got '{model}'", field="model")
+    """Raise InputError for a name that is no model of any technique."""
+    names = (AUTO, *(name for names in MODELS.values() for name in names))
+    if model not in names:
+        raise InputError(f"expected one of {', '.join(names)}, got '{model}'", field="model")
 
 
 def model_of(kind: type[ForwardModel], name: str) -> str:
-    """Return the name if the technique has a model of it, else auto."""
+    """Return the name if it is a model of the technique, else auto."""
     return name if name in MODELS.get(kind.name, ()) else AUTO
 
 
 def forward_model(kind: type[ForwardModel], light: Light, model: str = AUTO) -> ForwardModel:
-    """Return the model of one technique; its own default where the name is auto or another technique's."""
+    """Return the model of one technique; its default if the name is auto or another technique's."""
     names = MODELS.get(kind.name, (AUTO,))
     return kind.of(light, model if model in names else names[0])
 
@@ -83,32 +70,19 @@ def forward_model(kind: type[ForwardModel], light: Light, model: str = AUTO) -> 
 def forward_models(
     kinds: Sequence[type[ForwardModel]], light: Light, model: str = AUTO, linear: bool = False
 ) -> tuple[ForwardModel, ...]:
-    """Return the model of each technique of a measurement.
-
-    Parameters
-    ----------
-    kinds : techniques
-    light : the measurement
-    model : auto, or the name of a model of one of the techniques
-    linear : whether only linear models serve
-
-    Raises
-    ------
-    InputError
-        If the name is of none of them, or the model is not linear where it has to be.
-    """
+    """Return the model of each technique of a measurement: `model` is auto, or that of one of the techniques."""
     check_model(model)
-    offered = [name for kind in kinds for name in MODELS.get(kind.name, ())]
-    if model != AUTO and model not in offered:
-        names = " and ".join(kind.name for kind in kinds)
-        instead = "; give --from displacements" if any(kind.derived for kind in kinds) else ""
+    names = [name for kind in kinds for name in MODELS.get(kind.name, ())]
+    if model != AUTO and model not in names:
+        techniques = " and ".join(kind.name for kind in kinds)
+        remedy = "; give --from displacements" if any(kind.derived for kind in kinds) else ""
         raise InputError(
-            f"expected one of {', '.join((AUTO, *offered))} for {names}, got '{model}'{instead}", field="model"
+            f"expected one of {', '.join((AUTO, *names))} for {techniques}, got '{model}'{remedy}", field="model"
         )
     models = tuple(forward_model(kind, light, model) for kind in kinds)
     if not linear:
         return models
-    for kind, found in zip(kinds, models, strict=True):
-        if not found.linear and model in MODELS.get(kind.name, ()):
+    for kind, forward in zip(kinds, models, strict=True):
+        if not forward.linear and model in MODELS.get(kind.name, ()):
             raise InputError(f"expected a linear one, got '{model}', which only --method nerif can fit", field="model")
-    return tuple(found.linear_twin for found in models)
+    return tuple(forward.linear_twin for forward in models)

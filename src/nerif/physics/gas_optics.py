@@ -1,9 +1,9 @@
-"""Gas optics: from refractive index to density by Gladstone-Dale, and on to temperature by the ideal gas law.
+"""Gas optics: density from the refractive index by Gladstone-Dale, temperature from density by the ideal gas law.
 
     n - 1 = K rho,      K = sum_i w_i K_i,      K_i = (n_i - 1) R T_i / (p_i M_i)      at each gas's reference state
 
-K belongs to a composition. A single K for a field in which the composition changes (fuel, products, co-flow) is an
-approximation, and where the products stand the temperature inherits its error.
+One K for a field whose composition varies (fuel, products, co-flow) is an approximation; the temperature of the
+products has its error.
 """
 
 from __future__ import annotations
@@ -21,18 +21,9 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 
 __all__ = [
-    "GASES",
-    "GAS_CONSTANT",
-    "Composition",
-    "Gas",
-    "ambient_index",
-    "density_from_index",
-    "density_from_temperature",
-    "gladstone_dale",
-    "molar_mass",
-    "parse_mixture",
-    "temperature_from_density",
-]
+    "GASES", "GAS_CONSTANT", "Composition", "Gas", "ambient_index", "density_from_index", "density_from_temperature",
+    "gladstone_dale", "molar_mass", "parse_mixture", "temperature_from_density",
+]  # fmt: skip
 
 GAS_CONSTANT = 8.314462618  # J/(mol K), CODATA 2018
 
@@ -42,32 +33,30 @@ Composition = str | Mapping[str, float]
 Quantity = TypeVar("Quantity", float, np.ndarray, Tensor)
 
 _ATM = 101325.0  # Pa
-_FRACTION_TOLERANCE = 1.0001e-3  # three thirds printed as 0.333 miss 1 by 1e-3, and rounding must not tip them over
+_FRACTION_TOLERANCE = 1.0001e-3  # for three thirds written as 0.333, and rounding
 
 
 def _sellmeier(constant: float, *terms: tuple[float, float]) -> Callable[[float], float]:
-    """Return n - 1 = constant + sum_i a_i / (b_i - s^2), with s = 1 / wavelength in 1/um."""
+    """n - 1 = constant + sum_i a_i / (b_i - s^2), with s = 1 / wavelength in 1/um."""
     return lambda wavelength_um: constant + sum(a / (b - wavelength_um**-2) for a, b in terms)
 
 
 def _power_series(*coefficients: float) -> Callable[[float], float]:
-    """Return n - 1 = sum_i c_i s^(2 i), with s = 1 / wavelength in 1/um."""
+    """n - 1 = sum_i c_i s^(2 i), with s = 1 / wavelength in 1/um."""
     return lambda wavelength_um: sum(c * wavelength_um ** (-2 * i) for i, c in enumerate(coefficients))
 
 
 @dataclass(frozen=True)
 class Gas:
-    """A gas and its dispersion formula, as measured at a reference state.
+    """A gas and its dispersion formula.
 
-    Attributes
+    Parameters
     ----------
-    name : common name
     molar_mass : kg/mol
-    temperature : K, reference state of the formula
-    pressure : Pa, reference state of the formula
-    refractivity : n - 1 (1) at the reference state, of the vacuum wavelength in um
-    wavelength_range : nm, where the formula was fitted
-    source : where the formula was published
+    temperature, pressure : K, Pa; reference state of the formula
+    refractivity : n - 1 at the reference state by the vacuum wavelength in um
+    wavelength_range : nm, in which the formula was fitted
+    source : of the formula
     """
 
     name: str
@@ -114,48 +103,27 @@ GASES: Mapping[str, Gas] = {
         _sellmeier(0.0, (0.01470091, 423.98)), (480.1, 2058.6),
         "Mansfield & Peck 1969, J. Opt. Soc. Am. 59, 199"),
 }  # fmt: skip
-"""The known gases; the formulas are those of refractiveindex.info, with which the tests compare them."""
+"""Gases with the formulas of refractiveindex.info, with which tests compare them."""
 
 
-def _known(species: str) -> str:
-    """Return `species`, or raise an InputError that names the gas it may have meant."""
-    if species in GASES:
-        return species
+def _species(name: str) -> str:
+    if name in GASES:
+        return name
     spellings = {key.lower(): key for key in GASES} | {gas.name.split(",")[0]: key for key, gas in GASES.items()}
-    near = difflib.get_close_matches(species.lower(), spellings, n=1)
+    near = difflib.get_close_matches(name.lower(), spellings, n=1)
     hint = f"; did you mean '{spellings[near[0]]}'?" if near else "; give its mixture, or compute K from its own data"
-    raise InputError(f"expected gases out of '{' '.join(GASES)}', got '{species}'{hint}", field="composition")
+    raise InputError(f"expected gases out of '{' '.join(GASES)}', got '{name}'{hint}", field="composition")
 
 
 def _positive(name: str, value: float, unit: str, remedy: str) -> float:
-    """Return `value` as a Python float, which leaves the dtype of an array it meets alone."""
+    """The value as a Python float, which does not change the dtype of arrays."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"expected a positive number in {unit}, got {value:g}; {remedy}", field=name)
     return float(value)
 
 
-def _refractivity(n_ambient: float) -> float:
-    if not (math.isfinite(n_ambient) and n_ambient >= 1):
-        raise InputError(
-            f"expected a refractive index of at least 1, got {n_ambient:g}; "
-            "give n itself, not n - 1 (ambient_index computes it)",
-            field="n_ambient",
-        )
-    return float(n_ambient) - 1.0
-
-
 def parse_mixture(composition: Composition) -> dict[str, float]:
-    """Return the mole fractions of a composition, normalised to the sum 1.
-
-    Parameters
-    ----------
-    composition : a gas such as ``"air"``, a text such as ``"CH4:0.112, O2:0.888"``, or {species: mole fraction (1)}
-
-    Raises
-    ------
-    InputError
-        If a gas is unknown or named twice, a fraction is not a number >= 0, or the sum is further than 1e-3 from 1.
-    """
+    """Return the mole fractions of a composition, normalised to the sum 1; the given sum must be 1 within 1e-3."""
     pairs: Iterable[tuple[str, str | float]]
     if not isinstance(composition, str):
         pairs = composition.items()
@@ -163,14 +131,11 @@ def parse_mixture(composition: Composition) -> dict[str, float]:
         pairs = [(part.partition(":")[0], part.partition(":")[2]) for part in composition.split(",")]
     else:
         pairs = [(composition, 1.0)]
-
     fractions: dict[str, float] = {}
-    for word, number in pairs:
-        species = _known(word.strip())
+    for name, number in pairs:
+        species = _species(name.strip())
         if species in fractions:
-            raise InputError(
-                f"expected each gas once, got '{species}' twice; add its fractions up", field="composition"
-            )
+            raise InputError(f"expected each gas once, got '{species}' twice; add its fractions", field="composition")
         try:
             fractions[species] = float(number)
         except (TypeError, ValueError):
@@ -182,34 +147,25 @@ def parse_mixture(composition: Composition) -> dict[str, float]:
             )
     total = sum(fractions.values())
     if not abs(total - 1) <= _FRACTION_TOLERANCE:
-        raise InputError(
-            f"composition: expected mole fractions with the sum 1, got the sum {total:g}; divide each by {total:g}"
-            if total > 0
-            else "composition: expected mole fractions with the sum 1, got none above 0; name at least one gas"
-        )
+        remedy = f"the sum {total:g}; divide each by {total:g}" if total > 0 else "none above 0; name at least one gas"
+        raise InputError(f"expected mole fractions with the sum 1, got {remedy}", field="composition")
     return {species: fraction / total for species, fraction in fractions.items()}
 
 
 def molar_mass(composition: Composition) -> float:
-    """Return the molar mass M = sum_i x_i M_i (kg/mol) of a composition, see `parse_mixture`."""
+    """Return the molar mass M = sum_i x_i M_i, kg/mol."""
     return sum(fraction * GASES[species].molar_mass for species, fraction in parse_mixture(composition).items())
 
 
 def gladstone_dale(composition: Composition, wavelength_nm: float) -> float:
     """Return the Gladstone-Dale constant K = sum_i w_i K_i (m^3/kg), w_i the mass fractions x_i M_i / M.
 
-    The reference density is the ideal gas's, as in the way on to temperature; for CO2, the least ideal of the table,
-    the real density at 0 degrees C is 0.7 % above it.
+    The reference density is that of the ideal gas; for CO2, the least ideal gas here, the real density at 0 degrees C
+    is 0.7 % higher.
 
     Parameters
     ----------
-    composition : see `parse_mixture`
-    wavelength_nm : vacuum wavelength, nm
-
-    Raises
-    ------
-    InputError
-        If the composition cannot be right, or the wavelength is outside the range of a gas's dispersion formula.
+    wavelength_nm : in vacuum
 
     Source: paper, Eq. (2); formulas and reference states in `GASES`.
     """
@@ -231,47 +187,32 @@ def gladstone_dale(composition: Composition, wavelength_nm: float) -> float:
 
 
 def density_from_index(index_excess: Quantity, n_ambient: float, K: float) -> Quantity:
-    """Return the density rho = ((n_ambient - 1) + (n - n_ambient)) / K.
+    """Return the density rho = ((n_ambient - 1) + (n - n_ambient)) / K, kg/m^3.
 
     n itself is never formed: one float32 step near 1.00027 is already 0.04 % of n - 1.
 
     Parameters
     ----------
-    index_excess : (...) n - n_ambient (1); float, array or tensor
-    n_ambient : index of the ambient gas (1)
+    index_excess : (...) n - n_ambient (1); float, array or tensor, whose type and dtype the result has
     K : Gladstone-Dale constant, m^3/kg
-
-    Returns
-    -------
-    (...) kg/m^3, in the type and dtype that came
-
-    Raises
-    ------
-    InputError
-        If n_ambient < 1 or K <= 0.
     """
-    return (index_excess + _refractivity(n_ambient)) / _positive("K", K, "m^3/kg", "see gladstone_dale")
+    if not (math.isfinite(n_ambient) and n_ambient >= 1):
+        raise InputError(
+            f"expected a refractive index of at least 1, got {n_ambient:g}; "
+            "give n itself, not n - 1 (ambient_index computes it)",
+            field="n_ambient",
+        )
+    return (index_excess + (float(n_ambient) - 1.0)) / _positive("K", K, "m^3/kg", "see gladstone_dale")
 
 
 def temperature_from_density(density: Quantity, pressure_pa: float, molar_mass: float) -> Quantity:
-    """Return the temperature T = p M / (R rho) of an ideal gas, NaN where the density is not above 0.
-
-    Noise can take a reconstructed density to 0 and below, where there is no temperature to tell.
+    """Return the temperature T = p M / (R rho) of an ideal gas, K; NaN where noise has made the density 0 or less.
 
     Parameters
     ----------
-    density : (...) kg/m^3; float, array or tensor
-    pressure_pa : absolute pressure, Pa
+    density : (...) kg/m^3; float, array or tensor, whose type and dtype the result has
+    pressure_pa : absolute pressure
     molar_mass : kg/mol
-
-    Returns
-    -------
-    (...) K, in the type and dtype that came
-
-    Raises
-    ------
-    InputError
-        If pressure or molar mass is not positive.
     """
     pressure = _positive("pressure_pa", pressure_pa, "Pa", "give the absolute pressure, 101325 for one atmosphere")
     mass = _positive("molar_mass", molar_mass, "kg/mol", "see molar_mass")
@@ -284,27 +225,17 @@ def temperature_from_density(density: Quantity, pressure_pa: float, molar_mass: 
 
 
 def density_from_temperature(temperature: Quantity, pressure_pa: float, molar_mass: float) -> Quantity:
-    """Return the density rho = p M / (R T) (kg/m^3) of an ideal gas, NaN where the temperature is not above 0.
-
-    `temperature` is (...) in K; the law is its own inverse, see `temperature_from_density` for the rest.
-    """
+    """Return the density rho = p M / (R T) (kg/m^3); the inverse of `temperature_from_density` has the same form."""
     return temperature_from_density(temperature, pressure_pa, molar_mass)
 
 
 def ambient_index(composition: Composition, temperature_k: float, pressure_pa: float, wavelength_nm: float) -> float:
-    """Return the refractive index n = 1 + K p M / (R T) (1) of a gas at rest.
+    """Return the refractive index n = 1 + K p M / (R T) of a gas at rest.
 
     Parameters
     ----------
-    composition : see `parse_mixture`
-    temperature_k : K
-    pressure_pa : absolute pressure, Pa
-    wavelength_nm : vacuum wavelength, nm
-
-    Raises
-    ------
-    InputError
-        If temperature or pressure is not positive, or as `gladstone_dale`.
+    pressure_pa : absolute pressure
+    wavelength_nm : in vacuum
     """
     temperature = _positive("temperature_k", temperature_k, "K", "add 273.15 to degrees Celsius")
     density = density_from_temperature(temperature, pressure_pa, molar_mass(composition))

@@ -1,10 +1,10 @@
-"""From index excess to what people were after: n, density, temperature."""
+"""n, density and temperature from the index excess."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,31 +18,25 @@ from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_m
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
 
-__all__ = [
-    "LINEAR", "NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings", "derive", "derive_all", "deviation",
-    "masked_lines",
-]  # fmt: skip
+__all__ = ["NOT_UNIFORM", "GasChanges", "GasSettings", "derive", "derive_all", "deviation", "masked_lines"]
 
 TEMPERATURE_RANGE = 200.0, 4000.0
-"""K; beyond, gases of the table condense or dissociate, and one composition holds no more."""
+"""K; outside, gases of the table condense or dissociate."""
 
 BOTH_SIGNS, EXTREME = 0.4, 1e-3
-"""Ratio of the smaller to the larger of the extreme density differences above and below ambient, from which compression
-and expansion are assumed, and the share of the voxels beyond each extreme. Of a hot or cold flow at uniform pressure
-the other sign is the error of the field."""
+"""Ratio of the smaller to the larger extreme of the density differences above and below ambient from which compression
+and expansion are assumed (in a flow at uniform pressure the smaller is the error of the field); share of the voxels
+beyond each extreme."""
 
 NOT_UNIFORM = (
     "the pressure is not uniform (density is both above and below ambient, as behind compression and expansion waves); "
-    "--gas.uniform-pressure yes computes temperature all the same"
+    "--gas.uniform-pressure yes computes temperature anyway"
 )
-
-LINEAR = "n", "density"
-"""Quantities that are linear functions of the index excess."""
 
 
 @dataclass(frozen=True)
 class GasSettings:
-    """What density and temperature are computed for."""
+    """Gas of density and temperature."""
 
     composition: str = "air"
     """Gas or mixture by mole fractions, e.g. "CH4:0.11, air:0.89"; one composition is assumed throughout."""
@@ -59,13 +53,7 @@ class GasSettings:
             raise InputError(f"expected a positive pressure in Pa, got {self.pressure_pa}", field="pressure_pa")
 
     def for_measurement(self, measurement: Measurement) -> GasSettings:
-        """Return the settings at the wavelength of a measurement, if it tells one.
-
-        Raises
-        ------
-        InputError
-            If density and temperature cannot be computed of it: before the long work, not after it.
-        """
+        """Return the settings at the wavelength of a measurement, if it has one, and refuse invalid ones."""
         if "density" not in quantities_of(measurement.quantity):
             return self
         wavelength = measurement.wavelength_nm
@@ -74,7 +62,7 @@ class GasSettings:
         return gas
 
     def for_field(self, excess: Volume) -> GasSettings:
-        """Return the settings for a flow, with yes or no for whether its pressure is uniform."""
+        """Return the settings with yes or no for the uniform pressure of a field."""
         if self.uniform_pressure != "auto":
             return self
         low, high = np.quantile(excess.values.nan_to_num(0.0).numpy(), [EXTREME, 1 - EXTREME])
@@ -82,14 +70,14 @@ class GasSettings:
         return replace(self, uniform_pressure="no" if both else "yes")
 
     def quantities_of(self, excess: Volume) -> tuple[str, ...]:
-        """Return the quantities that follow from a field: without temperature where the pressure is not uniform."""
+        """Return the quantities of a field: without temperature if the pressure is not uniform."""
         uniform = self.for_field(excess).uniform_pressure == "yes"
         return tuple(q for q in quantities_of(excess.quantity) if uniform or q != "temperature")
 
 
 @dataclass(frozen=True)
 class GasChanges:
-    """What density and temperature are computed for, where it is not what the result was."""
+    """Changes to the gas of a result."""
 
     composition: str | None = None
     """Gas or mixture by mole fractions, e.g. "CH4:0.11, air:0.89"; default: that of the result."""
@@ -101,11 +89,10 @@ class GasChanges:
     """Whether the pressure is uniform, so that temperature follows from density; default: that of the result."""
 
     def of(self, settings: Mapping[str, Any]) -> GasSettings:
-        """Return the gas that the settings of a run (run.toml) hold, with the changes."""
-        kept = settings.get("gas", {})
-        changed = {f.name: getattr(self, f.name) for f in fields(self)}
-        known = {name: kept[name] for name in changed if name in kept}
-        return GasSettings(**known | {name: value for name, value in changed.items() if value is not None})
+        """Return the gas in the settings of a run (run.toml) with the changes."""
+        changes = {name: value for name, value in vars(self).items() if value is not None}
+        stored = {name: value for name, value in settings.get("gas", {}).items() if name in vars(self)}
+        return GasSettings(**stored | changes)
 
 
 def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
@@ -113,68 +100,58 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
 
         rho = (n - 1) / K,      T = p M / (R rho)
 
-    Where the relations break down (n - 1 <= 0, temperature beyond 200 to 4000 K or in a flow whose pressure is not
-    uniform) values are NaN; how many, and what was assumed, stands in the notes.
+    Values outside the relations (n - 1 <= 0, temperature outside 200 to 4000 K or at non-uniform pressure) are NaN; the
+    notes contain their number and the assumptions.
 
     Parameters
     ----------
-    excess : Volume of index excess with n_ambient in its attributes
+    excess : volume with n_ambient in its attributes
     quantity : index_excess, n, density or temperature
-    gas : composition, wavelength and pressure; written into the attributes
-
-    Raises
-    ------
-    InputError
-        If the quantity is unknown.
     """
-    known = quantities_of(excess.quantity)
-    if quantity not in known:
-        raise InputError(f"expected one of {', '.join(known)}, got '{quantity}'", field="quantity")
+    quantities = quantities_of(excess.quantity)
+    if quantity not in quantities:
+        raise InputError(f"expected one of {', '.join(quantities)}, got '{quantity}'", field="quantity")
     if quantity == excess.quantity:
         return excess
     n_ambient = float(excess.attributes["n_ambient"])
     if quantity == "n":
         return replace(excess, values=excess.values.double() + n_ambient, quantity="n")
     k = gladstone_dale(gas.composition, gas.wavelength_nm)
-    mass = molar_mass(gas.composition)
-    attributes: dict[str, float | str] = {
-        **excess.attributes,
-        "gas": gas.composition,
-        "wavelength_nm": gas.wavelength_nm,
-        "gladstone_dale_m3_kg-1": k,
-    }
-    density = density_from_index(excess.values.double(), n_ambient, k)
-    real = density > 0
-    if quantity == "density":
-        density = density.masked_fill(~real, math.nan)
-        return _quantity(excess, "density", density, attributes, _density_assumption(gas, k), "n - 1 <= 0")
-    attributes |= {"pressure_pa": gas.pressure_pa, "molar_mass_kg_mol-1": mass}
-    temperature = temperature_from_density(density, gas.pressure_pa, mass)
-    low, high = TEMPERATURE_RANGE
-    temperature = temperature.masked_fill((temperature < low) | (temperature > high), math.nan)
-    where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
-    if gas.for_field(excess).uniform_pressure == "no":
-        temperature, where = torch.full_like(temperature, math.nan), NOT_UNIFORM
+    attributes = excess.attributes | {
+        "gas": gas.composition, "wavelength_nm": gas.wavelength_nm, "gladstone_dale_m3_kg-1": k,
+    }  # fmt: skip
     assumption = (
-        f"T = p M / (R rho), an ideal gas of M = {mass * 1e3:.4g} g/mol ({gas.composition}) "
-        f"at a uniform pressure of {gas.pressure_pa:g} Pa; {_density_assumption(gas, k)}"
+        f"n - 1 = K rho (Gladstone-Dale) with K = {k:.5g} m3/kg of {gas.composition} at {gas.wavelength_nm:g} nm, "
+        "one composition throughout"
     )
-    return _quantity(excess, "temperature", temperature, attributes, assumption, where)
+    density = density_from_index(excess.values.double(), n_ambient, k)
+    if quantity == "density":
+        values, where = density.masked_fill(~(density > 0), math.nan), "n - 1 <= 0"
+    else:
+        mass, (low, high) = molar_mass(gas.composition), TEMPERATURE_RANGE
+        attributes |= {"pressure_pa": gas.pressure_pa, "molar_mass_kg_mol-1": mass}
+        assumption = (
+            f"T = p M / (R rho), an ideal gas of M = {mass * 1e3:.4g} g/mol ({gas.composition}) "
+            f"at a uniform pressure of {gas.pressure_pa:g} Pa; {assumption}"
+        )
+        values = temperature_from_density(density, gas.pressure_pa, mass)
+        values = values.masked_fill((values < low) | (values > high), math.nan)
+        where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
+        if gas.for_field(excess).uniform_pressure == "no":
+            values, where = torch.full_like(values, math.nan), NOT_UNIFORM
+    count = int(torch.isnan(values).sum())
+    notes: dict[str, float | str] = {"assumption": assumption, "masked_voxels": count, "masked_where": where}
+    return Volume(values.float(), excess.grid, quantity, QUANTITIES[quantity][0], attributes, notes)
 
 
 def deviation(excess: Volume, std: Tensor, quantity: str, gas: GasSettings) -> Tensor:
-    """Return the standard deviation of n, density or temperature by that of the index excess, to first order.
+    """Return the standard deviation of n, density or temperature to first order; NaN where the quantity is.
 
         std(n) = std,      std(rho) = std / K,      std(T) = T std(rho) / rho
 
-    It is NaN where the quantity itself is.
-
     Parameters
     ----------
-    excess : Volume of index excess, or of what is no index
-    std : (z, y, x) of its values
-    quantity : as `derive` takes it
-    gas : composition, wavelength and pressure
+    std : (z, y, x) standard deviation of the values of `excess`
     """
     if quantity in (excess.quantity, "n"):
         return std
@@ -184,12 +161,12 @@ def deviation(excess: Volume, std: Tensor, quantity: str, gas: GasSettings) -> T
 
 
 def derive_all(excess: Volume, gas: GasSettings) -> list[Volume]:
-    """Return index_excess, n, density and, at uniform pressure, temperature; a volume of anything else alone."""
+    """Return index_excess, n, density and, at uniform pressure, temperature; other quantities unchanged."""
     return [derive(excess, quantity, gas) for quantity in gas.quantities_of(excess)]
 
 
 def masked_lines(volumes: list[Volume]) -> list[str]:
-    """Return a line for each quantity with masked voxels: how many, and why."""
+    """Return a line with number and reason for each quantity with masked voxels."""
     lines = []
     for v in volumes:
         count = int(v.notes.get("masked_voxels", 0))
@@ -197,19 +174,3 @@ def masked_lines(volumes: list[Volume]) -> list[str]:
             share = f"{count} of {v.values.numel()} voxels ({count / v.values.numel():.2%})"
             lines.append(f"{v.quantity}: {share} are NaN: {v.notes['masked_where']}")
     return lines
-
-
-def _density_assumption(gas: GasSettings, k: float) -> str:
-    return (
-        f"n - 1 = K rho (Gladstone-Dale) with K = {k:.5g} m3/kg of {gas.composition} at {gas.wavelength_nm:g} nm, "
-        "one composition throughout"
-    )
-
-
-def _quantity(
-    excess: Volume, quantity: str, values: Tensor, attributes: dict[str, float | str], assumption: str, where: str
-) -> Volume:
-    """A volume whose masked voxels are NaN, counted, and explained."""
-    count = int(torch.isnan(values).sum())
-    notes: dict[str, float | str] = {"assumption": assumption, "masked_voxels": count, "masked_where": where}
-    return Volume(values.float(), excess.grid, quantity, QUANTITIES[quantity][0], attributes, notes)

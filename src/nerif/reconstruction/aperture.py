@@ -1,4 +1,4 @@
-"""Whether pixels count as seeing through the whole of their lens, and over their window, or along thin rays."""
+"""Pixels with an aperture or a correlation window, or as thin rays."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 
-__all__ = ["APERTURES", "check_aperture", "lens_rays", "seen_through"]
+__all__ = ["check_aperture", "lens_rays", "seen_through"]
 
 APERTURES = ("auto", "on", "off")
-
-OF_AREA, MOST = 2, 12
+RAYS_PER_PX2, MAX_RAYS = 2, 12  # of a pixel: per square of the cone's radius in px, and at most
 
 
 def check_aperture(aperture: str) -> None:
@@ -24,23 +23,13 @@ def check_aperture(aperture: str) -> None:
 
 
 def seen_through(measurement: Measurement, aperture: str) -> Measurement:
-    """Return the measurement as seen through the lenses, and over the windows, that are known of it, or by thin rays.
-
-    Parameters
-    ----------
-    aperture : "auto", "on" to insist that an aperture is known, "off" for thin rays
-
-    Raises
-    ------
-    InputError
-        If it is "on" and no aperture is known.
-    """
+    """Return the measurement with its lenses and windows ("auto"; "on" requires an aperture) or thin rays ("off")."""
     check_aperture(aperture)
     lenses = [camera.lens for camera in measurement.cameras if camera.lens is not None]
     if aperture == "on" and not any(lens.diameter > 0 for lens in lenses):
         raise InputError(
-            "expected a measurement that knows aperture_diameter (mm), got one that does not; add it to the "
-            "calibration (nerif calibrate --aperture-diameter) or measurement file, or leave --aperture on out",
+            "expected a measurement with aperture_diameter (mm), got one without; add it to the calibration "
+            "(nerif calibrate --aperture-diameter) or measurement file, or omit --aperture on",
             field="aperture",
         )
     if (aperture != "off" and any(lens.wide for lens in lenses)) or not lenses:
@@ -48,17 +37,13 @@ def seen_through(measurement: Measurement, aperture: str) -> Measurement:
     return replace(measurement, cameras=tuple(replace(camera, lens=None) for camera in measurement.cameras))
 
 
-def lens_rays(measurement: Measurement, asked: int = 0) -> int:
-    """Return how many rays of a pixel, through its lens and over its window, a network is trained on at the end.
+def lens_rays(measurement: Measurement, count: int = 0) -> int:
+    """Return the rays of a pixel in the last part of a training: 1 where rays are thin, else `count` or the default.
 
-    It is 1 where rays are thin.
-
-    Parameters
-    ----------
-    asked : so many; 0 for OF_AREA r^2, 2 to MOST, of the radius r of the cone in the middle of the box, px, or that of
-        a disc as large as the window
+    That is RAYS_PER_PX2 r^2, 2 to MAX_RAYS, where r is the radius in px of the cone in the middle of the box, or of a
+    disc of the area of the window.
     """
-    centre, widths = torch.tensor(measurement.box.centre, dtype=torch.float64), []
+    centre, radii = torch.tensor(measurement.box.centre, dtype=torch.float64), []
     for camera in measurement.cameras:
         lens, radius = camera.lens, 0.0
         if lens is None or not lens.wide:
@@ -68,7 +53,7 @@ def lens_rays(measurement: Measurement, asked: int = 0) -> int:
             depth = float(camera.local(centre)[2])
             radius = lens.diameter / 2 * abs(1 - depth / focus) / float(camera.pixel_size(centre))
         windowed = any(kind.windowed for kind in measurement.techniques)
-        widths.append(math.hypot(radius, windowed * lens.window / math.sqrt(math.pi)))
-    if not widths:
+        radii.append(math.hypot(radius, windowed * lens.window / math.sqrt(math.pi)))
+    if not radii:
         return 1
-    return asked or 2 * min(max(round(OF_AREA * max(widths) ** 2 / 2), 1), MOST // 2)
+    return count or 2 * min(max(round(RAYS_PER_PX2 * max(radii) ** 2 / 2), 1), MAX_RAYS // 2)

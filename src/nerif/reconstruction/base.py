@@ -1,6 +1,6 @@
-"""What every reconstruction method takes and gives back.
+"""The interface of reconstruction methods.
 
-A Reconstructor is a frozen record of settings; called with a Measurement it returns a Reconstruction.
+A Reconstructor is an immutable record of settings; called with a Measurement it returns a Reconstruction.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from nerif.geometry.symmetry import Axis
 
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 
-SHOWN_VOXELS = 48  # along the longest edge, in a notebook
-
+NOTEBOOK_VOXELS = 48  # along the longest edge
 MISFITS = {
     "residual_over_sigma": "times the noise, rms over the training views",
-    "residual": "rms over the training views, where the ambient field has 1",
-    "loss": "in the loss, where the ambient field has 1",
+    "residual": "rms over the training views, relative to the ambient field",
+    "loss": "loss, relative to the ambient field",
 }
-"""Names in a history, the most telling first, and what they say."""
+"""Columns of a history, the most informative first, and their meaning."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,8 @@ class Outcome:
     Parameters
     ----------
     reason : one word: converged, discrepancy, epochs, steps, iterations, time_limit, interrupted, diverged or
-        collapsed (the field explains nothing of what was measured)
-    message : one sentence, with the remedy where there is one
+        collapsed (to the ambient field)
+    message : one sentence, with the remedy if there is one
     """
 
     reason: str
@@ -47,37 +46,36 @@ class Outcome:
 
     @property
     def failed(self) -> bool:
-        """Whether no field was found."""
+        """Whether there is no useful field."""
         return self.reason in ("diverged", "collapsed")
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything needed to go on with a run: tensors by name, and plain numbers and texts."""
+    """The state from which a run can be resumed: tensors by name, and plain numbers and texts."""
 
     tensors: dict[str, Tensor]
     scalars: dict[str, Any]
 
     def under(self, prefix: str) -> dict[str, Tensor]:
-        """Return the tensors whose names begin with a prefix, by what follows it."""
+        """Return the tensors whose names begin with a prefix, by the rest of their names."""
         return {name.removeprefix(prefix): value for name, value in self.tensors.items() if name.startswith(prefix)}
 
 
 @dataclass(frozen=True)
 class Step:
-    """What a method tells of itself after a step.
+    """The progress of a method after a step.
 
     Parameters
     ----------
     step, epoch : counts; epoch in passes over all rays
-    seconds : spent so far, earlier runs included
-    progress : 0 at the start, 1 at the end; of a run that may end early, 1 at the latest end
+    seconds : time of the run, earlier parts of a resumed one included
+    progress : from 0 at the start to 1 at the latest end
     losses : the terms by name
-    rays_per_second : 1/s
-    capture : gives the State to resume from
-    field : gives the Field as it is now, to be looked at before the method goes on
-    note : a line for the user on what changed before this step; nothing where nothing did
-    pass_steps : steps that a pass over all pixels takes on average, of a training
+    capture : returns the State to resume from
+    field : returns the present Field, valid until the method continues
+    note : a line for the user on a change before this step, or ""
+    pass_steps : average steps per pass over all pixels, of a training
     """
 
     step: int
@@ -93,17 +91,12 @@ class Step:
 
 
 OnStep = Callable[[Step], bool | None]
-"""Called after each step; True asks the method to stop and return what it has."""
+"""Called after each step; returns True to stop the method, which then returns its present result."""
 
 
 def compose(*callbacks: OnStep) -> OnStep:
-    """Return a callback that calls each in turn and asks to stop if one of them does."""
-
-    def call(step: Step) -> bool:
-        asked = [bool(c(step)) for c in callbacks]  # each is called, also after one has asked to stop
-        return any(asked)
-
-    return call
+    """Return a callback that calls all others in turn and requests a stop if one of them does."""
+    return lambda step: any([bool(callback(step)) for callback in callbacks])  # noqa: C419 (a generator would skip some)
 
 
 @dataclass(frozen=True)
@@ -112,19 +105,16 @@ class Reconstruction:
 
     Parameters
     ----------
-    field : Field of the quantity
-    box : where it holds, mm
-    n_ambient : refractive index that an excess is counted from
-    quantity : what the field is (volume.QUANTITIES)
-    history : one record a logged step
-    outcome : why it stopped
-    settings : what the method was asked, as plain values
-    seconds : spent
+    box : of the field, mm
+    n_ambient : refractive index from which an excess is counted
+    quantity : of the field (volume.QUANTITIES)
+    history : one record per logged step
+    settings : of the method, as plain values
+    seconds : time of the run
     peak_memory_bytes : on the device (CUDA) or of the process (CPU)
-    device : where it ran
     state : to resume from, or None
-    rig : what was refined of each view (refinement.py)
-    axis : of a symmetric flow, as it was found (symmetry.py); None where no symmetry was asked for
+    rig : corrections of each view (refinement.py)
+    axis : of a symmetric flow, as estimated (symmetry.py); None without symmetry
     """
 
     field: Field
@@ -143,7 +133,7 @@ class Reconstruction:
 
     @property
     def model(self) -> str:
-        """Forward model by which the field was found."""
+        """Name of the forward model."""
         return str(self.settings["model"])
 
     def volume(self, grid: Grid) -> Volume:
@@ -151,33 +141,29 @@ class Reconstruction:
         return Volume.of(self.field.sample(grid, self.device), grid, self.quantity, self.n_ambient)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the three middle slices, why it stopped, how long it took, and the misfit."""
+        """Notebook display: the three middle slices, outcome, time and misfit."""
         from nerif.plotting.notebook import number, panel, show_slices
 
-        volume = self.volume(Grid.of_resolution(self.box, SHOWN_VOXELS))
+        volume = self.volume(Grid.of_resolution(self.box, NOTEBOOK_VOXELS))
         rows = [("Outcome", f"{self.outcome.reason.replace('_', ' ')}: {self.outcome.message}")]
         rows.append(("Time", f"{self.seconds:.0f} s on {self.device}"))
         last = self.history[-1] if self.history else {}
-        for name, meaning in MISFITS.items():
-            if name in last:
-                rows.append(("Misfit", f"{number(last[name], 3)} {meaning}"))
-                break
+        misfits = [("Misfit", f"{number(last[name], 3)} {text}") for name, text in MISFITS.items() if name in last]
         image = show_slices(volume)
         caption = f"{describe(self.quantity)[1].capitalize()} in the three middle slices"
-        return panel("Reconstruction", rows + volume.summary(), (image, caption))
+        return panel("Reconstruction", rows + misfits[:1] + volume.summary(), (image, caption))
 
 
 class Reconstructor(ABC):
-    """A method of reconstruction: a frozen record of its settings, called with the data.
+    """A reconstruction method: an immutable record of settings, called with the data.
 
-    A record can be kept, compared and called again; a call leaves it as it is. Settings that cannot be right are
-    refused when the record is made.
+    Invalid settings raise InputError when the record is made.
     """
 
     aperture: str
-    """Whether pixels see through the whole of their lens (aperture.py)."""
+    """Whether pixels have an aperture (aperture.py)."""
     source: str
-    """Whether it goes by images, displacements or both (sources.py)."""
+    """Images, displacements or both (sources.py)."""
 
     @abstractmethod
     def __call__(
@@ -187,32 +173,26 @@ class Reconstructor(ABC):
         resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:
-        """Reconstruct the field of a measurement: from nothing, from an earlier State, or from another field.
+        """Reconstruct the field of a measurement.
 
-        A run that a limit, the callback or a failure stops returns the best field it has, and says why in its outcome.
+        A run that is stopped by a limit, the callback or a failure returns its best field; the outcome has the reason.
 
         Parameters
         ----------
-        measurement : Measurement; usable pixels whose rays cross the box are to be met, weighed by sigma if it is known
-        on_step : called after each step or iteration (on a GPU: after some of them) with a Step; None for no callback.
-            Where it returns True the run stops with outcome "interrupted"
-        resume : State of an earlier run of the same method and settings on the same data, to go on as if it had not
-            stopped; limits (time, steps, iterations) may be raised. None to begin anew
-        start : Field to begin from, in the box of the measurement and on any device; None for the ambient index.
-            Without effect when resuming
-
-        Returns
-        -------
-        Reconstruction
-            Field, history, outcome, and the State to resume from.
+        measurement : its usable pixels whose rays cross the box are fitted, weighted by sigma if that is known
+        on_step : called after each step or iteration (on a GPU: after some of them); returns True to stop the run
+        resume : State of an earlier run of the same method, settings and data, to be continued; limits (time, steps,
+            iterations) may be raised
+        start : Field to start from, in the box of the measurement; None for the ambient index. Without effect when
+            resuming
 
         Raises
         ------
         InputError
-            If nothing in the measurement fixes the ambient index, no ray is left, the device does not exist or has too
-            little memory, or `resume` is of another method, other settings or other data.
+            If nothing fixes the ambient index, no ray is left, the device does not exist or has too little memory, or
+            `resume` is of another method, other settings or other data.
         """
 
     @abstractmethod
     def in_two(self) -> tuple[Reconstructor, Reconstructor]:
-        """Return settings of a short run, and of one within the limits asked for that goes on from what that finds."""
+        """Return settings of a short first run, and of a run that starts from its field within the same limits."""

@@ -1,4 +1,4 @@
-"""Bounds of the field: what is known of its lowest and highest value; the ambient, 0, lies between them."""
+"""Lowest and highest value of the field; the ambient, 0, lies between them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,8 @@ __all__ = ["check_bounds", "check_resumed", "field_bounds", "in_units"]
 
 
 def check_bounds(lower: float | None, upper: float | None) -> None:
-    """Refuse bounds that do not hold the ambient between them.
-
-    Raises
-    ------
-    InputError
-        Naming both.
-    """
-    low, high = -math.inf if lower is None else lower, math.inf if upper is None else upper
-    if not low <= 0 <= high or low == high:
+    """Raise InputError unless the ambient lies between the bounds."""
+    if not _valid(-math.inf if lower is None else lower, math.inf if upper is None else upper):
         raise InputError(
             f"expected bounds of the field around 0, the ambient, got {lower} to {upper}; those of an "
             "index are of the excess over the ambient",
@@ -28,43 +21,35 @@ def check_bounds(lower: float | None, upper: float | None) -> None:
 
 
 def field_bounds(measurement: Measurement, lower: float | None, upper: float | None) -> tuple[float, float]:
-    """Return the bounds asked for, else those that the technique knows; -inf and inf where there are none.
-
-    Raises
-    ------
-    InputError
-        If the two together leave the field no range around 0; names the one that was asked for.
-    """
+    """Return the bounds of the settings, else of the technique; -inf and inf where there are none."""
     technique = measurement.observations[0].technique
-    (least, most), asked = technique.bounds, {"lower": lower, "upper": upper}
-    low, high = least if lower is None else lower, most if upper is None else upper
-    if not low <= 0 <= high or low == high:
-        names = " and ".join(name for name, value in asked.items() if value is not None)
+    lowest, highest = technique.bounds
+    low, high = lowest if lower is None else lower, highest if upper is None else upper
+    if not _valid(low, high):
+        names = " and ".join(name for name, value in (("lower", lower), ("upper", upper)) if value is not None)
         raise InputError(
-            f"expected to leave a range around 0, got {low:g} to {high:g} with the bounds of "
-            f"{technique.quantity}, {least:g} to {most:g}; give another value, or none",
+            f"expected a range around 0, got {low:g} to {high:g} with the bounds of "
+            f"{technique.quantity}, {lowest:g} to {highest:g}; give another value, or none",
             field=names,
         )
     return low, high
 
 
-def check_resumed(began: tuple[float, float], asked: tuple[float, float]) -> None:
-    """Refuse to go on with a network that cannot leave other bounds than those asked for.
-
-    Raises
-    ------
-    InputError
-        Naming both.
-    """
-    if not all(math.isclose(a, b, rel_tol=1e-4) for a, b in zip(began, asked, strict=True)):
-        first, other = (f"{low:g} to {high:g}" for low, high in (began, asked))
+def check_resumed(before: tuple[float, float], bounds: tuple[float, float]) -> None:
+    """Raise InputError unless the bounds are those of the network to be resumed, which cannot change."""
+    if not all(math.isclose(a, b, rel_tol=1e-4) for a, b in zip(before, bounds, strict=True)):
+        first, other = (f"{low:g} to {high:g}" for low, high in (before, bounds))
         raise InputError(
-            f"expected the bounds that the run began with, {first}, got {other}; give the same --lower and "
+            f"expected the bounds of the run to be resumed, {first}, got {other}; give the same --lower and "
             "--upper, or start without --resume",
             field="resume",
         )
 
 
 def in_units(bounds: tuple[float, float], scale: float) -> tuple[float, float]:
-    """Return bounds of a field that is given in units of `scale`."""
+    """Return the bounds of the field over `scale`."""
     return bounds[0] / scale, bounds[1] / scale
+
+
+def _valid(low: float, high: float) -> bool:
+    return low <= 0 <= high and low != high

@@ -1,8 +1,8 @@
 """Device, precision, memory and threads of a computation.
 
 Torch and Numba use the same number of threads, at most the number of cores that no other program uses. Threads that
-share a step wait for one another: two threads on two cores, one of them busy, take eight times as long as one thread
-(benchmarks/results/busy-cpu.md).
+share a step wait for each other: two threads on two cores, one of them busy, take eight times as long as one thread
+(docs/decisions/026).
 """
 
 from __future__ import annotations
@@ -27,33 +27,25 @@ from nerif.common.conventions import InputError
 from nerif.common.pauses import at_pauses
 
 __all__ = [
-    "Cores",
-    "autocast_dtype",
-    "available_memory",
-    "float32_products",
-    "free_threads",
-    "keep_freed_memory",
-    "on_free_cores",
-    "peak_memory",
-    "resolve_device",
-    "share_threads",
-]
+    "Cores", "autocast_dtype", "available_memory", "float32_products", "free_threads", "keep_freed_memory",
+    "on_free_cores", "peak_memory", "resolve_device", "share_threads",
+]  # fmt: skip
 
-Given = ParamSpec("Given")
+Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-_here = threading.local()  # torch has a number of threads for each thread that asks it too
+_here = threading.local()  # torch's number of threads is per calling thread, too
 
-FIRST, EVERY = 0.5, 2.0  # seconds until the first look at what the cores do, and between looks
-LEAST, SHARED = 0.25, 0.8  # of a core others may use before it is left to them: the least, and what all threads share
-CALM, MOST_CALM = 2, 64  # looks in a row with cores free before they are taken, at first and at most
-KNOWN = 0.5  # of the time of the cores that their counters have to tell
+FIRST_SECONDS, SECONDS = 0.5, 2.0  # until the first measurement of the cores, and between measurements
+MIN_LOAD, SHARED_LOAD = 0.25, 0.8  # of a core, tolerated from others: at least, and divided by the number of threads
+CALM, MAX_CALM = 2, 64  # successive measurements with free cores before they are used: at first, at most
+MIN_COUNTED = 0.5  # of the time of the cores that their counters must account for
 
 
 def share_threads() -> None:
-    """Give what Numba compiles as many threads as torch has.
+    """Give Numba as many threads as torch has.
 
-    Numba sets OpenMP's number, which is torch's, to all cores when it starts its own; torch's is set back.
+    When Numba starts its own threads it sets OpenMP's number, which is torch's, to all cores; torch's is set back.
     """
     import numba
 
@@ -62,102 +54,100 @@ def share_threads() -> None:
     _set(threads)
 
 
-def free_threads(idle: float, own: float, most: int) -> int:
-    """Return how many threads to compute with: as many as have a core for themselves, or nearly.
+def free_threads(idle: float, process: float, most: int) -> int:
+    """Return the number of threads to use, each with a core nearly for itself.
 
     Parameters
     ----------
-    idle : mean number of cores that nobody used
-    own : mean number of cores that this process used
-    most : threads that it may have
+    idle, process : mean number of cores that were idle, and that this process used
+    most : maximum number of threads
     """
-    fit = (k for k in range(most, 1, -1) if idle + own + max(LEAST, SHARED / k) >= k)
+    fit = (k for k in range(most, 1, -1) if idle + process + max(MIN_LOAD, SHARED_LOAD / k) >= k)
     return next(fit, 1)
 
 
 class Used(NamedTuple):
-    """Seconds: a clock, what the cores that this process may use were idle, what they did in all, what it used."""
+    """Counters in s: clock; idle time, all time of the cores of this process; time of the process."""
 
     clock: float
     idle: float
     counted: float
-    own: float
+    process: float
 
 
 class Cores:
-    """Within it, torch has as many threads as there are cores that are idle or its own, looked at every two seconds.
+    """A context in which torch has as many threads as there are cores idle or used by this process.
 
-    It never has more threads than when it was entered, or than a container may use, and afterwards what it had before.
-    On a machine with nothing else to do the number stays, and with it the order in which numbers are added. Threads
-    are left at once, and taken when there has been room for a while: a longer one, each time it was in vain.
+    At most as many as when it was entered, and as a container may use; afterwards the number from before. On a machine
+    without other load the number is constant, and with it the order of summation. Threads are given up at once, and
+    used again when cores have been free for a while, which becomes longer each time it was in vain.
 
-    It looks at every pause of the thread (pauses.py). Within another one, on a CPU, it is that one that looks, and goes
-    on with what it knows: pieces of work that are short by themselves are not each begun with all threads.
+    Cores are measured at the pauses of the thread (pauses.py). A nested context leaves that to the outer one, so that
+    short computations do not each begin with all threads.
 
     Parameters
     ----------
-    device : where the work is done; on a GPU nothing is looked at
+    device : of the computation; for a GPU nothing is measured
     """
 
     def __init__(self, device: torch.device) -> None:
         self.before = torch.get_num_threads()
         self.most = min(self.before, _quota()) if device.type == "cpu" else self.before
-        self._watching = device.type == "cpu" and self.most > 1
-        self._next, self._then = 0.0, Used(0.0, 0.0, 0.0, 0.0)
-        self._calm, self._patience, self._taken = 0, CALM, False
-        self._entered = ExitStack()
+        self._measures = device.type == "cpu" and self.most > 1
+        self._next, self._last = 0.0, Used(0.0, 0.0, 0.0, 0.0)
+        self._calm, self._patience, self._raised = 0, CALM, False
+        self._stack = ExitStack()
 
     def __enter__(self) -> Cores:
         if getattr(_here, "cores", None) is None:
             _here.cores = self
-            self._entered.callback(_set, self.before)
-            self._entered.callback(setattr, _here, "cores", None)
-            self._entered.enter_context(at_pauses(self.look))
+            self._stack.callback(_set, self.before)
+            self._stack.callback(setattr, _here, "cores", None)
+            self._stack.enter_context(at_pauses(self.look))
             _set(self.most)
-            self._begin(FIRST)
+            self._measure(FIRST_SECONDS)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._entered.close()
+        self._stack.close()
 
     def look(self) -> None:
-        """Take the threads that there are cores for."""
-        if not self._watching or time.perf_counter() < self._next:
+        """Adapt the number of threads to the load since the last measurement, if that is due."""
+        if not self._measures or time.perf_counter() < self._next:
             return
-        then = self._then
-        self._begin(EVERY)
-        spent = Used(*(b - a for a, b in zip(then, self._then, strict=True)))
-        if self._watching and spent.counted >= KNOWN * self.most * spent.clock:
-            self._settle(free_threads(spent.idle / spent.clock, spent.own / spent.clock, self.most))
-
-    def _settle(self, free: int) -> None:
+        last = self._last
+        self._measure(SECONDS)
+        spent = Used(*(b - a for a, b in zip(last, self._last, strict=True)))
+        if not self._measures or spent.counted < MIN_COUNTED * self.most * spent.clock:
+            return
+        free = free_threads(spent.idle / spent.clock, spent.process / spent.clock, self.most)
         threads = torch.get_num_threads()
         self._calm = self._calm + 1 if free > threads else 0
         if free < threads:
-            if self._taken:
-                self._patience = min(2 * self._patience, MOST_CALM)
+            if self._raised:
+                self._patience = min(2 * self._patience, MAX_CALM)
             _set(free)
         elif self._calm >= self._patience:
-            self._calm, self._taken = 0, True
+            self._calm, self._raised = 0, True
             _set(free)
 
-    def _begin(self, seconds: float) -> None:
-        if self._watching:
-            used = _used()
-            self._watching = used is not None
-            self._then = self._then if used is None else used
-            self._next = time.perf_counter() + seconds
+    def _measure(self, seconds: float) -> None:
+        """Read the counters; the next time is due after some seconds."""
+        used = _used() if self._measures else None
+        self._measures = used is not None
+        if used is not None:
+            self._last, self._next = used, time.perf_counter() + seconds
 
 
-def on_free_cores(function: Callable[Given, Result]) -> Callable[Given, Result]:
-    """Let all of a function compute with the threads that there are cores for (Cores)."""
+def on_free_cores(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Run a function within Cores."""
 
     @functools.wraps(function)
-    def within(*given: Given.args, **named: Given.kwargs) -> Result:
+    def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         with Cores(torch.device("cpu")):
-            return function(*given, **named)
+            return function(*args, **kwargs)
 
     return within
 
@@ -168,50 +158,43 @@ def _set(threads: int) -> None:
 
 
 def _used() -> Used | None:
-    """Return what has been used so far; None where the system does not tell."""
+    """Read the counters of the cores and the process; None if the system does not provide them."""
     import psutil
 
     try:
         cores = psutil.cpu_times(percpu=True)
         allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(len(cores))
-        if not cores or max(allowed) >= len(cores):  # rows that are not those of the numbers
+        if not cores or max(allowed) >= len(cores):  # rows do not match the numbers of the cores
             return None
-        own = psutil.Process().cpu_times()
+        process = psutil.Process().cpu_times()
     except (OSError, psutil.Error):
         return None
     idle = sum(cores[i].idle + getattr(cores[i], "iowait", 0.0) for i in allowed)
     counted = sum(sum(cores[i]) for i in allowed)
-    return Used(time.perf_counter(), idle, counted, own.user + own.system)
+    return Used(time.perf_counter(), idle, counted, process.user + process.system)
 
 
 def _quota() -> int:
-    """Return how many cores a container may use, by the kernel's rule for its group; many where there is none."""
+    """The number of cores that a container may use, by the kernel's limit for its group; sys.maxsize without one."""
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        return sys.maxsize if quota == "max" else max(1, math.floor(int(quota) / int(period) + LEAST))
+        return sys.maxsize if quota == "max" else max(1, math.floor(int(quota) / int(period) + MIN_LOAD))
     except (OSError, ValueError):
         return sys.maxsize
 
 
 def resolve_device(name: str) -> torch.device:
-    """Return the device called `name`; "auto" is the GPU where there is one. "cuda" is the first, under torchrun the
-    process's own.
-
-    Raises
-    ------
-    InputError
-        If the device does not exist here.
-    """
+    """Return the device of a name: "auto" is a GPU if there is one, "cuda" the first (under torchrun the process's)."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise InputError(f"expected auto, cpu, cuda or cuda:N, got '{name}'", field="device") from None
+        device = torch.device("meta")
     if device.type not in ("cpu", "cuda"):
         raise InputError(f"expected auto, cpu, cuda or cuda:N, got '{name}'", field="device")
     if name == "cuda":
-        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))  # torchrun: a GPU for each process
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise InputError(
             f"expected one of {torch.cuda.device_count()} GPUs, got '{name}'; use --device cpu, "
@@ -222,21 +205,19 @@ def resolve_device(name: str) -> torch.device:
 
 
 def autocast_dtype(precision: str, device: torch.device) -> torch.dtype | None:
-    """Return bfloat16 where the precision asks for it (or, with "auto", where the hardware has it), else None."""
+    """Return bfloat16 for precision "bf16", and for "auto" if the hardware supports it; else None."""
     if device.type == "cuda":
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
         fast = bool(torch.cpu._is_avx512_bf16_supported())
-    if precision == "bf16" or (precision == "auto" and fast):
-        return torch.bfloat16
-    return None
+    return torch.bfloat16 if precision == "bf16" or (precision == "auto" and fast) else None
 
 
 @contextmanager
 def float32_products(precision: Literal["highest", "high"]) -> Iterator[None]:
-    """Set the precision of torch's products of float32 matrices within a block; "high" is TF32 on CUDA.
+    """Set the precision of torch's products of float32 matrices in a block; "high" is TF32 on CUDA.
 
-    Directions of rays lose 9e-5 rad to TF32, so that only a network may run with it.
+    TF32 costs directions of rays 9e-5 rad, so it is for networks only.
     """
     try:
         before = torch.get_float32_matmul_precision()
@@ -250,7 +231,7 @@ def float32_products(precision: Literal["highest", "high"]) -> Iterator[None]:
 
 
 def available_memory(device: torch.device) -> int:
-    """Return the free memory in bytes: of a GPU, or of the machine and what a container or job leaves of it."""
+    """Return the free memory in bytes of a GPU, or of the machine within the limit of a container or job."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     import psutil
@@ -260,7 +241,7 @@ def available_memory(device: torch.device) -> int:
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
         used = int(Path("/sys/fs/cgroup/memory.current").read_text())
         return free if limit == "max" else min(free, max(0, int(limit) - used))
-    except (OSError, ValueError):  # no such limit here
+    except (OSError, ValueError):  # no such limit
         return free
 
 
@@ -270,17 +251,17 @@ def peak_memory(device: torch.device) -> int:
         return int(torch.cuda.max_memory_allocated(device))
     try:
         import resource
-    except ImportError:  # not on Windows
+    except ImportError:  # Windows
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(peak if sys.platform == "darwin" else peak * 1024)
 
 
 def keep_freed_memory() -> None:
-    """Ask glibc to keep freed blocks for the next step, rather than hand megabytes back to the kernel each time.
+    """Make glibc keep freed blocks for the next step instead of returning them to the kernel.
 
     A step on the CPU allocates the same few arrays again and again; with the default thresholds their pages are
-    unmapped and zeroed anew every time, which takes as long as the arithmetic (benchmarks/README.md).
+    unmapped and zeroed each time, which takes as long as the arithmetic (docs/decisions/006).
     """
     if platform.libc_ver()[0] != "glibc":
         return

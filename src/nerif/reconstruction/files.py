@@ -1,4 +1,4 @@
-"""The field and the checkpoint on disk: weights in safetensors, the rest as JSON; digests of the data of a run."""
+"""Field and checkpoint files: tensors in safetensors, the rest as JSON; digests of the data of a run."""
 
 from __future__ import annotations
 
@@ -29,68 +29,54 @@ from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
 
 __all__ = [
-    "CHECKPOINT",
-    "FIELD",
-    "check_fingerprint",
-    "checkpoints",
-    "digest",
-    "fingerprint",
-    "read_field",
-    "read_quantity",
-    "read_state",
-    "write_field",
-    "write_state",
-]
+    "CHECKPOINT", "FIELD", "check_fingerprint", "checkpoints", "digest", "fingerprint", "read_field", "read_quantity",
+    "read_state", "write_field", "write_state",
+]  # fmt: skip
+
+FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
 
 
 def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
-    """Return a digest of each part of what a reconstruction sees of a measurement, by the part's name.
+    """Return digests of the parts of a measurement on which a reconstruction depends, by name.
 
     Parameters
     ----------
-    measurement : Measurement
     open_faces : faces whose rays are dropped
     """
-    usable, seen = measurement.usable, {}
-    light: dict[str, list[Any]] = {}
+    maps: dict[str, str] = {}
+    constants: dict[str, list[Any]] = {}
     for o in measurement.observations:
-        own = measurement.usable_for(o)
-        seen[o.technique.measured] = digest([o.values[own]])
-        seen[o.technique.sigma] = digest([None if o.sigma is None else o.sigma[own]])
+        usable = measurement.usable_for(o)
+        maps[o.technique.measured] = digest([o.values[usable]])
+        maps[o.technique.sigma] = digest([None if o.sigma is None else o.sigma[usable]])
         for name, value in forward_model(o.technique, measurement).constants.items():
-            light.setdefault(name, []).append(value)
+            constants.setdefault(name, []).append(value)
     return {
         "views": digest(measurement.names),
         "cameras": digest(part for camera in measurement.cameras for part in _parts(camera)),
-        **seen,
-        "valid pixels": digest([usable]),
+        **maps,
+        "valid pixels": digest([measurement.usable]),
         "flow_mask": digest([measurement.flow_mask]),
         "box": digest([measurement.box.lower, measurement.box.upper]),
         "n_ambient": digest([measurement.n_ambient]),
-        **{name: digest(values) for name, values in light.items()},
+        **{name: digest(values) for name, values in constants.items()},
         "ambient_faces": digest(sorted(measurement.ambient_faces)),
         "open_faces": digest(sorted(open_faces)),
     }
 
 
-def check_fingerprint(kept: dict[str, str] | None, asked: dict[str, str]) -> None:
-    """Refuse to go on with a run that saw other data.
-
-    Raises
-    ------
-    InputError
-        Naming the parts that differ.
-    """
-    if kept is None:
+def check_fingerprint(before: dict[str, str] | None, present: dict[str, str]) -> None:
+    """Raise InputError if a checkpoint is of other data; the message names the parts that differ."""
+    if before is None:
         raise InputError(
-            "the checkpoint does not tell which data it belongs to, so it is of another version of nerif; "
+            "the checkpoint has no fingerprint of its data, so it is of another version of nerif; "
             "start without --resume",
             field="resume",
         )
-    changed = [name for name in asked if kept.get(name) != asked[name]]
+    changed = [name for name in present if before.get(name) != present[name]]
     if changed:
         raise InputError(
-            f"expected the data that the run began with, got other {', '.join(changed)}; "
+            f"expected the data of the run to be resumed, got other {', '.join(changed)}; "
             "give the same measurement, --withhold and --open-faces, or start without --resume",
             field="resume",
         )
@@ -106,24 +92,21 @@ def _parts(camera: Camera) -> tuple[Any, ...]:
 
 def digest(parts: Iterable[Any]) -> str:
     """Return a digest of tensors and plain values, in their order."""
-    seen = hashlib.blake2b(digest_size=16)
+    result = hashlib.blake2b(digest_size=16)
     for part in parts:
         if isinstance(part, Tensor):
-            seen.update(str(tuple(part.shape)).encode() + part.contiguous().numpy().tobytes())
+            result.update(str(tuple(part.shape)).encode() + part.contiguous().numpy().tobytes())
         else:
-            seen.update(repr(part).encode())
-        seen.update(b"|")
-    return seen.hexdigest()
-
-
-FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
+            result.update(repr(part).encode())
+        result.update(b"|")
+    return result.hexdigest()
 
 
 def write_field(directory: Path, result: Reconstruction) -> None:
-    """Write a field, and all that is needed to evaluate it, atomically."""
+    """Write a field atomically, with everything needed to evaluate it."""
     field = result.field
     about: dict[str, Any] = {"n_ambient": result.n_ambient, "outcome": vars(result.outcome)}
-    about["quantity"] = result.quantity
+    about |= {"quantity": result.quantity}
     if isinstance(field, VoxelField):
         box = field.grid.box
         about |= {"kind": "voxels", "shape": field.grid.shape, "degree": field.degree}
@@ -146,13 +129,7 @@ def write_field(directory: Path, result: Reconstruction) -> None:
 
 
 def read_field(directory: Path) -> tuple[Field, Box, float]:
-    """Read the field of a result directory, its box and n_ambient.
-
-    Raises
-    ------
-    InputError
-        If the directory holds no finished reconstruction, or its field is damaged.
-    """
+    """Read the field of a result directory, its box and n_ambient."""
     path = directory / FIELD
     if not path.is_file():
         what = "the directory has no" if directory.is_dir() else "no such directory with a"
@@ -167,11 +144,11 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         if about["kind"] == "symmetric voxels":
             lower, upper = about["reduced_box"]
             grid = Grid(Box(tuple(lower), tuple(upper)), tuple(about["shape"]))
-            parts = [VoxelField(own, grid, int(about["degree"])) for own in tensors["coefficients"]]
+            parts = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
             return SymmetricVoxels(parts, Symmetry.kept(about["symmetry"])), box, n_ambient
         shape = NetworkShape.of(about["network"])
-        kept = about.get("symmetry")
-        network = Network(shape) if kept is None else SymmetricNetwork(shape, Symmetry.kept(kept))
+        symmetry = about.get("symmetry")
+        network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.kept(symmetry))
         network.load_state_dict(tensors)
         network.eval().requires_grad_(False)
         return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient
@@ -182,17 +159,17 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
 
 
 def read_quantity(directory: Path) -> str:
-    """Read what the field of a result directory is (volume.QUANTITIES)."""
+    """Read the quantity of the field of a result directory (volume.QUANTITIES)."""
     return str(_load(directory / FIELD)[1].get("quantity", INDEX))
 
 
 def write_state(directory: Path, state: State) -> None:
-    """Write a checkpoint, atomically: a run killed while writing leaves the one before."""
+    """Write a checkpoint atomically: a run killed while writing leaves the previous one."""
     _save(directory / CHECKPOINT, {k: v.cpu().contiguous() for k, v in state.tensors.items()}, state.scalars)
 
 
 def checkpoints(directory: Path, seconds: float) -> OnStep:
-    """Return a callback that writes a checkpoint every so many seconds."""
+    """Return a callback that writes checkpoints at intervals of some seconds."""
     last = time.monotonic()
 
     def write(step: Step) -> None:
@@ -206,18 +183,11 @@ def checkpoints(directory: Path, seconds: float) -> OnStep:
 
 
 def read_state(directory: Path) -> State:
-    """Read the checkpoint of a result directory.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it is damaged.
-    """
+    """Read the checkpoint of a result directory."""
     path = directory / CHECKPOINT
     if not path.is_file():
         raise InputError(f"expected {CHECKPOINT} to resume from, got none; start without --resume", field=directory)
-    tensors, scalars = _load(path)
-    return State(tensors, scalars)
+    return State(*_load(path))
 
 
 def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -> None:
@@ -227,7 +197,7 @@ def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -
     with OwnFiles(path.parent).writing(path.name), atomic(path) as part:
         try:
             save_file(tensors, part, metadata={"nerif": json.dumps(about)})
-        except SafetensorError as error:  # a full disc is no OSError to it
+        except SafetensorError as error:  # safetensors has no OSError for a full disc
             raise OSError(errno.EIO, f"cannot be written ({error})", str(path)) from None
 
 

@@ -1,6 +1,6 @@
-"""The gauge: where the field is known to be ambient, 0. Displacements fix n only up to a constant.
+"""The gauge: regions where the field is ambient, 0, which fix the constant that displacements leave undetermined.
 
-By default the side faces of the box; where flow masks are given, all that lies outside the visual hull as well.
+By default the side faces of the box and, with flow masks, the space outside the visual hull.
 """
 
 from __future__ import annotations
@@ -20,36 +20,29 @@ __all__ = ["AmbientRegion", "ambient_faces", "check_gauge", "is_open", "visual_h
 
 
 def is_open(measurement: Measurement) -> bool:
-    """Return whether what was measured leaves a constant of the field open."""
+    """Return whether the data leave a constant of the field undetermined."""
     return all(kind.gauge for kind in measurement.techniques)
 
 
-def ambient_faces(measurement: Measurement, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Return the faces on which the field is ambient: those asked for, else those of the file, if any is needed."""
-    needed = any(kind.gauge for kind in measurement.techniques)
-    return asked or (measurement.ambient_faces if needed else ())
+def ambient_faces(measurement: Measurement, faces: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return the ambient faces: those of the settings, else those of the measurement if a technique needs a gauge."""
+    return faces or (measurement.ambient_faces if any(kind.gauge for kind in measurement.techniques) else ())
 
 
 def check_gauge(measurement: Measurement, faces: tuple[str, ...], hull: bool = True) -> None:
-    """Refuse a reconstruction that leaves a constant open, and of which nothing is known to be ambient."""
+    """Raise InputError if a constant of the field is undetermined and no region is ambient."""
     if is_open(measurement) and not faces and not (hull and measurement.flow_mask is not None):
         raise InputError(
             "expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
-            "fix the index only up to a constant",
+            "determine the index only up to a constant",
             field="ambient_faces",
         )
 
 
 def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
-    """Return the voxels that every view which sees them sees inside its flow mask.
-
-    Raises
-    ------
-    InputError
-        If the measurement has no flow mask, or no voxel is left.
-    """
+    """Return the voxels whose centres lie inside the flow mask of every view that has them in its image."""
     if measurement.flow_mask is None:
-        raise InputError("expected masks in the measurement to carve the visual hull, got none", field="flow_mask")
+        raise InputError("expected masks in the measurement for the visual hull, got none", field="flow_mask")
     inside = _in_hull(measurement, measurement.flow_mask, grid)
     if not bool(inside.any()):
         raise InputError(
@@ -58,54 +51,42 @@ def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
     return inside
 
 
-def _in_hull(
-    measurement: Measurement, masks: Bool[Tensor, "view row column"], grid: Grid
-) -> Bool[Tensor, "z y x"]:  # fmt: skip
-    """Which points of a grid all views that see them see inside their masks."""
+def _in_hull(measurement: Measurement, masks: Tensor, grid: Grid) -> Bool[Tensor, "z y x"]:
+    """The points of a grid inside the masks of all views that have them in their image."""
     points = grid.points(torch.float64).reshape(-1, 3)
     inside = torch.ones(len(points), dtype=torch.bool)
     for camera, mask in zip(measurement.cameras, masks, strict=True):
         column, row = camera.project(points).round().long().unbind(-1)
         height, width = camera.image_size
-        seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        inside &= ~seen | mask[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        in_image = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        inside &= ~in_image | mask[row.clamp(0, height - 1), column.clamp(0, width - 1)]
     return inside.reshape(grid.shape)
 
 
-def _outside(measurement: Measurement, masks: Bool[Tensor, "view row column"], grid: Grid) -> Bool[Tensor, "z y x"]:
-    """Which voxels of a grid are outside the hull as a whole: their centres and their corners."""
+def _outside(measurement: Measurement, masks: Tensor, grid: Grid) -> Bool[Tensor, "z y x"]:
+    """The voxels of a grid that are outside the hull with their centres and all corners."""
     (x0, y0, z0), (x1, y1, z1), (hx, hy, hz) = grid.box.lower, grid.box.upper, (edge / 2 for edge in grid.spacing)
-    around = Box((x0 - hx, y0 - hy, z0 - hz), (x1 + hx, y1 + hy, z1 + hz))  # voxels about the corners of those of grid
+    # a grid whose voxel centres are the corners of the voxels
+    larger = Box((x0 - hx, y0 - hy, z0 - hz), (x1 + hx, y1 + hy, z1 + hz))
     nz, ny, nx = grid.shape
-    corners = _in_hull(measurement, masks, Grid(around, (nz + 1, ny + 1, nx + 1)))
+    corners = _in_hull(measurement, masks, Grid(larger, (nz + 1, ny + 1, nx + 1)))
     near = torch.nn.functional.max_pool3d(corners[None, None].float(), 2, 1)[0, 0] > 0
     return ~(near | visual_hull(measurement, grid))
 
 
 @dataclass(frozen=True)
 class AmbientRegion:
-    """Faces of the box, and voxels outside the visual hull, in which the index excess is 0.
-
-    Parameters
-    ----------
-    box : Box, mm
-    faces : names such as "x-"
-    empty : (m, 3) centres of voxels that are outside the hull with all their corners, mm; may be of length 0
-    voxel : edges of those voxels, mm
-    """
+    """Faces of the box, and voxels outside the visual hull, where the index excess is 0."""
 
     box: Box
     faces: tuple[str, ...]
-    empty: Float[Tensor, "m 3"]
-    voxel: tuple[float, float, float]
+    empty: Float[Tensor, "m 3"]  # centres of voxels that are outside the hull with all their corners, mm
+    voxel: tuple[float, float, float]  # their edges, mm
 
     @classmethod
-    def of(cls, measurement: Measurement, asked: tuple[str, ...], resolution: int = 48) -> AmbientRegion | None:
-        """Find the ambient region of a measurement, with the faces asked for or its own.
-
-        None where nothing is known to be ambient and nothing has to be; an error where something has.
-        """
-        faces = ambient_faces(measurement, asked)
+    def of(cls, measurement: Measurement, faces: tuple[str, ...], resolution: int = 48) -> AmbientRegion | None:
+        """Return the ambient region of a measurement, with the faces of the settings or its own; None if not needed."""
+        faces = ambient_faces(measurement, faces)
         grid = Grid.of_resolution(measurement.box, resolution)
         empty = torch.zeros(0, 3)
         if measurement.flow_mask is not None:
@@ -116,7 +97,7 @@ class AmbientRegion:
         return cls(measurement.box, faces, empty, grid.spacing)
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-        """Draw about `count` random points, half of them outside the hull where there is one, mm."""
+        """Draw about `count` random points (mm), half of them outside the hull if there is one."""
         points = []
         share = count // 2 if len(self.empty) and self.faces else count
         if self.faces:
@@ -124,14 +105,14 @@ class AmbientRegion:
             unit = torch.rand(len(self.faces), -(-share // len(self.faces)), 2, generator=generator)
             points.append((corner + unit @ edges).reshape(-1, 3))
         if len(self.empty):
-            chosen = torch.randint(len(self.empty), (share,), generator=generator)
+            index = torch.randint(len(self.empty), (share,), generator=generator)
             shift = (torch.rand(share, 3, generator=generator) - 0.5) * torch.tensor(self.voxel)
-            points.append(self.empty[chosen] + shift)
+            points.append(self.empty[index] + shift)
         return torch.cat(points)
 
     @cached_property
     def _face_frames(self) -> tuple[Float[Tensor, "face 1 3"], Float[Tensor, "face 2 3"]]:
-        """A corner of each face, and the two edges that leave it, mm."""
+        """A corner of each face, and the two edges from it, mm."""
         unit = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        found = torch.stack([self.box.face_points(face, unit) for face in self.faces])
-        return found[:, :1], found[:, 1:] - found[:, :1]
+        points = torch.stack([self.box.face_points(face, unit) for face in self.faces])
+        return points[:, :1], points[:, 1:] - points[:, :1]

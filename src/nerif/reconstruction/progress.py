@@ -1,4 +1,4 @@
-"""Who is told how long work goes: lines of text, and bars. Quiet unless somebody listens."""
+"""Progress reporting: lines of text, and bars."""
 
 from __future__ import annotations
 
@@ -11,19 +11,15 @@ from nerif.reconstruction.base import OnStep, compose
 __all__ = ["QUIET", "Monitor"]
 
 
-def _quiet(*_: object) -> None:
-    return None
+def _quiet(*_: object) -> None: ...
 
 
 @dataclass(frozen=True)
 class Monitor:
-    """What is called while work goes on.
+    """Callbacks of long work; by default silent.
 
-    Parameters
-    ----------
-    say : takes a line for the user
-    training : takes a title, and gives a context in which every Step of a reconstruction is told
-    counting : takes a title, and gives a context in which it is told how many are done, and out of how many
+    `say` takes a line for the user; `training` and `counting` take a title and return a context that gives a callback
+    for every Step of a reconstruction, and for (items done, all items).
     """
 
     say: Callable[[str], None] = _quiet
@@ -31,12 +27,12 @@ class Monitor:
     counting: Callable[[str], AbstractContextManager[Callable[[int, int], None]]] = lambda title: nullcontext(_quiet)
 
     def telling(self, on_step: OnStep) -> Monitor:
-        """Return a monitor that also calls that callback with every Step."""
+        """Return a monitor that also calls `on_step` with every Step."""
 
         @contextmanager
         def training(title: str) -> Iterator[OnStep]:
-            with self.training(title) as told:
-                yield compose(on_step, told)
+            with self.training(title) as callback:
+                yield compose(on_step, callback)
 
         return replace(self, training=training)
 

@@ -1,9 +1,9 @@
-"""What a reconstruction goes by, where a measurement holds displacements and the images they were found in.
+"""The data to fit: images, the displacements computed from them, or both.
 
-Images are met only where the pattern is already at the right dot. So a network begins with the displacements, where
-there are some, else with images blurred by several pixels, and goes on with images that are SOFT. Between pixels a
-sharp pattern is not known: that much blur takes more from what cubic splines get wrong than from the pattern
-(docs/decisions/028).
+Images can be fitted only where the predicted displacement already leads to the right dot. A network therefore starts
+with displacements if there are any, else with images blurred by several pixels, and continues with images blurred by
+SOFT_PX. A sharp pattern is not determined between pixels: that much blur reduces the error of cubic splines more than
+the signal (docs/decisions/028).
 """
 
 from __future__ import annotations
@@ -20,42 +20,32 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, Observation
 
-__all__ = ["SOURCES", "Stage", "check_source", "chosen_source", "of_source", "stages"]
+__all__ = ["Stage", "check_source", "chosen_source", "of_source", "stages"]
 
 SOURCES = ("auto", "images", "displacements", "both")
-
-SOFT = 0.6  # px, standard deviation
-BLURS = (4.0, 2.0, 1.0)  # px
-FILLED = 6.0  # px, over which a displacement goes on where it was not measured
+SOFT_PX = 0.6  # standard deviation
+BLURS_PX = (4.0, 2.0, 1.0)  # before that, without displacements
+FILL_PX = 6.0  # over which displacements are extrapolated to pixels without one
 SHARP_FROM = 0.3  # of a run
-SETTLED = (0.5, 0.75)  # of a run: what is open beside the field is fitted again
+FITTED_AGAIN = (0.5, 0.75)  # of a run: intensity gains and offsets are fitted again
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of a run.
+    """A part of a run."""
 
-    Parameters
-    ----------
-    begin : share of the run at which it begins
-    measurement : gives what is to be met
-    words : what that is
-    """
-
-    begin: float
-    measurement: Callable[[], Measurement]
-    words: str
+    begin: float  # share of the run at which it begins
+    measurement: Callable[[], Measurement]  # the data to fit
+    words: str  # their name
 
 
 def check_source(source: str, measurement: Measurement | None = None) -> None:
-    """Raise InputError unless it is one of SOURCES, and a measurement that is given holds the images asked for, or
-    displacements beside its images where those are.
-    """
+    """Raise InputError unless it is one of SOURCES, and a measurement, if given, holds these data."""
     if source not in SOURCES:
         raise InputError(f"expected one of {', '.join(SOURCES)}, got '{source}'", field="from")
     if measurement is None:
         return
-    images, found = _pair(measurement)
+    images, displacements = _pair(measurement)
     if images is None and source in ("images", "both"):
         names = " and ".join(o.technique.measured for o in measurement.observations)
         raise InputError(
@@ -63,90 +53,77 @@ def check_source(source: str, measurement: Measurement | None = None) -> None:
             "nerif displacement writes them",
             field="from",
         )
-    if images is not None and found is None and source in ("displacements", "both"):
+    if images is not None and displacements is None and source in ("displacements", "both"):
         raise InputError(f"expected displacements for '{source}', got images alone; give --from images", field="from")
 
 
 def chosen_source(measurement: Measurement, source: str, preferred: str) -> str:
-    """Return what "auto" means where a measurement holds both displacements and images; any other source as it is."""
-    images, found = _pair(measurement)
-    return preferred if source == "auto" and images is not None and found is not None else source
+    """Return the source, with "auto" replaced by the preferred one if there are both displacements and images."""
+    images, displacements = _pair(measurement)
+    return preferred if source == "auto" and images is not None and displacements is not None else source
 
 
-def of_source(measurement: Measurement, source: str, blur: float = SOFT, preferred: str = "images") -> Measurement:
-    """Return the measurement with what a reconstruction is to go by: images, displacements, or both.
+def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, preferred: str = "images") -> Measurement:
+    """Return the measurement with the data to fit: images (blurred, standard deviation in px), displacements, or both.
 
-    What is measured by other techniques is left as it is. Images keep what displacements tell, as a guess.
-
-    Parameters
-    ----------
-    source : one of SOURCES
-    blur : of the images, standard deviation in px
-    preferred : what "auto" takes where there are both
-
-    Raises
-    ------
-    InputError
-        If the measurement does not hold what is asked for.
+    Data of other techniques are unchanged. Images retain the displacements as a first approximation.
     """
     check_source(source, measurement)
-    images, found = _pair(measurement)
+    images, displacements = _pair(measurement)
     if images is None:
         return measurement
     source = chosen_source(measurement, source, preferred)
-    if found is not None and source == "displacements":
+    if displacements is not None and source == "displacements":
         return images.without(measurement)
-    whole = measurement if source == "both" or found is None else found.without(measurement)
+    whole = measurement if source == "both" or displacements is None else displacements.without(measurement)
     sizes = [camera.image_size for camera in whole.cameras]
-    maps = images.technique.softened(whole.maps, sizes, blur)
-    measured = images.technique.measured
-    maps[measured] = maps[measured].where(whole.usable_for(_pair(whole)[0] or images), math.nan)
-    if found is not None:
-        known = [measurement.names.index(name) for name in whole.names]
-        maps[images.technique.guess] = _filled(measurement, found)[known]
+    maps = images.technique.blur(whole.maps, sizes, blur)
+    variable = images.technique.measured
+    maps[variable] = maps[variable].where(whole.usable_for(_pair(whole)[0] or images), math.nan)
+    if displacements is not None:
+        views = [measurement.names.index(name) for name in whole.names]
+        maps[images.technique.guess] = _extrapolated(measurement, displacements)[views]
     return replace(whole, maps=maps)
 
 
 def stages(measurement: Measurement, source: str) -> list[Stage]:
-    """Return the parts of a network's run on a measurement (see the head of this file)."""
-    images, found = _pair(measurement)
+    """Return the stages of the training of a network."""
+    images, displacements = _pair(measurement)
     final = of_source(measurement, source)
 
     def last() -> Measurement:
         return final
 
     if images is None or source == "displacements":
-        names = " and ".join(o.technique.measured for o in final.observations)
-        return [Stage(0.0, last, names)]
-    ends = [Stage(begin, last, "images") for begin in (SHARP_FROM, *SETTLED)]
-    if found is not None:
+        return [Stage(0.0, last, " and ".join(o.technique.measured for o in final.observations))]
+    ends = [Stage(begin, last, "images") for begin in (SHARP_FROM, *FITTED_AGAIN)]
+    if displacements is not None:
         return [Stage(0.0, partial(of_source, measurement, "displacements"), "displacements"), *ends]
-    begins = [SHARP_FROM * i / len(BLURS) for i in range(len(BLURS))]
-    blurred = [
-        Stage(begin, partial(of_source, measurement, source, px), f"images blurred by {px:g} px")
-        for begin, px in zip(begins, BLURS, strict=True)
-    ]
+    blurred = []
+    for i, px in enumerate(BLURS_PX):
+        data = partial(of_source, measurement, source, px)
+        blurred.append(Stage(SHARP_FROM * i / len(BLURS_PX), data, f"images blurred by {px:g} px"))
     return [*blurred, *ends]
 
 
 def _pair(measurement: Measurement) -> tuple[Observation | None, Observation | None]:
-    """The images, and the displacements that were found in them, as far as there are any."""
+    """The images and the displacements computed from them, or None."""
     by_name = {o.technique.name: o for o in measurement.observations}
     images = next((o for o in by_name.values() if o.technique.derived), None)
     return images, None if images is None else by_name.get(images.technique.derived)
 
 
-def _filled(measurement: Measurement, found: Observation) -> Float[Tensor, "view row column 2"]:
-    """The displacement, and where it was not measured the mean of what is around."""
+def _extrapolated(measurement: Measurement, displacements: Observation) -> Float[Tensor, "view row column 2"]:
+    """The displacement, and where it is not usable a weighted mean of its surroundings."""
     from scipy.ndimage import gaussian_filter
 
-    d, usable = found.values, measurement.usable_for(found)
-    whole = torch.zeros_like(d)
+    d, usable = displacements.values, measurement.usable_for(displacements)
+    result = torch.zeros_like(d)
     for i, camera in enumerate(measurement.cameras):
         inside = i, slice(0, camera.image_size[0]), slice(0, camera.image_size[1])
         good = usable[inside][..., None]
-        known = torch.where(good, d[inside], 0.0).double()
-        weight = torch.from_numpy(gaussian_filter(good[..., 0].double().numpy(), FILLED)).clamp(min=1e-6)
-        mean = torch.from_numpy(gaussian_filter(known.numpy(), (FILLED, FILLED, 0))) / weight[..., None]
-        whole[inside] = torch.where(good, d[inside], mean.to(d))
-    return whole
+        values = torch.where(good, d[inside], 0.0).double()
+        weight = torch.from_numpy(gaussian_filter(good[..., 0].double().numpy(), FILL_PX)).clamp(min=1e-6)
+        mean = torch.from_numpy(gaussian_filter(values.numpy(), (FILL_PX, FILL_PX, 0))) / weight[..., None]
+        result[inside] = torch.where(good, d[inside], mean.to(d))
+    return result

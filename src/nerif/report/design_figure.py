@@ -1,4 +1,4 @@
-"""What a planned rig will see, drawn: sensitivity and resolution over where the background stands and the aperture."""
+"""Drawings of a planned rig: plan view, sensitivity over the background distance, resolution over the f-number."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_displacement", "draw_plan", "draw_resolution", "save_design"]
 
+F_NUMBERS = (2, 4, 8, 16, 32, 64)
+
 
 def draw_plan(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
-    """Draw the rig from above: cameras, what they see, backgrounds and the flow; mm."""
+    """Draw cameras, fields of view, backgrounds and flow from above; mm."""
     from matplotlib.patches import Circle
 
     for camera in ring.cameras():
@@ -32,46 +34,40 @@ def draw_plan(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
         axes.plot(*edges.T, color="black", linewidth=2)
         axes.plot(*lens.T, marker="o", color="#0072B2", markersize=5)
     axes.add_patch(Circle((0, 0), flow.flow_size / 2, color="#D55E00", alpha=0.7))
-    axes.set_aspect("equal")
-    axes.set_xlabel("x [mm]")
-    axes.set_ylabel("y [mm]")
-    axes.set_title("from above: cameras, backgrounds, flow", fontsize=9)
+    axes.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_title("plan view: cameras, backgrounds, flow", fontsize=9)
     return axes
 
 
 def draw_displacement(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
-    """Draw the expected displacement (px) and the resolution (mm) over the distance of the background."""
+    """Draw the expected displacement (px) and the resolution (mm) over the background distance."""
     distances = ring.background_distance * np.geomspace(0.2, 3, 60)
-    results = [expect(replace(ring, background_distance=float(d)), flow) for d in distances]
-    axes.plot(distances, [r.displacement for r in results], color="#0072B2", label="displacement [px]")
-    axes.plot(distances, [r.resolution for r in results], color="#D55E00", linestyle="--", label="resolution [mm]")
+    expected = [expect(replace(ring, background_distance=float(d)), flow) for d in distances]
+    axes.plot(distances, [e.displacement for e in expected], color="#0072B2", label="displacement [px]")
+    axes.plot(distances, [e.resolution for e in expected], color="#D55E00", linestyle="--", label="resolution [mm]")
     axes.axhline(flow.displacement_noise, color="0.5", linewidth=0.8)
     axes.text(distances[-1], flow.displacement_noise, "noise [px]", fontsize=7, ha="right", va="bottom", color="0.4")
     axes.axvline(ring.background_distance, color="0.7", linewidth=0.8, linestyle=":")
-    axes.set_yscale("log")
-    axes.set_xlabel("flow to background [mm]")
-    axes.set_ylabel("displacement [px], resolution [mm]")
+    axes.set(yscale="log", xlabel="flow to background [mm]", ylabel="displacement [px], resolution [mm]")
     axes.legend(fontsize=7, loc="center right")
-    axes.set_title("where the background stands (dotted: as planned)", fontsize=9)
+    axes.set_title("background distance (dotted: as planned)", fontsize=9)
     return axes
 
 
 def draw_resolution(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
-    """Draw the parts of the resolution (mm at the flow) over the f-number."""
+    """Draw the contributions to the resolution (mm at the flow) over the f-number."""
     numbers = np.geomspace(1.4, 64, 60)
-    results = [expect(ring, replace(flow, f_number=float(n))) for n in numbers]
+    expected = [expect(ring, replace(flow, f_number=float(n))) for n in numbers]
     for name, style in (("cone", "--"), ("window", ":"), ("diffraction", "-.")):
-        axes.plot(numbers, [getattr(r, name) for r in results], linestyle=style, label=name)
-    axes.plot(numbers, [r.resolution for r in results], color="black", label="together")
+        axes.plot(numbers, [getattr(e, name) for e in expected], linestyle=style, label=name)
+    axes.plot(numbers, [e.resolution for e in expected], color="black", label="together")
     axes.axvline(flow.f_number, color="0.7", linewidth=0.8, linestyle=":")
-    axes.set_xscale("log")
-    axes.set_xticks([2, 4, 8, 16, 32, 64], [f"{n}" for n in (2, 4, 8, 16, 32, 64)])
+    axes.set(xscale="log", xlabel="f-number", ylabel="length at the flow [mm]")
+    axes.set_xticks(F_NUMBERS, [f"{n}" for n in F_NUMBERS])
     axes.minorticks_off()
-    axes.set_xlabel("f-number")
-    axes.set_ylabel("length at the flow [mm]")
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=7)
-    axes.set_title("what blurs (dotted: as planned)", fontsize=9)
+    axes.set_title("resolution (dotted: as planned)", fontsize=9)
     return axes
 
 
@@ -80,9 +76,7 @@ def save_design(path: Path, ring: Ring, flow: DesignSettings) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4.2), layout="constrained")
-    first, second, third = figure.subplots(1, 3)
-    draw_plan(first, ring, flow)
-    draw_displacement(second, ring, flow)
-    draw_resolution(third, ring, flow)
+    for axes, draw in zip(figure.subplots(1, 3), (draw_plan, draw_displacement, draw_resolution), strict=True):
+        draw(axes, ring, flow)
     with atomic(path) as part:
         figure.savefig(part, dpi=130)

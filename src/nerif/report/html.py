@@ -1,4 +1,4 @@
-"""`report.html`: one file that opens from disk or an e-mail, with everything it needs inside and no network."""
+"""`report.html`: a single file that contains everything it needs and loads nothing from the network."""
 
 from __future__ import annotations
 
@@ -17,13 +17,10 @@ from nerif.data.volume import name_of
 from nerif.forward.registry import technique_of
 from nerif.plotting.drawing import drawn_of, map_colours
 from nerif.plotting.notebook import image, number
-from nerif.report.figures import draw_history, draw_residuals, draw_slice_scores
+from nerif.report import figures, summary
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
-from nerif.report.moves_figure import draw_moved_rig, draw_moves
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
-from nerif.report.summary import came_out, headline, looked, measured, trust, trust_figures
-from nerif.report.uncertainty_figure import banded, draw_bands, draw_reliability
 from nerif.report.view_images import colour_table, view_images
 from nerif.results.directory import Result
 
@@ -47,33 +44,32 @@ def write(page: str, path: Path) -> None:
 
 
 def render(result: Result) -> str:
-    """Return the page of a result, whatever of it is there."""
-    statements = trust(result)
+    """Return the page of a result, complete or not."""
     scene, arrays = scene_of(result)
-    metrics = result.metrics.get("views")
-    metrics = metrics if isinstance(metrics, list) else []
-    views, scales = ([], []) if result.reprojection is None else view_images(result.reprojection, metrics)
+    scores = result.metrics.get("views")
+    scores = scores if isinstance(scores, list) else []
+    views, scales = ([], []) if result.reprojection is None else view_images(result.reprojection, scores)
     meridian = result.meridian
-    first = next((v.name for v in views if v.withheld), views[0].name if views else "")
+    measurement = result.metrics.get("measurement", result.settings.get("measurement"))
     return render_page(
         kind=_kind(result),
         title=result.directory.resolve().name,
-        source=_source(result),
+        source=Path(str(measurement)).name if measurement else "",
         finished=result.about.get("finished", ""),
-        headline=headline(result),
-        statements=statements,
+        headline=summary.headline(result),
+        statements=summary.statements(result),
         cards=(
-            ("What was measured", measured(result)),
-            ("What came out", came_out(result)),
-            ("Can it be trusted", trust_figures(result)),
+            ("Measurement", summary.measurement_rows(result)),
+            ("Reconstruction", summary.field_rows(result)),
+            ("Accuracy", summary.accuracy_rows(result)),
         ),
         scene=scene,
         arrays=arrays,
         views=views,
-        first_view=first,
+        first_view=next((v.name for v in views if v.withheld), views[0].name if views else ""),
         scales=scales,
-        scores=metrics,
-        kept_out=looked(result),
+        scores=scores,
+        first_run=summary.cross_validated(result),
         plane=_plane(meridian),
         plane_title="Around the axis" if meridian is None or meridian.axial else "In the plane of the flow",
         curves=_curves(result),
@@ -90,11 +86,11 @@ def render(result: Result) -> str:
 
 
 def render_page(scene: dict[str, Any] | None, **parts: Any) -> str:
-    """Return the page of what report.html.j2 is given; parts that are left out are not shown."""
+    """Return the page of report.html.j2 with these variables; missing parts are not shown."""
     return _template().render(
         version=__version__,
         scene=scene,
-        scene_json=_json(scene),
+        scene_json=json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c"),  # "</script>" would end it
         citation=CITATION,
         style=(ASSETS / "report.css").read_text(),
         three=(ASSETS / "three.min.js").read_text(),
@@ -103,7 +99,7 @@ def render_page(scene: dict[str, Any] | None, **parts: Any) -> str:
     )
 
 
-@cache  # to parse it takes half a second
+@cache  # parsing takes half a second
 def _template() -> jinja2.Template:
     import jinja2
 
@@ -117,45 +113,43 @@ def _template() -> jinja2.Template:
 
 
 def _plane(meridian: Meridian | None) -> list[tuple[str, str]]:
-    """Titles and images of what a symmetric flow is over (r, h)."""
+    """Titles and images of a symmetric flow over (r, h)."""
     if meridian is None:
         return []
     plane = "in a plane through the axis" if meridian.axial else "in the plane across"
-    beside, along = ("across the axis", "on the axis") if meridian.axial else ("along r", "along h")
-    ways = (plane, draw_section), (beside, draw_profiles), (along, draw_centre_line)
+    across, along = ("across the axis", "on the axis") if meridian.axial else ("along r", "along h")
+    plots = (plane, draw_section), (across, draw_profiles), (along, draw_centre_line)
     return [
         (f"{name_of(quantity).capitalize()} {where}", svg(partial(draw, meridian=meridian, quantity=quantity)))
-        for quantity, (where, draw) in itertools.product(drawn_of(meridian.quantities), ways)
+        for quantity, (where, draw) in itertools.product(drawn_of(meridian.quantities), plots)
     ]
 
 
 def _curves(result: Result) -> list[tuple[str, str]]:
-    """Titles and images (SVG as data addresses) of how the run went and of how it compares with the truth."""
-    found = []
+    """Titles and images of convergence, residuals, rig and accuracy."""
+    metrics = result.metrics
+    curves: list[tuple[str, str]] = []
+
+    def add(title: str, draw: Callable[..., object], *data: Any) -> None:
+        curves.append((title, svg(lambda axes: draw(axes, *data))))
+
     if result.history:
-        method = str(result.settings.get("method", "nerif"))
-        found.append(("How the run went", svg(lambda axes: draw_history(axes, result.history, method))))
+        add("Convergence", figures.draw_history, result.history, str(result.settings.get("method", "nerif")))
     if result.reprojection is not None:
         several = len(result.reprojection.measurement.observations) > 1
         for name, residuals in residuals_over_sigma(result.reprojection).items():
-            of = f" of {name}" if several else ""
-            found.append((f"Residuals{of} against the noise", svg(partial(draw_residuals, residuals=residuals))))
-    rig = result.metrics.get("rig")
-    if rig:
-        found.append(("How far the cameras were moved", svg(partial(draw_moves, table=rig))))
+            add(f"Residuals{f' of {name}' if several else ''} over the noise", figures.draw_residuals, residuals)
+    if rig := metrics.get("rig"):
+        add("Corrections of the cameras", figures.draw_corrections, rig)
         if result.reprojection is not None:
-            cameras = result.reprojection.measurement.cameras
-            found.append(("Where the cameras were moved to", svg(partial(draw_moved_rig, cameras=cameras, table=rig))))
-    for quantity in banded(result.volumes):
-        draw = partial(draw_bands, volumes=result.volumes, quantity=quantity)
-        found.append((f"{name_of(quantity).capitalize()} with bands that hold 90 %", svg(draw)))
-    if "reliability" in (result.metrics.get("coverage") or {}):
-        draw = partial(draw_reliability, coverage=result.metrics["coverage"])
-        found.append(("Are the bands right? Against the truth", svg(draw)))
-    if result.metrics.get("slices"):
-        slices = result.metrics["slices"]
-        found.append(("Against the truth, slice by slice", svg(lambda axes: draw_slice_scores(axes, slices))))
-    return found
+            add("Refined camera positions", figures.draw_refined_rig, result.reprojection.measurement.cameras, rig)
+    for quantity in figures.banded(result.volumes):
+        add(f"{name_of(quantity).capitalize()} with bands of 90 %", figures.draw_bands, result.volumes, quantity)
+    if "reliability" in (metrics.get("coverage") or {}):
+        add("Reliability of the bands, against the truth", figures.draw_reliability, metrics["coverage"])
+    if metrics.get("slices"):
+        add("Against the truth, slice by slice", figures.draw_slice_scores, metrics["slices"])
+    return curves
 
 
 def svg(draw: Callable[[Axes], object]) -> str:
@@ -164,18 +158,12 @@ def svg(draw: Callable[[Axes], object]) -> str:
 
 
 def _kind(result: Result) -> str:
-    """What kind of tomography it is, by what was measured, or by what was reconstructed where that is not there."""
+    """The kind of tomography, of the measurement or else of the field."""
     if result.measurement is not None:
         kinds = result.measurement.techniques
     else:
         kinds = () if result.field is None else (technique_of(result.field.quantity),)
     return " and ".join(dict.fromkeys(kind.tomography for kind in kinds))
-
-
-def _source(result: Result) -> str:
-    """Name of the measurement whose views are shown."""
-    path = result.metrics.get("measurement", result.settings.get("measurement"))
-    return Path(str(path)).name if path else ""
 
 
 def _gradient(name: str) -> str:
@@ -184,15 +172,10 @@ def _gradient(name: str) -> str:
 
 
 def _ends(limits: tuple[float, float], unit: str) -> list[str]:
-    """What stands below a bar of colours: its ends, and 0 between them."""
+    """Labels below a colour bar: its ends, and 0 between them."""
     low, high = limits
     below = [f"−{number(-low, 3)}"] if low < 0 else []
     return [*below, "0", f"{number(high, 3)} {unit}".rstrip()]
-
-
-def _json(value: Any) -> str:
-    """JSON that cannot end the script it stands in."""
-    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def flat(table: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""An isosurface in a Matplotlib figure, for print."""
+"""Isosurfaces: triangles, an STL file, and a drawing for print."""
 
 from __future__ import annotations
 
@@ -15,15 +15,12 @@ if TYPE_CHECKING:
 
 __all__ = ["default_level", "draw_isosurface", "filled", "stl_of", "surface_triangles"]
 
-LARGEST = 80  # voxels along an edge: finer surfaces cannot be told apart in print, and take minutes to draw
+MAX_VOXELS = 80  # along an edge: finer surfaces look the same in print and take minutes to draw
 FACE = "#E69F00"
 
 
 def default_level(volume: Volume) -> float:
-    """Return the value halfway between the ambient (median of the faces of the box) and what is farthest from it.
-
-    A few outliers do not count: see drawing.colour_range.
-    """
+    """Return the value halfway between the ambient (median on the faces) and the extreme, outliers excluded."""
     values = shown(volume)
     faces = np.concatenate([np.take(values, i, axis=a).ravel() for a in range(3) for i in (0, -1)])
     ambient = float(np.nanmedian(faces)) if np.isfinite(faces).any() else 0.0
@@ -31,12 +28,11 @@ def default_level(volume: Volume) -> float:
 
 
 def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"]:
-    """Return the corners (mm) of triangles on which a quantity has the value `level`; none where it is nowhere met."""
+    """Return the corners (mm) of the triangles of an isosurface; none where the level is not reached."""
     from skimage.measure import marching_cubes
 
-    stride = max(1, -(-max(volume.grid.shape) // LARGEST))
-    values = shown(volume)[::stride, ::stride, ::stride]
-    values = filled(values)
+    stride = max(1, -(-max(volume.grid.shape) // MAX_VOXELS))
+    values = filled(shown(volume)[::stride, ::stride, ::stride])
     if min(values.shape) < 2 or not values.min() < level < values.max():
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(values, level)
@@ -45,7 +41,7 @@ def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"
 
 
 def stl_of(triangles: Float[np.ndarray, "n 3 3"]) -> bytes:
-    """Return triangles (mm) as a binary STL file, which CAD programs and three.js read."""
+    """Return triangles (mm) as a binary STL file."""
     a, b, c = (triangles[:, i] for i in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -55,7 +51,7 @@ def stl_of(triangles: Float[np.ndarray, "n 3 3"]) -> bytes:
 
 
 def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
-    """Return masked voxels (NaN) with the value of the nearest that is not: they must have no surface of their own."""
+    """Return the values with masked voxels (NaN) set to their nearest neighbour, so that masks have no surface."""
     from scipy.ndimage import distance_transform_edt
 
     masked = ~np.isfinite(values)
@@ -66,28 +62,21 @@ def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
 
 
 def draw_isosurface(axes: Axes3D, volume: Volume, level: float) -> Axes3D:
-    """Draw the surface on which a quantity has the value `level` (in its unit), lit from the viewer; lengths in mm."""
+    """Draw an isosurface (level in the unit shown), lit from the viewer; lengths in mm."""
     from matplotlib.colors import LightSource
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     triangles = surface_triangles(volume, level)
     if len(triangles):
+        light = LightSource(azdeg=225, altdeg=45)
+        # coloured edges hide the gaps between triangles
         surface = Poly3DCollection(
-            triangles,
-            facecolors=FACE,
-            edgecolors=FACE,  # else the ground shines through between triangles
-            linewidths=0.2,
-            shade=True,
-            lightsource=LightSource(azdeg=225, altdeg=45),
-            rasterized=True,
+            triangles, facecolors=FACE, edgecolors=FACE, linewidths=0.2, shade=True, lightsource=light, rasterized=True
         )
         axes.add_collection3d(surface)
     box = volume.grid.box
-    axes.set_xlim(box.lower[0], box.upper[0])
-    axes.set_ylim(box.lower[1], box.upper[1])
-    axes.set_zlim(box.lower[2], box.upper[2])
+    limits = zip(box.lower, box.upper, strict=True)
+    axes.set(**dict(zip(("xlim", "ylim", "zlim"), limits, strict=True)))
     axes.set_box_aspect(box.edges, zoom=0.88)
-    axes.set_xlabel("x [mm]")
-    axes.set_ylabel("y [mm]")
-    axes.set_zlabel("z [mm]")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
     return axes

@@ -1,4 +1,4 @@
-"""What a symmetric flow looks like: its section beside and beyond the axis, profiles across it and along it."""
+"""Plots of a symmetric flow: section through the axis, profiles across it, and the line along it."""
 
 from __future__ import annotations
 
@@ -16,29 +16,34 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_centre_line", "draw_profiles", "draw_section"]
 
-HEIGHTS = (0.25, 0.5, 0.75)  # shares of the height of the box, of profiles
+PROFILE_HEIGHTS = (0.25, 0.5, 0.75)  # of the height of the box
 
 
 def _shown(meridian: Meridian, quantity: str) -> np.ndarray:
-    """The values as they are shown: n as n - 1."""
+    """The values as plotted: n as n - 1."""
     values = meridian.quantities[quantity]
     return values - 1 if quantity == "n" else values
 
 
 def _banded(meridian: Meridian, quantity: str) -> Meridian:
-    """The `line` of a quantity; `low` and `high`, which hold 90 %, where it has standard deviations."""
-    known = meridian.quantities
-    std = f"{quantity}_std"
-    found = {"line": _shown(meridian, quantity)}
-    if std in known:
+    """The quantity as `line` and, where it has standard deviations, its band of 90 % as `low` and `high`."""
+    std = meridian.quantities.get(f"{quantity}_std")
+    curves = {"line": _shown(meridian, quantity)}
+    if std is not None:
         for name, (percentile, deviations) in zip(("low", "high"), TAILS.items(), strict=True):
-            end = known.get(f"{quantity}_{percentile}")
-            found[name] = found["line"] + deviations * known[std] if end is None else end
-    return replace(meridian, quantities=found)
+            end = meridian.quantities.get(f"{quantity}_{percentile}")
+            curves[name] = curves["line"] + deviations * std if end is None else end
+    return replace(meridian, quantities=curves)
+
+
+def _draw(axes: Axes, at: np.ndarray, curves: dict[str, np.ndarray], colour: str, label: str = "") -> None:
+    axes.plot(at, curves["line"], color=colour, lw=1, label=label)
+    if "low" in curves:
+        axes.fill_between(at, curves["low"], curves["high"], color=colour, alpha=0.25, lw=0)
 
 
 def draw_section(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
-    """Draw a quantity in a plane through the axis, mirrored at it; what is outside the box grey."""
+    """Draw a quantity in a plane through the axis, grey outside the box."""
     values, r, h = _shown(meridian, quantity), meridian.r, meridian.h
     if meridian.axial:
         values, r = np.concatenate([values[:, :0:-1], values], axis=1), np.concatenate([-r[:0:-1], r])
@@ -48,35 +53,28 @@ def draw_section(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
         values, extent=(r[0], r[-1], h[0], h[-1]), origin="lower", vmin=limits[0], vmax=limits[1],
         cmap=map_colours(limits), aspect="equal", interpolation="nearest",
     )  # fmt: skip
-    axes.set_xlabel("r [mm]")
-    axes.set_ylabel("h [mm]")
+    axes.set(xlabel="r [mm]", ylabel="h [mm]")
     add_colour_bar([axes], label_of(quantity))
     return axes
 
 
 def draw_profiles(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
-    """Draw a quantity over r at three heights, with bands that hold 90 % where there are standard deviations."""
-    span, drawn = meridian.h[-1] - meridian.h[0], _banded(meridian, quantity)
-    for share, colour in zip(HEIGHTS, (COLOURS["blue"], COLOURS["orange"], COLOURS["green"]), strict=True):
+    """Draw a quantity over r at three heights, with bands of 90 % where it has standard deviations."""
+    span, curves = meridian.h[-1] - meridian.h[0], _banded(meridian, quantity)
+    for share, colour in zip(PROFILE_HEIGHTS, (COLOURS["blue"], COLOURS["orange"], COLOURS["green"]), strict=True):
         height = meridian.h[0] + share * span
-        lines = {name: drawn.profile(name, height) for name in drawn.quantities}
-        axes.plot(meridian.r, lines["line"], color=colour, lw=1, label=f"h = {height:z.1f} mm")
-        if "low" in lines:
-            axes.fill_between(meridian.r, lines["low"], lines["high"], color=colour, alpha=0.25, lw=0)
-    axes.set_xlabel("r [mm]")
-    axes.set_ylabel(label_of(quantity))
+        profiles = {name: curves.profile(name, height) for name in curves.quantities}
+        _draw(axes, meridian.r, profiles, colour, f"h = {height:z.1f} mm")
+    axes.set(xlabel="r [mm]", ylabel=label_of(quantity))
     axes.legend(frameon=False)
     return axes
 
 
 def draw_centre_line(axes: Axes, meridian: Meridian, quantity: str) -> Axes:
-    """Draw a quantity over h at r = 0, with a band that holds 90 % where there are standard deviations."""
-    middle = int(np.abs(meridian.r).argmin())
-    lines = {name: values[:, middle] for name, values in _banded(meridian, quantity).quantities.items()}
-    axes.plot(meridian.h, lines["line"], color=COLOURS["blue"], lw=1)
-    if "low" in lines:
-        axes.fill_between(meridian.h, lines["low"], lines["high"], color=COLOURS["blue"], alpha=0.25, lw=0)
-    axes.set_xlabel("h [mm]")
-    where = "on the axis" if meridian.axial else f"at r = {meridian.r[middle]:z.1f} mm"
-    axes.set_ylabel(f"{label_of(quantity)} {where}")
+    """Draw a quantity over h at r = 0, with a band of 90 % where it has standard deviations."""
+    centre = int(np.abs(meridian.r).argmin())
+    curves = _banded(meridian, quantity).quantities
+    _draw(axes, meridian.h, {name: values[:, centre] for name, values in curves.items()}, COLOURS["blue"])
+    where = "on the axis" if meridian.axial else f"at r = {meridian.r[centre]:z.1f} mm"
+    axes.set(xlabel="h [mm]", ylabel=f"{label_of(quantity)} {where}")
     return axes

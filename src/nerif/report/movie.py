@@ -1,4 +1,4 @@
-"""Movies of volumes over time, drawn off-screen: an isosurface or slices, with box, time and colour bar."""
+"""Movies of a sequence of volumes, rendered off-screen: an isosurface or slices, with box, time and colour bar."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ MASKED, GREY = "masked", "#BEBEBE"
 
 @dataclass(frozen=True)
 class Movie:
-    """How a movie looks.
+    """Settings of a movie.
 
     Parameters
     ----------
-    style : isosurface or slices (three, through the middle of the box)
-    quantity : shown; nothing for density or, of what is no index, the field
-    level : of the isosurface, in the unit shown; None for halfway between the ambient and what is farthest from it
+    style : isosurface or slices (three, through the centre of the box)
+    quantity : drawn; "" for density or, of another field than the index, the field
+    level : of the isosurface, in the unit shown; None for halfway between the ambient and the extreme
     size : width and height, px
-    azimuth, elevation : of the eye, degrees
+    azimuth, elevation : of the viewpoint, degrees
     frames_per_second : of the movie
     """
 
@@ -56,79 +56,67 @@ class Movie:
             raise InputError(f"expected a positive number, got {self.frames_per_second}", field="frames_per_second")
 
     def quantity_of(self, store: VolumeSequence) -> str:
-        """Return what is shown of a store.
-
-        Raises
-        ------
-        InputError
-            If it is not there.
-        """
+        """Return the quantity that is drawn of a store."""
         default = "density" if "density" in store.quantities else field_of(store.quantities)
-        chosen = self.quantity or default
-        if chosen is None or chosen not in store.quantities:
+        quantity = self.quantity or default
+        if quantity is None or quantity not in store.quantities:
             raise InputError(
-                f"expected one of {', '.join(store.quantities)}, got '{chosen or 'none'}'", field="quantity"
+                f"expected one of {', '.join(store.quantities)}, got '{quantity or 'none'}'", field="quantity"
             )
-        return chosen
+        return quantity
 
     def images(self, store: VolumeSequence, frames: Sequence[int]) -> Iterator[np.ndarray]:
-        """Draw the frames one after the other: (row, column, 3) of 8 bit. The colours are those of the whole movie."""
+        """Draw the frames, (row, column, 3) of 8 bit, on one colour scale."""
         quantity = self.quantity_of(store)
-        limits, found = ranges_over_time(store, quantity, frames)
-        level = found if self.level is None else self.level
-        for i, instant in zip(frames, instants([store.times[i] for i in frames]), strict=True):
-            volume = store.volume(i, quantity)
-            yield self._image(volume, f"t = {instant}", limits, level)
+        limits, level = ranges_over_time(store, quantity, frames)
+        level = level if self.level is None else self.level
+        for i, time in zip(frames, instants([store.times[i] for i in frames]), strict=True):
+            yield self._image(store.volume(i, quantity), f"t = {time}", limits, level)
 
     def _image(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
         import pyvista as pv
         from vtkmodules.vtkCommonCore import vtkLogger
 
-        # VTK looks for a display first, warns that there is none, and draws without
-        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-
+        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # VTK warns that there is no display
         label, unit = _plain(volume.quantity)
         name = f"{label} [{unit}]"
         grid = _points(volume, name)
         plotter = pv.Plotter(off_screen=True, window_size=list(self.size))
         try:
             plotter.set_background("white")
-            colour_map = COLOUR_MAPS.get(volume.quantity, SEQUENTIAL)
             if self.style == "slices":
                 bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.2g", "n_labels": 4}
                 bar |= {"position_x": 0.86, "position_y": 0.15, "width": 0.06, "height": 0.5}
                 x, y, z = volume.grid.box.centre
-                slices = grid.slice_orthogonal(x=x, y=y, z=z)
                 plotter.add_mesh(
-                    slices, scalars=name, clim=limits, cmap=colour_map, scalar_bar_args=bar, lighting=False,
+                    grid.slice_orthogonal(x=x, y=y, z=z), scalars=name, clim=limits,
+                    cmap=COLOUR_MAPS.get(volume.quantity, SEQUENTIAL), scalar_bar_args=bar, lighting=False,
                     nan_color=GREY,
                 )  # fmt: skip
             else:
-                surface, hidden = _surfaces(grid, name, level)
+                surface, masked = _surfaces(grid, name, level)
                 if surface.n_points:
                     plotter.add_mesh(surface, color="#E69F00", smooth_shading=True, ambient=0.25)
                     plotter.add_text(f"{label} = {level:.4g} {'' if unit == '1' else unit}", **_text("lower_left"))
-                if hidden.n_points:
-                    plotter.add_mesh(hidden, color=GREY, opacity=0.35)
+                if masked.n_points:
+                    plotter.add_mesh(masked, color=GREY, opacity=0.35)
             if grid[MASKED].any():
                 plotter.add_text("grey: masked", **_text("lower_right"))
-            lower, upper = volume.grid.box.lower, volume.grid.box.upper
-            box = [end for pair in zip(lower, upper, strict=True) for end in pair]
-            plotter.add_mesh(pv.Box(bounds=box), style="wireframe", color="black", line_width=1)
+            bounds = [end for pair in zip(volume.grid.box.lower, volume.grid.box.upper, strict=True) for end in pair]
+            plotter.add_mesh(pv.Box(bounds=bounds), style="wireframe", color="black", line_width=1)
             plotter.show_bounds(
-                bounds=box, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", color="black", font_size=10,
+                bounds=bounds, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", color="black", font_size=10,
                 location="outer", ticks="outside",
             )  # fmt: skip
             plotter.add_text(text, **_text("upper_left"))
             plotter.camera.focal_point = volume.grid.box.centre
-            plotter.camera.position = self._eye(volume)
+            plotter.camera.position = self._viewpoint(volume)
             plotter.camera.up = (0.0, 0.0, 1.0)
             return np.ascontiguousarray(plotter.screenshot(return_img=True)[..., :3])
         finally:
             plotter.close()
 
-    def _eye(self, volume: Volume) -> tuple[float, float, float]:
-        """Where the eye is, mm."""
+    def _viewpoint(self, volume: Volume) -> tuple[float, float, float]:
         azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
         direction = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -137,29 +125,21 @@ class Movie:
         return float(x), float(y), float(z)
 
     def write(
-        self,
-        path: Path,
-        store: VolumeSequence,
-        frames: Sequence[int],
+        self, path: Path, store: VolumeSequence, frames: Sequence[int],
         on_frame: Callable[[int], None] = lambda done: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Write the movie, atomically.
 
         Parameters
         ----------
         path : .mp4 (H.264) or .gif
-        frames : of the store, those that are there
-        on_frame : told how many are drawn
-
-        Raises
-        ------
-        InputError
-            If the ending is another, no frame is there, or a library is missing.
+        frames : available frames of the store
+        on_frame : called with the number of finished frames
         """
         if path.suffix not in FORMATS:
             raise InputError(f"expected a name ending in {' or '.join(FORMATS)}, got '{path.name}'", field="out")
         if not len(frames):
-            raise InputError("no frame of it is there yet", field=store.path)
+            raise InputError("expected at least one finished frame, got none", field=store.path)
         self.quantity_of(store)
         with atomic(path) as part, _writer(part, self.frames_per_second) as writer:
             for done, image in enumerate(self.images(store, frames), start=1):
@@ -168,7 +148,7 @@ class Movie:
 
 
 def instants(times: Sequence[float]) -> list[str]:
-    """Return instants (s) in ms, with three decimals or as many as resolve the shortest time between them."""
+    """Return times (s) in ms, with at least three decimals, and as many as resolve their shortest interval."""
     steps = np.diff(np.unique(times)) * 1e3
     decimals = max(3, 1 - int(np.floor(np.log10(steps.min())))) if len(steps) else 3
     return [f"{time * 1e3:.{decimals}f} ms" for time in times]
@@ -177,37 +157,34 @@ def instants(times: Sequence[float]) -> list[str]:
 def ranges_over_time(
     store: VolumeSequence, quantity: str, frames: Sequence[int]
 ) -> tuple[tuple[float, float], float]:  # fmt: skip
-    """Return the ends of the colours and the level of an isosurface for all of the frames, found from some of them."""
-    some = [store.volume(i, quantity) for i in frames[:: max(1, len(frames) // 8)]]
-    ends = [colour_range(shown(v)) for v in some]
+    """Return colour range and isosurface level for all frames, from a sample of about eight."""
+    sample = [store.volume(i, quantity) for i in frames[:: max(1, len(frames) // 8)]]
+    ends = [colour_range(shown(v)) for v in sample]
     limits = min(low for low, _ in ends), max(high for _, high in ends)
-    return limits, float(np.median([default_level(v) for v in some]))
+    return limits, float(np.median([default_level(v) for v in sample]))
 
 
 def frames_there(store: VolumeSequence) -> list[int]:
-    """Return the frames that can be shown: all of a store without status, else those done."""
+    """Return the available frames: all of a store without status, else the finished ones."""
     if "status" not in store.group:
         return list(range(len(store)))
     return [int(i) for i in np.flatnonzero(np.asarray(store.array("status")[:]) == 1)]
 
 
 def _points(volume: Volume, name: str) -> Any:
-    """Voxel centres with the values shown, NaN where masked, and 1 there and 0 elsewhere under MASKED."""
+    """Voxel centres with the values shown, NaN where masked, and the mask as 1 and 0 under MASKED."""
     import pyvista as pv
 
     values = shown(volume)
-    grid = pv.ImageData(
-        dimensions=volume.grid.shape[::-1],
-        spacing=volume.grid.spacing,
-        origin=[float(volume.grid.axis(a)[0]) for a in "xyz"],
-    )
+    origin = [float(volume.grid.axis(a)[0]) for a in "xyz"]
+    grid = pv.ImageData(dimensions=volume.grid.shape[::-1], spacing=volume.grid.spacing, origin=origin)
     grid[name] = values.ravel()
     grid[MASKED] = (~np.isfinite(values)).astype(np.float32).ravel()
     return grid
 
 
 def _surfaces(grid: Any, name: str, level: float) -> tuple[Any, Any]:
-    """The surface of `level` where the values are known, and the surface of what is masked."""
+    """The isosurface outside of the mask, and the surface of the mask."""
     whole = grid.copy()
     whole[name] = filled(grid[name].reshape(grid.dimensions[::-1])).ravel()
     surface = whole.contour([level], scalars=name)
@@ -226,14 +203,14 @@ def _writer(path: Path, frames_per_second: float) -> Any:
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
         raise InputError(f"{error.name} is not installed; {install('movie')}", field="movie") from None
-    # yuv420p is what browsers and slides play
+    # browsers and slides play yuv420p
     return imageio.get_writer(
         path, fps=frames_per_second, codec="libx264", quality=8, pixelformat="yuv420p", macro_block_size=2
     )
 
 
 def _plain(quantity: str) -> tuple[str, str]:
-    """Name and unit for a renderer that knows no mathematics."""
+    """Name and unit without mathematics, for VTK."""
     name, unit = LABELS.get(quantity, (quantity, "1"))
     plain = str.maketrans("⁻¹²³", "-123")
     return name.replace("n$_{ambient}$", "n_ambient"), re.sub("[⁻¹²³]+", lambda m: f"^{m[0].translate(plain)}", unit)

@@ -1,8 +1,7 @@
-"""Volumes packed small enough to travel inside a page: 16 bit, differences along x, bytes apart, deflated, base64.
+"""Volumes packed into a page: 16 bit, differences along x, low and high bytes apart, deflated, base64.
 
-The page holds the reconstructed field once; n, density and temperature are simple functions of an index excess
-(`relation`), so that three quantities take the room of one. What stands beside it (spread, error) has 12 bits. 65535
-stands for a masked voxel.
+The page contains the reconstructed field once; n, density and temperature are functions of an index excess
+(`relation`). Standard deviation and error have 12 bits. 65535 is a masked voxel.
 """
 
 from __future__ import annotations
@@ -20,55 +19,53 @@ from nerif.geometry import Grid
 from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE
 
-__all__ = ["COARSE", "FINE", "LARGEST", "MASKED", "coarsen", "pack", "relation"]
+__all__ = ["COARSE", "FINE", "MASKED", "MAX_VOXELS", "coarsen", "pack", "relation"]
 
-LARGEST = 128  # voxels along the longest edge; finer volumes are averaged down, and the page says so
+MAX_VOXELS = 128  # along the longest edge; finer volumes are averaged, as the page says
 MASKED = 65535
-FINE, COARSE = 65534, 4095
+FINE, COARSE = 65534, 4095  # levels
 
 
 def relation(quantity: str, attributes: dict[str, float | str]) -> dict[str, Any]:
     """Return how n - 1, density or temperature q follow from the index excess x, by the attributes of the file.
 
-    Any other field x is shown as it is: q = x.
-
         linear: q = (x + offset) factor,      reciprocal: q = factor / (x + offset)
 
-    With a `lower` (None for no bound) q is masked unless x + offset > 0, with an `upper` unless lower <= q <= upper.
+    With a `lower` (or None) q is masked unless x + offset > 0, with an `upper` unless lower <= q <= upper. Other
+    quantities are shown unchanged.
     """
-    found: dict[str, Any] = {"kind": "linear", "offset": 0.0, "factor": 1.0, "lower": None, "upper": None}
+    identity: dict[str, Any] = {"kind": "linear", "offset": 0.0, "factor": 1.0, "lower": None, "upper": None}
     if quantity not in quantities_of(INDEX):
-        return found
-    found["offset"] = float(attributes["n_ambient"]) - 1
+        return identity
+    of_index = {**identity, "offset": float(attributes["n_ambient"]) - 1}
     if quantity == "n":
-        return found
+        return of_index
     k = float(attributes["gladstone_dale_m3_kg-1"])
     if quantity == "density":
-        return {**found, "factor": 1 / k, "lower": 0.0}
+        return {**of_index, "factor": 1 / k, "lower": 0.0}
     pressure, mass = float(attributes["pressure_pa"]), float(attributes["molar_mass_kg_mol-1"])
     low, high = TEMPERATURE_RANGE
     factor = pressure * mass * k / GAS_CONSTANT
-    return {**found, "kind": "reciprocal", "factor": factor, "lower": low, "upper": high}
+    return {**of_index, "kind": "reciprocal", "factor": factor, "lower": low, "upper": high}
 
 
-def coarsen(volume: Volume, largest: int = LARGEST) -> Volume:
-    """Average a volume down until no edge has more than `largest` voxels."""
-    if max(volume.grid.shape) <= largest:
+def coarsen(volume: Volume, max_voxels: int = MAX_VOXELS) -> Volume:
+    """Average a volume until no edge has more than `max_voxels` voxels."""
+    if max(volume.grid.shape) <= max_voxels:
         return volume
-    nz, ny, nx = (max(1, round(n * largest / max(volume.grid.shape))) for n in volume.grid.shape)
+    nz, ny, nx = (max(1, round(n * max_voxels / max(volume.grid.shape))) for n in volume.grid.shape)
     grid = Grid(volume.grid.box, (nz, ny, nx))
     values = torch.nn.functional.adaptive_avg_pool3d(volume.values.float()[None, None], grid.shape)[0, 0]
     return Volume(values, grid, volume.quantity, volume.unit, volume.attributes, volume.notes)
 
 
 def pack(values: Float[np.ndarray, "z y x"], levels: int = FINE) -> dict[str, Any]:
-    """Return the values as text, and what is needed to read it: x = low + code step."""
-    known = np.isfinite(values)
-    low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 1.0)
+    """Return the values as text, with `low` and `step`: x = low + code step."""
+    valid = np.isfinite(values)
+    low, high = (float(values[valid].min()), float(values[valid].max())) if valid.any() else (0.0, 1.0)
     span = high - low or 1.0
-    codes = np.where(known, np.round((np.nan_to_num(values) - low) / span * levels), MASKED).astype("<u2")
-    flat = codes.ravel()
-    steps = np.diff(flat, prepend=flat.dtype.type(0))  # modulo 65536: small where the field is smooth
+    codes = np.where(valid, np.round((np.nan_to_num(values) - low) / span * levels), MASKED).astype("<u2").ravel()
+    steps = np.diff(codes, prepend=codes.dtype.type(0))  # modulo 65536; small in a smooth field
     data = np.concatenate([(steps & 255).astype(np.uint8), (steps >> 8).astype(np.uint8)])
     text = base64.b64encode(zlib.compress(data.tobytes(), 6)).decode()
     return {"low": low, "step": span / levels, "text": text}

@@ -1,4 +1,4 @@
-"""What the pages draw their own images from: grids, quantities and colours as JSON, and packed arrays beside it."""
+"""The scene of a page, which its scripts draw: grids, quantities and colours as JSON, and packed arrays."""
 
 from __future__ import annotations
 
@@ -23,37 +23,38 @@ from nerif.results.directory import Result
 
 __all__ = ["scene_of", "scene_over_time"]
 
-LARGEST = 48  # voxels of a sequence along the longest edge: its page holds dozens of volumes
+MAX_FRAME_VOXELS = 48  # along the longest edge; the page of a sequence has dozens of volumes
 
 
 def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
-    """Return what the page of a result draws from: grid, quantities, cameras; and the packed arrays by name."""
-    whole = result.field
-    if whole is None or (whole.quantity == INDEX and whole.n_ambient is None):
+    """Return the scene of a result, and its packed arrays by name."""
+    field, quantities = result.field, drawn_of(result.volumes)
+    if field is None or (field.quantity == INDEX and field.n_ambient is None) or not quantities:
         return None, {}
-    small = packing.coarsen(whole)
+    small = packing.coarsen(field)
     sources: dict[str, Volume] = {"value": small}
     error = error_of(result)
     if error is not None:
         sources["error"] = packing.coarsen(error)
-    if f"{whole.quantity}_std" in result.volumes:
-        sources["std"] = packing.coarsen(result.volumes[f"{whole.quantity}_std"])
+    if f"{field.quantity}_std" in result.volumes:
+        sources["std"] = packing.coarsen(result.volumes[f"{field.quantity}_std"])
     for quantity in ("density", "temperature"):
-        volume = result.volumes.get(f"{quantity}_std")
-        if volume is not None and _own(quantity, volume):
-            sources[volume.quantity] = packing.coarsen(volume)
+        std = result.volumes.get(f"{quantity}_std")
+        # others are a linear function of that of the excess
+        if std is not None and (quantity == "temperature" or not bool(torch.isfinite(std.values).all())):
+            sources[std.quantity] = packing.coarsen(std)
     packed = {
         name: packing.pack(volume.values.double().numpy(), packing.FINE if name == "value" else packing.COARSE)
         for name, volume in sources.items()
     }
-    quantities = {
-        name: _quantity(name, result.volumes[name], default_level(result.volumes[name]))
-        for name in drawn_of(result.volumes)
-    }
-    if not quantities:
-        return None, {}
+    variants = {"value": "Reconstruction"}
+    if "std" in sources:
+        variants["std"] = "Standard deviation"
+    if "error" in sources:
+        variants |= {"truth": "Truth", "error": "Error"}
+    entries = {q: _quantity(q, result.volumes[q], default_level(result.volumes[q])) for q in quantities}
     scene = {
-        **_scene(small.grid, whole.grid, quantities, _variants(sources), (DIVERGING, "cividis")),
+        **_scene(small.grid, field.grid, entries, variants, (DIVERGING, "cividis")),
         "arrays": {name: {"low": p["low"], "step": p["step"]} for name, p in packed.items()},
         "cameras": _cameras(result),
         "backgrounds": result.measurement is not None and any(c.background for c in result.measurement.cameras),
@@ -61,27 +62,27 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     return scene, {name: p["text"] for name, p in packed.items()}
 
 
-def scene_over_time(store: VolumeSequence, chosen: list[int]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return what the page of a sequence draws from, of the frames chosen; and the packed volumes by name."""
+def scene_over_time(store: VolumeSequence, frames: list[int]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the scene of some frames of a sequence, and the packed volumes by name."""
     field = field_of(store.quantities)
-    assert field is not None, "there is a field to show"
-    small = [packing.coarsen(store.volume(i, field), LARGEST) for i in chosen]
+    assert field is not None, "a sequence with a field"
+    small = [packing.coarsen(store.volume(i, field), MAX_FRAME_VOXELS) for i in frames]
     packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
     gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
     quantities = {}
-    follows = drawn_of(quantities_of(field))
-    for name in follows if gas is not None else follows[:1]:
-        some = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
-        ends = [colour_range(shown(v)) for v in some]
+    names = drawn_of(quantities_of(field))
+    for name in names if gas is not None else names[:1]:
+        sample = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
+        ends = [colour_range(shown(v)) for v in sample]
         quantities[name] = {
-            **_quantity(name, some[0], float(np.median([default_level(v) for v in some]))),
+            **_quantity(name, sample[0], float(np.median([default_level(v) for v in sample]))),
             "range": [min(e[0] for e in ends), max(e[1] for e in ends)],
         }
     scales = [{"low": p["low"], "step": p["step"]} for p in packed]
     scene = {
         **_scene(small[0].grid, store.grid, quantities, {"value": "Reconstruction"}),
         "arrays": {"value": scales[0]},
-        "frames": [{"index": i, "time": store.times[i], **s} for i, s in zip(chosen, scales, strict=True)],
+        "frames": [{"index": i, "time": store.times[i], **s} for i, s in zip(frames, scales, strict=True)],
         "cameras": [],
     }
     arrays = {"value": packed[0]["text"]}
@@ -89,7 +90,7 @@ def scene_over_time(store: VolumeSequence, chosen: list[int]) -> tuple[dict[str,
 
 
 def _quantity(name: str, volume: Volume, level: float) -> dict[str, Any]:
-    """How a quantity is called and coloured, and follows from the reconstructed field; `level` of its isosurface."""
+    """Labels and colours of a quantity, its relation to the field, and the level of its isosurface."""
     label, unit = LABELS.get(name, (name, volume.unit))
     return {
         "button": name_of(name).capitalize(),
@@ -104,7 +105,7 @@ def _quantity(name: str, volume: Volume, level: float) -> dict[str, Any]:
 def _scene(
     small: Grid, full: Grid, quantities: dict[str, dict[str, Any]], variants: dict[str, str], more: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """What every scene has: grids, quantities, what can be switched to, and colours, `more` beside the quantities'."""
+    """What all scenes have; `more` are colour maps beside those of the quantities."""
     maps = sorted({q["colours"] for q in quantities.values()} | {*more})
     return {
         "shape": small.shape,
@@ -118,31 +119,16 @@ def _scene(
     }
 
 
-def _own(quantity: str, volume: Volume) -> bool:
-    """Whether a statistic has to be packed for itself: it is no linear function of the excess, or masked somewhere."""
-    return quantity == "temperature" or not bool(torch.isfinite(volume.values).all())
-
-
-def _variants(sources: dict[str, Volume]) -> dict[str, str]:
-    """What can be switched to, and its button."""
-    found = {"value": "Reconstruction"}
-    if "std" in sources:
-        found["std"] = "Standard deviation"
-    if "error" in sources:
-        found |= {"truth": "Truth", "error": "Error"}
-    return found
-
-
 def _cameras(result: Result) -> list[dict[str, Any]]:
-    """The lines to the corners of the image, from where to draw them to the background, of every camera; mm."""
+    """The lines of sight of the image corners of every camera, mm."""
     if result.measurement is None:
         return []
     withheld = () if result.reprojection is None else result.reprojection.withheld
-    found = []
-    middle = np.array(result.measurement.box.centre)
+    centre = np.array(result.measurement.box.centre)
+    cameras = []
     for camera in result.measurement.cameras:
-        corners = image_corners(camera, middle)
-        found.append(
+        corners = image_corners(camera, centre)
+        cameras.append(
             {
                 "name": camera.name,
                 "withheld": camera.name in withheld,
@@ -152,4 +138,4 @@ def _cameras(result: Result) -> list[dict[str, Any]]:
                 "ends": np.round(corners.end, 3).tolist(),
             }
         )
-    return found
+    return cameras

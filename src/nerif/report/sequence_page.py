@@ -1,4 +1,4 @@
-"""`report.html` of a sequence: the page of a single result, with a slider for time and how the frames went."""
+"""`report.html` of a sequence: the page of a result with a time slider, and the fit of all frames."""
 
 from __future__ import annotations
 
@@ -24,135 +24,116 @@ if TYPE_CHECKING:
 
 __all__ = ["render_sequence"]
 
-MOST = 60  # frames on the page
+MAX_FRAMES = 60  # on the page
 
 
 def render_sequence(store: VolumeSequence) -> str:
-    """Return the page of a sequence, finished or not.
-
-    Raises
-    ------
-    InputError
-        If no frame of it is there, or it holds no reconstructed field.
-    """
-    there = frames_there(store)
-    if not there:
-        raise InputError("no frame of it is done yet; run nerif sequence again", field=store.path)
-    found = field_of(store.quantities)
-    if found is None:
+    """Return the page of a sequence, complete or not."""
+    frames = frames_there(store)
+    if not frames:
+        raise InputError("expected at least one finished frame, got none; run nerif sequence again", field=store.path)
+    field = field_of(store.quantities)
+    if field is None:
         raise InputError(
             f"expected index_excess among its quantities, got {', '.join(store.quantities)}", field=store.path
         )
-    chosen = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST)).round().astype(int))]
-    scene, arrays = scene_over_time(store, chosen)
-    statements = _statements(store)
-    measured = store.attributes.get("measurement")
-    techniques = [technique(name) for name in store.attributes.get("techniques", ())]
-    kinds = techniques or [technique_of(found)]
+    places = np.linspace(0, len(frames) - 1, min(len(frames), MAX_FRAMES)).round().astype(int)
+    sample = [frames[i] for i in np.unique(places)]
+    scene, arrays = scene_over_time(store, sample)
+    about = store.attributes
+    measurement = about.get("measurement")
+    kinds = [technique(name) for name in about.get("techniques", ())] or [technique_of(field)]
+    missing = len(store) - len(frames)
+    complete = Statement("good", f"All {len(store)} frames are available.")
+    incomplete = Statement("warning", f"{missing} of {len(store)} frames are missing; see below.")
     return render_page(
         kind=" and ".join(kind.tomography for kind in kinds),
         title=store.path.resolve().name,
-        source=Path(str(measured)).name if measured else "",
-        headline=_headline(store, there),
-        statements=statements,
-        cards=(("The frames", _frames(store, there)), ("The fit", _fit(store, there))),
+        source=Path(str(measurement)).name if measurement else "",
+        headline=incomplete if missing else complete,
+        statements=_statements(store),
+        cards=(("Frames", _frame_rows(store, frames)), ("Fit", _fit_rows(store, frames))),
         scene=scene,
         arrays=arrays,
-        curves=_curves(store, there),
-        settings=flat({k: v for k, v in store.attributes.items() if k not in ("settings", "network", "references")})
-        + flat(store.attributes.get("settings", {})),
-        shown_of=(len(chosen), len(there)),
+        curves=_curves(store, frames),
+        settings=flat({k: v for k, v in about.items() if k not in ("settings", "network", "references")})
+        + flat(about.get("settings", {})),
+        shown_of=(len(sample), len(frames)),
     )
 
 
 def _statements(store: VolumeSequence) -> list[Statement]:
-    """What to know before looking."""
     if "status" not in store.group:
-        return [Statement("note", "These are volumes that were simulated or imported, not reconstructed.")]
+        return [Statement("note", "These volumes were simulated or imported, not reconstructed.")]
     status = np.asarray(store.array("status")[:])
-    found = []
+    remarks = []
     missing, failed = int((status == 0).sum()), np.flatnonzero(status == 2)
     if missing:
-        found.append(
-            Statement("warning", f"{missing} of {len(status)} frames are missing; the same command again does them.")
-        )
+        text = f"{missing} of {len(status)} frames are missing; the same command again reconstructs them."
+        remarks.append(Statement("warning", text))
     if len(failed):
-        reasons = [str(r) for r in store.array("reason")[:]]
-        first = f"frame {failed[0]}: {reasons[failed[0]]}"
-        found.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
-    held = set(store.attributes.get("withhold", ()))
-    if not held:
-        found.append(Statement("note", "No view was held out, so nothing here is a test on unseen data."))
-    return found
+        first = f"frame {failed[0]}: {store.array('reason')[:][failed[0]]}"
+        remarks.append(Statement("warning", f"{len(failed)} frame{'s' * (len(failed) > 1)} failed, {first}"))
+    if not store.attributes.get("withhold", ()):
+        remarks.append(Statement("note", "No view was withheld, so the fields are not validated on independent data."))
+    return remarks
 
 
-def _headline(store: VolumeSequence, there: list[int]) -> Statement:
-    """The sum of it."""
-    if len(there) < len(store):
-        return Statement("warning", f"{len(store) - len(there)} of {len(store)} frames are missing; see below.")
-    return Statement("good", f"All {len(store)} frames are there.")
-
-
-def _frames(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
+def _frame_rows(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
     times = store.times
     rows = [
-        ("Frames", f"{len(there)} of {len(store)}"),
-        ("From, to", f"{number(times[0] * 1e3, 4)} to {number(times[-1] * 1e3, 4)} ms"),
+        ("Frames", f"{len(frames)} of {len(store)}"),
+        ("Time", f"{number(times[0] * 1e3, 4)} to {number(times[-1] * 1e3, 4)} ms"),
     ]
     if len(times) > 1:
-        rows.append(("Frames a second", number((len(times) - 1) / (times[-1] - times[0]), 4)))
-    rows.append(("Voxels", " × ".join(str(n) for n in store.grid.shape[::-1])))
-    return rows
+        rows.append(("Frames per second", number((len(times) - 1) / (times[-1] - times[0]), 4)))
+    return [*rows, ("Voxels", " × ".join(str(n) for n in store.grid.shape[::-1]))]
 
 
-def _fit(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
+def _fit_rows(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
     scores = store.view_scores
     if not scores:
-        return [("Truth", "volumes as they are")]
-    held = np.array([v in store.attributes.get("withhold", ()) for v in store.attributes["views"]])
+        return [("Truth", "volumes as stored")]
+    withheld = np.array([v in store.attributes.get("withhold", ()) for v in store.attributes["views"]])
     rows = []
-    for (name, which), of in itertools.product((("Training views", ~held), ("Held-out views", held)), scores):
-        cc, rms = (np.asarray(array[:])[there][:, which] for array in (of.cc, of.rms))
+    groups = (("Training views", ~withheld), ("Withheld views", withheld))
+    for (name, group), of in itertools.product(groups, scores):
+        cc, rms = (np.asarray(array[:])[frames][:, group] for array in (of.cc, of.rms))
         if np.isfinite(rms).any():
             least, most = number(float(np.nanmin(cc)), 4), number(float(np.nanmax(rms)), 3)
-            said = f"CC at least {least}, rms error at most {with_unit(most, of.technique.unit)}"
-            rows.append((name + _of(of, scores), said))
-    seconds = np.asarray(store.array("seconds")[:])[there]
-    rows.append(("Time for a frame", f"{number(float(np.median(seconds)), 3)} s (median)"))
-    return rows
+            text = f"CC at least {least}, rms error at most {with_unit(most, of.technique.unit)}"
+            rows.append((name + _suffix(of, scores), text))
+    seconds = np.asarray(store.array("seconds")[:])[frames]
+    return [*rows, ("Time per frame", f"{number(float(np.median(seconds)), 3)} s (median)")]
 
 
-def _curves(store: VolumeSequence, there: list[int]) -> list[tuple[str, str]]:
-    """How the frames went, over time."""
+def _curves(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
+    """Residuals and computing time over time."""
     scores = store.view_scores
     if not scores:
         return []
-    times = np.array(store.times)[there] * 1e3
-    names, held = store.attributes["views"], store.attributes.get("withhold", ())
-    seconds = np.asarray(store.array("seconds")[:])[there]
+    times = np.array(store.times)[frames] * 1e3
+    names, withheld = store.attributes["views"], store.attributes.get("withhold", ())
+    seconds = np.asarray(store.array("seconds")[:])[frames]
 
     def draw_rms(of: ViewScores, axes: Axes) -> None:
-        rms = np.asarray(of.rms[:])[there]
+        rms = np.asarray(of.rms[:])[frames]
         for i, name in enumerate(names):
-            if not np.isfinite(rms[:, i]).any():
-                continue
-            out = name in held
-            axes.plot(times, rms[:, i], lw=1.2, ls="--" if out else "-", label=f"{name} (held out)" if out else name)
-        axes.set_xlabel("time [ms]")
-        axes.set_ylabel(f"rms difference from the measurement [{of.technique.unit}]")
+            if np.isfinite(rms[:, i]).any():
+                style, label = ("--", f"{name} (withheld)") if name in withheld else ("-", name)
+                axes.plot(times, rms[:, i], lw=1.2, ls=style, label=label)
+        axes.set(xlabel="time [ms]", ylabel=f"rms difference from the measurement [{of.technique.unit}]")
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=7, ncols=2)
 
     def draw_seconds(axes: Axes) -> None:
         axes.plot(times, seconds, ".", color="#0072B2")
-        axes.set_xlabel("time [ms]")
-        axes.set_ylabel("spent on the frame [s]")
+        axes.set(xlabel="time [ms]", ylabel="computing time [s]")
         axes.set_ylim(bottom=0)
 
-    views = [(f"Every view over time{_of(of, scores)}", svg(partial(draw_rms, of))) for of in scores]
-    return [*views, ("Time spent on each frame", svg(draw_seconds))]
+    views = [(f"Every view over time{_suffix(of, scores)}", svg(partial(draw_rms, of))) for of in scores]
+    return [*views, ("Computing time of each frame", svg(draw_seconds))]
 
 
-def _of(one: ViewScores, scores: list[ViewScores]) -> str:
-    """What is measured, where that has to be said."""
+def _suffix(one: ViewScores, scores: list[ViewScores]) -> str:
     return f", {one.technique.measured}" if len(scores) > 1 else ""

@@ -1,4 +1,4 @@
-"""Slices of a volume as small images for a page, at any voxel along an axis."""
+"""Slices of a volume, and colour bars, as small images for a page."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ __all__ = ["bar_image", "colours_of", "slice_aspect", "slice_image"]
 
 
 def colours_of(quantity: str) -> str:
-    """Return the colour map that a quantity is drawn in."""
+    """Return the colour map of a quantity."""
     return COLOUR_MAPS.get(quantity.partition("_")[0], SEQUENTIAL)
 
 
 def slice_image(volume: Volume, normal: str, index: int, limits: tuple[float, float], colours: str) -> str:
-    """Return the slice across an axis as a PNG in a data address, a pixel a voxel, masked voxels grey.
+    """Return a slice as a PNG in a data address, one pixel per voxel, masked voxels grey.
 
     Parameters
     ----------
-    normal : axis across which it is cut: x, y or z
+    normal : x, y or z
     index : of the voxel along it
-    limits : ends of the colours, as values are shown (drawing.shown)
+    limits : ends of the colours, of values as shown (drawing.shown)
     colours : name of a Matplotlib colour map
     """
     axis = "zyx".index(normal)
     index = min(max(index, 0), volume.grid.shape[axis] - 1)
     plane = np.take(volume.values.numpy(), index, axis=axis)
-    if volume.quantity == "n":  # as drawing.shown has it
+    if volume.quantity == "n":
         plane = plane.astype(np.float64) - 1
     return image_address(plane[::-1], limits, colours)
 

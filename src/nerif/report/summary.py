@@ -1,7 +1,8 @@
-"""The first screen of a report: what was measured, what came out, can it be trusted."""
+"""The first screen of a report: the measurement, the reconstruction and its accuracy."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from nerif.analysis.evaluation import rms_text
 from nerif.analysis.residuals import CAUSES
-from nerif.analysis.verdict import verdict
+from nerif.analysis.verdict import correlated_share, verdict
 from nerif.common.conventions import with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
@@ -17,40 +18,43 @@ from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.plotting.drawing import LABELS, drawn_of, shown
 from nerif.plotting.notebook import number, percent, span
 from nerif.reconstruction.files import FIELD
-from nerif.reconstruction.rig.refined import moved_lines
+from nerif.reconstruction.rig.parameters import moved_lines
 from nerif.report.packing import relation
 from nerif.results.directory import METRICS, VOLUME, Result
 
-__all__ = ["Statement", "came_out", "headline", "looked", "measured", "repeated", "trust", "trust_figures"]
+__all__ = [
+    "Statement", "accuracy_rows", "cross_validated", "field_rows", "headline", "measurement_rows", "statements",
+]  # fmt: skip
 
-VITAL = (FIELD, METRICS, VOLUME)
-"""Without these nothing can be said of a result; without the others less can be shown."""
-
+VITAL = (FIELD, METRICS, VOLUME)  # without these there is no verdict
 LEVELS = ("good", "note", "warning", "bad")
-OF_WORD = {"use": "good", "use with care": "warning", "do not use": "bad", "cannot tell": "note"}
-WITHHELD_CC = 0.95  # a view that was not seen is predicted this well in all our simulated cases with nine views
-TRUTH_CC = 0.98, 0.9  # good and fair, of all our simulated cases
-NAMED = 4  # views
-ALIKE = 0.01  # of what is predicted: smaller leftovers, even if they are alike, move a field by less than noise does
-NOISE_BAND = 0.7, 1.4  # rms residual over sigma that noise alone explains; sigma itself is known to a factor of about 2
+LEVEL_OF_WORD = {"use": "good", "use with care": "warning", "do not use": "bad", "cannot tell": "note"}
+MIN_CC = 0.95  # of a withheld view; reached in all our simulated cases with nine views
+TRUTH_CC = 0.98, 0.9  # good and fair in our simulated cases
+MAX_NAMES = 4  # of views in a sentence
+CORRELATED = 0.01  # of the signal; smaller correlated residuals change a field less than noise does
+NOISE_RANGE = 0.7, 1.4  # rms residual over sigma that noise alone explains; sigma is uncertain by a factor of about 2
+
+View = dict[str, Any]
+Rows = list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Statement:
-    """One thing to know before trusting a result.
+    """A statement on the accuracy of a result, with the remedy where there is one.
 
     Parameters
     ----------
     level : good, note, warning or bad
-    text : one or two sentences, with the remedy where there is one
+    text : one or two sentences
     """
 
     level: str
     text: str
 
 
-def measured(result: Result) -> list[tuple[str, str]]:
-    """Return what was measured, as names and values with units."""
+def measurement_rows(result: Result) -> Rows:
+    """Return names and values of the measurement."""
     m = result.measurement
     if m is None:
         return [("Measurement", str(result.settings.get("measurement", "unknown")))]
@@ -58,8 +62,8 @@ def measured(result: Result) -> list[tuple[str, str]]:
     return m.summary(len(set(withheld) & set(m.names)))
 
 
-def came_out(result: Result) -> list[tuple[str, str]]:
-    """Return what was reconstructed: ranges of the quantities, and what they rest on."""
+def field_rows(result: Result) -> Rows:
+    """Return names and values of the reconstruction: method, ranges of the quantities, cost."""
     rows = [("Method", result.method)]
     for quantity in drawn_of(result.volumes):
         volume = result.volumes[quantity]
@@ -68,234 +72,211 @@ def came_out(result: Result) -> list[tuple[str, str]]:
         rows.append((name if quantity == "n" else name.capitalize(), span(shown(volume), unit, digits)))
     ambient = _ambient_temperature(result)
     if ambient is not None:
-        rows.append(("Ambient, implied", f"{ambient:.1f} K"))
+        rows.append(("Ambient temperature, implied", f"{ambient:.1f} K"))
     if result.volumes:
         shape = next(iter(result.volumes.values())).grid.shape
         rows.append(("Voxels", " × ".join(str(n) for n in shape[::-1]) + " (x, y, z)"))
     if result.metrics.get("seconds") is not None:
         memory = result.metrics.get("peak_memory_bytes")
-        beside = f", {memory / 2**30:.2f} GiB" if memory else ""
-        rows.append(("Time", f"{result.metrics['seconds']:.0f} s on {result.metrics.get('device', '?')}{beside}"))
+        gib = f", {memory / 2**30:.2f} GiB" if memory else ""
+        rows.append(("Time", f"{result.metrics['seconds']:.0f} s on {result.metrics.get('device', '?')}{gib}"))
     return rows
 
 
 def _ambient_temperature(result: Result) -> float | None:
-    """Temperature that n_ambient stands for under the assumptions made, K."""
+    """Temperature that corresponds to n_ambient in the assumed gas, K."""
     volume = result.volumes.get("temperature")
     if volume is None:
         return None
-    found = relation("temperature", volume.attributes)
-    return found["factor"] / found["offset"] if found["offset"] > 0 else None
+    ambient = relation("temperature", volume.attributes)
+    return ambient["factor"] / ambient["offset"] if ambient["offset"] > 0 else None
 
 
-def trust_figures(result: Result) -> list[tuple[str, str]]:
-    """Return the figures by which to trust it: held-out and training views, outcome, truth, error bars."""
-    held, seen = _views(result, True), _views(result, False)
-    rows = []
-    for title, views in (("Held-out view", held), ("Training views", seen)):
-        of = dict.fromkeys(v["measured"] for v in views)
-        for measured in of:
-            own = [v for v in views if v["measured"] == measured]
-            name = f"{title}{'s' if views is held and len(own) > 1 else ''}{f', {measured}' if len(of) > 1 else ''}"
-            noise = _largest(own, "rms_over_sigma")
-            beside = "" if noise is None else f" = {noise:.2f} σ"
-            rms = rms_text(max(own, key=lambda v: v.get("rms") or 0.0), 3)
-            worst = "" if len(own) == 1 else "at least "
-            rows.append((name, f"CC {worst}{number(_smallest(own, 'cc'), 5)}, rms error {rms}{beside}"))
-        if views is held and not views and looked(result):
-            continue
-        if not views:
-            rows.append((title, "none" if seen else "not known"))
-    for unseen in looked(result):
-        place = _place(unseen, looked(result))
-        rows.append((f"View {place}, while it was kept out", _scores(unseen)))
-        same = [v for v in seen if (v["name"], v["measured"]) == (unseen["name"], unseen["measured"])]
-        rows += [(f"View {place}, in the end", _scores(v)) for v in same]
-    for view in result.metrics.get("views_refitted") or []:
-        name = f"{view['name']}, camera refined"
-        rows.append((name, _scores(view)))
-    rig = [row for row in result.metrics.get("rig") or [] if "rms_after" in row]
+def accuracy_rows(result: Result) -> Rows:
+    """Return names and values of the accuracy: withheld and training views, outcome, truth, standard deviations."""
+    metrics, rows = result.metrics, []
+    withheld, training, first_run = _views(result, True), _views(result, False), cross_validated(result)
+    for title, views in (("Withheld view", withheld), ("Training views", training)):
+        quantities = dict.fromkeys(v["measured"] for v in views)
+        for measured in quantities:
+            group = [v for v in views if v["measured"] == measured]
+            plural = "s" if views is withheld and len(group) > 1 else ""
+            name = f"{title}{plural}{f', {measured}' if len(quantities) > 1 else ''}"
+            rows.append((name, _scores(group)))
+        if not views and not (views is withheld and first_run):
+            rows.append((title, "none" if training else "unknown"))
+    for view in first_run:
+        place = _place(view, first_run)
+        rows.append((f"View {place}, withheld from the first run", _scores([view])))
+        same = [v for v in training if (v["name"], v["measured"]) == (view["name"], view["measured"])]
+        rows += [(f"View {place}, after the whole run", _scores([v])) for v in same]
+    rows += [(f"{view['name']}, camera refined", _scores([view])) for view in metrics.get("views_refitted") or []]
+    rig = [row for row in metrics.get("rig") or [] if "rms_after" in row]
     if rig:
         before, after = (max(row[name] for row in rig) for name in ("rms_before", "rms_after"))
-        rows.append(("Worst view, as calibrated and refined", f"rms {before:.2f} σ, {after:.2f} σ"))
-    if "outcome" in result.metrics:
-        rows.append(("Outcome", str(result.metrics["outcome"]).replace("_", " ")))
-    m = result.metrics
-    if m.get("l2") is not None and m.get("l2_variation") is not None:
-        errors = f"L2 {m['l2']:.2%}"
-        if field_of(result.volumes) in (None, INDEX):  # the paper's L2 counts the ambient in
-            errors += f", of the variation {m['l2_variation']:.2%}"
-        rows.append(("Against the truth", f"{errors}; CC {number(m.get('cc'), 5)}, SSIM {number(m.get('ssim'), 4)}"))
-    repetitions = repeated(result)
-    found = field_of(result.volumes)
-    spread = result.volumes.get("density_std", result.volumes.get(f"{found}_std"))
-    if repetitions and spread is not None:
-        base = spread.quantity.removesuffix("_std")
-        size = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
-        name, unit = LABELS.get(base, (base, spread.unit))
-        text = f"σ of {name} rms {with_unit(number(size, 2), unit)}"
-        rows.append((f"Error bars by {repetitions.get('members')} trials", text))
-    coverage = result.metrics.get("coverage")
+        rows.append(("Worst view, before and after refinement", f"rms {before:.2f} σ, {after:.2f} σ"))
+    if "outcome" in metrics:
+        rows.append(("Outcome", str(metrics["outcome"]).replace("_", " ")))
+    if metrics.get("l2") is not None and metrics.get("l2_variation") is not None:
+        errors = f"L2 {metrics['l2']:.2%}"
+        if field_of(result.volumes) in (None, INDEX):  # the paper's L2 includes the ambient
+            errors += f", of the variation {metrics['l2_variation']:.2%}"
+        scores = f"CC {number(metrics.get('cc'), 5)}, SSIM {number(metrics.get('ssim'), 4)}"
+        rows.append(("Against the truth", f"{errors}; {scores}"))
+    spread = result.volumes.get("density_std", result.volumes.get(f"{field_of(result.volumes)}_std"))
+    if (bootstrap := _bootstrap(result)) and spread is not None:
+        quantity = spread.quantity.removesuffix("_std")
+        rms = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
+        name, unit = LABELS.get(quantity, (quantity, spread.unit))
+        title = f"Standard deviation, bootstrap of {bootstrap.get('members')}"
+        rows.append((title, f"rms {with_unit(number(rms, 2), unit)} of {name}"))
+    coverage = metrics.get("coverage")
     if isinstance(coverage, dict):
         flow = coverage.get("share_in_flow")
-        beside = "" if flow is None else f", {flow:.0%} of those in the flow"
-        rows.append(("Truth within ±2 σ", f"{coverage['share']:.0%} of the voxels{beside}"))
+        in_flow = "" if flow is None else f", {flow:.0%} of those in the flow"
+        rows.append(("Truth within ±2 σ", f"{coverage['share']:.0%} of the voxels{in_flow}"))
     return rows
 
 
-def _scores(view: dict[str, Any]) -> str:
-    noise = view.get("rms_over_sigma")
-    return f"CC {number(view['cc'], 5)}, rms error {rms_text(view, 3)}{'' if noise is None else f' = {noise:.2f} σ'}"
+def _scores(views: list[View]) -> str:
+    """The worst scores of some views."""
+    cc, noise = _extreme(views, "cc", min), _extreme(views, "rms_over_sigma")
+    rms = rms_text(max(views, key=lambda v: v.get("rms") or 0.0), 3)
+    least, most = ("at least ", "at most ") if len(views) > 1 else ("", "")
+    return f"CC {least}{number(cc, 5)}, rms error {most}{rms}{'' if noise is None else f' = {noise:.2f} σ'}"
 
 
-def trust(result: Result) -> list[Statement]:
-    """Return what to know before trusting it, the gravest first."""
-    found = [Statement("bad" if gap.what in VITAL else "note", gap.sentence) for gap in result.missing]
-    found += _of_outcome(result) + _of_withheld(result) + _of_residual(result) + _of_leftovers(result)
-    found += _of_truth(result)
-    found += _of_gas(result) + _of_masks(result) + _of_repetitions(result) + _of_rig(result)
-    return sorted(found, key=lambda s: -LEVELS.index(s.level))
+def _extreme(views: list[View], key: str, extreme: Callable[..., float | None] = max) -> float | None:
+    return extreme((float(v[key]) for v in views if v.get(key) is not None), default=None)
 
 
-def headline(result: Result) -> Statement:
-    """Return the verdict, or that a file without which there is none is missing."""
-    gap = next((gap for gap in result.missing if gap.what in VITAL), None)
-    if gap is not None:
-        return Statement("bad", f"Cannot tell: {gap.what} is missing or damaged, see below.")
-    judged = verdict(result)
-    return Statement(OF_WORD[judged.word], judged.sentence)
-
-
-def _place(view: dict[str, Any], views: list[dict[str, Any]]) -> str:
-    """Name of a view and, where several things were measured, of what is meant."""
+def _place(view: View, views: list[View]) -> str:
+    """Name of a view and, where several quantities were measured, of the quantity."""
     several = len({v["measured"] for v in views}) > 1
     return f"{view['name']}, {view['measured']}" if several else str(view["name"])
 
 
-def _views(result: Result, withheld: bool) -> list[dict[str, Any]]:
+def _views(result: Result, withheld: bool) -> list[View]:
     views = result.metrics.get("views")
     return [v for v in views if v.get("withheld") is withheld] if isinstance(views, list) else []
 
 
-def looked(result: Result) -> list[dict[str, Any]]:
-    """Scores of the view that was kept out of a short run first."""
+def cross_validated(result: Result) -> list[View]:
+    """Return the scores of the view that was withheld from the first run of a cross-validation."""
     return list((result.metrics.get("cross_validation") or {}).get("views") or [])
 
 
-def _values(views: list[dict[str, Any]], key: str) -> list[float]:
-    return [float(v[key]) for v in views if v.get(key) is not None]
+def _bootstrap(result: Result) -> dict[str, Any]:
+    trials = result.metrics.get("uncertainty")
+    return trials if isinstance(trials, dict) else {}
 
 
-def _smallest(views: list[dict[str, Any]], key: str) -> float | None:
-    return min(_values(views, key), default=None)
+def headline(result: Result) -> Statement:
+    """Return the verdict, or the file that is missing for one."""
+    gap = next((gap for gap in result.missing if gap.name in VITAL), None)
+    if gap is not None:
+        return Statement("bad", f"Cannot tell: {gap.name} is missing or damaged, see below.")
+    judgement = verdict(result)
+    return Statement(LEVEL_OF_WORD[judgement.word], judgement.sentence)
 
 
-def _largest(views: list[dict[str, Any]], key: str) -> float | None:
-    return max(_values(views, key), default=None)
+def statements(result: Result) -> list[Statement]:
+    """Return what limits the accuracy of a result, and what supports it, most severe first."""
+    remarks = [Statement("bad" if gap.name in VITAL else "note", gap.sentence) for gap in result.missing]
+    for part in (
+        _of_outcome, _of_withheld_views, _of_residuals, _of_correlated_residuals, _of_truth, _of_gas, _of_masks,
+        _of_bootstrap, _of_rig,
+    ):  # fmt: skip
+        remarks += part(result)
+    return sorted(remarks, key=lambda s: -LEVELS.index(s.level))
 
 
 def _of_outcome(result: Result) -> list[Statement]:
     outcome, message = result.metrics.get("outcome"), result.metrics.get("message", "")
-    ended = "The run ended at its {}; a longer one may be more accurate."
-    known = {
+    limit = "The run stopped at its {}; a longer run may reduce the error."
+    level, text = {
         "diverged": ("bad", f"The run diverged. {message}"),
-        "collapsed": ("bad", f"The run found no field. {message}"),
+        "collapsed": ("bad", f"The field collapsed to the ambient. {message}"),
         "interrupted": ("warning", f"The run was interrupted; --resume continues it. {message}"),
-        "time_limit": ("note", ended.format("time limit")),
-        "steps": ("note", ended.format("limit of steps")),
-    }
-    level, text = known.get(str(outcome), ("", ""))
+        "time_limit": ("note", limit.format("time limit")),
+        "steps": ("note", limit.format("limit of steps")),
+    }.get(str(outcome), ("", ""))
     return [Statement(level, text.strip())] if text else []
 
 
-def _of_withheld(result: Result) -> list[Statement]:
-    seen, held = _views(result, False), _views(result, True)
-    what = "The field predicts"
-    if not held and looked(result):
-        held, what = looked(result), "A first, short run predicts"
-    if not held:
-        if not seen:
-            text = "The field was not compared with any view: nerif evaluate --measurement FILE does it."
-            return [Statement("warning", text)]
-        text = "No view was held out, so the field was not checked against data the reconstruction has not seen."
-        return [Statement("warning", f"{text} Repeat with --withhold auto, or a view.")]
-    known = [v for v in held if v.get("cc") is not None]
-    if not known:
-        return [Statement("warning", "The held-out views have no pixels to compare.")]
-    worst = min(known, key=lambda v: v["cc"])
-    cc, noise, name = worst["cc"], _largest(known, "rms_over_sigma"), _place(worst, known)
-    among = f"; the worst of {len(known)}" if len(known) > 1 else ""
-    if held == looked(result):  # of a short run, which is no measure of the long one: the verdict allows for that
-        text = f"{what} what has not been seen (view {name}{among}) with CC {cc:.4f}; the whole run has used it."
-        return [Statement("good" if cc >= WITHHELD_CC else "note", text)]
-    if cc >= WITHHELD_CC:
-        beyond = "" if noise is None or noise <= 2 else f", though the error is {noise:.1f} times the noise"
-        text = f"{what} what has not been seen (view {name}{among}): CC {cc:.4f}{beyond}."
+def _of_withheld_views(result: Result) -> list[Statement]:
+    withheld, first_run = _views(result, True), cross_validated(result)
+    if not withheld and not first_run:
+        if not _views(result, False):
+            text = "The field was not compared with any view; nerif evaluate --measurement FILE does so."
+        else:
+            text = "No view was withheld, so the field is not validated against independent data. "
+            text += "Repeat with --withhold auto, or the name of a view."
+        return [Statement("warning", text)]
+    views = [v for v in withheld or first_run if v.get("cc") is not None]
+    if not views:
+        return [Statement("warning", "The withheld views have no valid pixels to compare.")]
+    worst = min(views, key=lambda v: v["cc"])
+    cc, noise, name = worst["cc"], _extreme(views, "rms_over_sigma"), _place(worst, views)
+    among = f" (worst of {len(views)})" if len(views) > 1 else ""
+    if not withheld:  # a short run, from which the verdict extrapolates
+        text = f"Cross-validation: a short run without view {name}{among} predicts it with CC {cc:.4f}; "
+        return [Statement("good" if cc >= MIN_CC else "note", text + "the whole run uses all views.")]
+    if cc >= MIN_CC:
+        beyond = "" if noise is None or noise <= 2 else f", but its residual is {noise:.1f} × the noise"
+        text = f"The withheld view {name}{among} is predicted with CC {cc:.4f}{beyond}."
         return [Statement("warning" if beyond else "good", text)]
-    text = f"{what} poorly what has not been seen (view {name}{among}): CC {cc:.3f}."
-    remedy = "More views, or a look at the calibration (nerif check), may help."
-    of_noise = noise is not None and noise <= 2
-    return [Statement("warning" if cc >= 0.8 or of_noise else "bad", f"{text} {remedy}")]
+    text = f"The withheld view {name}{among} is predicted poorly: CC {cc:.3f}. "
+    level = "warning" if cc >= 0.8 or (noise is not None and noise <= 2) else "bad"
+    return [Statement(level, text + "More views, or a check of the calibration (nerif check), may help.")]
 
 
-def _of_residual(result: Result) -> list[Statement]:
-    seen = _views(result, False)
-    if not seen:
-        text = "No training view was compared, so there is no telling whether what is left unexplained is noise."
-        remedy = "nerif evaluate --measurement FILE compares the views of the reconstruction."
-        return [Statement("note", f"{text} {remedy}")] if _views(result, True) else []
-    known = [v for v in seen if v.get("rms_over_sigma") is not None]
-    if not known:
-        text = "The noise of the measurement is not known, so there is no telling whether the residual is noise."
-        remedy = "nerif displacement writes sigma." if _of_images(seen[0]["measured"]) else "Give its sigma."
+def _of_residuals(result: Result) -> list[Statement]:
+    training = _views(result, False)
+    if not training:
+        text = "No training view was compared, so it is unknown whether the residuals are noise. "
+        text += "nerif evaluate --measurement FILE compares the views of the reconstruction."
+        return [Statement("note", text)] if _views(result, True) else []
+    views = [v for v in training if v.get("rms_over_sigma") is not None]
+    if not views:
+        of_images = any(k.background for k in TECHNIQUES.values() if k.measured == training[0]["measured"])
+        remedy = "nerif displacement writes sigma." if of_images else "Give its sigma."
+        text = "The noise of the measurement is unknown, so it is unknown whether the residuals are noise."
         return [Statement("note", f"{text} {remedy}")]
-    lowest, highest = (f(known, key=lambda v: v["rms_over_sigma"]) for f in (min, max))
+    lowest, highest = (extreme(views, key=lambda v: v["rms_over_sigma"]) for extreme in (min, max))
     low, high = lowest["rms_over_sigma"], highest["rms_over_sigma"]
-    found = []
-    if high > NOISE_BAND[1]:
-        text = f"The residual of training view {_place(highest, known)} is {high:.1f} times the stated noise"
-        remedy = "Look at the length of the run, open faces, the calibration (nerif check), whether sigma is too small."
-        white = bool((highest.get("leftover") or {"white": False})["white"])
-        level = "warning" if high <= 3 or white else "bad"  # what is white may be noise that is mis-stated
-        found.append(Statement(level, f"{text}: not explained. {remedy}"))
-    if low < NOISE_BAND[0]:
-        text = f"The residual of training view {_place(lowest, known)} is {low:.2f} of the stated noise"
-        found.append(Statement("warning", f"{text}: the field follows noise, or sigma is too large."))
-    if not found:
-        text = "What the field leaves unexplained in the training views"
-        found.append(Statement("good", f"{text} is {low:.2f} to {high:.2f} of the noise."))
-    return found
+    remarks = []
+    if high > NOISE_RANGE[1]:
+        white = bool((highest.get("residual_test") or {"white": False})["white"])
+        level = "warning" if high <= 3 or white else "bad"  # a white residual may be noise with a wrong sigma
+        text = f"The residual of training view {_place(highest, views)} is {high:.1f} × the stated noise. "
+        text += "Possible causes: a short run, open faces, the calibration (nerif check), a sigma that is too small."
+        remarks.append(Statement(level, text))
+    if low < NOISE_RANGE[0]:
+        text = f"The residual of training view {_place(lowest, views)} is {low:.2f} × the stated noise: "
+        remarks.append(Statement("warning", text + "the field fits noise, or sigma is too large."))
+    return remarks or [
+        Statement("good", f"The residuals of the training views are {low:.2f} to {high:.2f} × the noise.")
+    ]
 
 
-def _of_leftovers(result: Result) -> list[Statement]:
-    """Residuals of which neighbours are alike, by what they have the pattern of."""
-    seen = [v for v in _views(result, False) if not (v.get("leftover") or {"white": True})["white"]]
-    found = []
-    for cause in dict.fromkeys(v["leftover"]["cause"] for v in seen):
-        own = sorted((v for v in seen if v["leftover"]["cause"] == cause), key=lambda v: -v["leftover"]["grain"])
-        worst, size = own[0], _left_alike(own[0])
-        names = ", ".join(_place(v, seen) for v in own[:NAMED]) + (", ..." if len(own) > NAMED else "")
-        where = f"row {worst['leftover']['row']:.0f}, column {worst['leftover']['column']:.0f}"
-        text = (
-            f"What is left of {len(own)} training view{'s' if len(own) > 1 else ''} ({names}) is not white: neighbours "
-            f"are alike, to {size:.1%} of what is predicted, most in {_place(worst, seen)} around {where}"
+def _of_correlated_residuals(result: Result) -> list[Statement]:
+    views = [v for v in _views(result, False) if not (v.get("residual_test") or {"white": True})["white"]]
+    remarks = []
+    for cause in dict.fromkeys(v["residual_test"]["cause"] for v in views):
+        group = sorted(
+            (v for v in views if v["residual_test"]["cause"] == cause), key=lambda v: -v["residual_test"]["grain"]
         )
-        why = CAUSES.get(cause, "it has the pattern of no cause that is known: flow beyond the box, too short a run?")
-        found.append(
-            Statement("warning" if size > ALIKE else "note", f"{text}. As where {why}." if cause else f"{text}; {why}")
-        )
-    return found
-
-
-def _left_alike(view: dict[str, Any]) -> float:
-    """The size of what is alike in a residual, over what is predicted."""
-    signal = view.get("rms_predicted") or float("inf")
-    return float(view["leftover"]["alike"] * view["rms"] / signal)
-
-
-def _of_images(measured: str) -> bool:
-    """Whether nerif displacement measures it, from images of a background."""
-    return any(kind.background for kind in TECHNIQUES.values() if kind.measured == measured)
+        worst, share = group[0], correlated_share(group[0])
+        names = ", ".join(_place(v, views) for v in group[:MAX_NAMES]) + (", ..." if len(group) > MAX_NAMES else "")
+        verb = f"Residuals of {len(group)} training views ({names}) are"
+        verb = verb if len(group) > 1 else f"The residual of training view {names} is"
+        where = f"row {worst['residual_test']['row']:.0f}, column {worst['residual_test']['column']:.0f}"
+        text = f"{verb} spatially correlated, up to {share:.1%} of the signal in {_place(worst, views)} around {where}."
+        reason = CAUSES.get(cause, "unknown; perhaps flow beyond the box, or a short run")
+        text += f" Likely cause: {reason}."
+        remarks.append(Statement("warning" if share > CORRELATED else "note", text))
+    return remarks
 
 
 def _of_truth(result: Result) -> list[Statement]:
@@ -303,10 +284,9 @@ def _of_truth(result: Result) -> list[Statement]:
     if cc is None or variation is None:
         return []
     level = "good" if cc >= TRUTH_CC[0] else "warning" if cc >= TRUTH_CC[1] else "bad"
-    found = field_of(result.volumes) or INDEX
-    of = "n" if found == INDEX else name_of(found)
-    text = f"Against the truth: CC {cc:.4f}, error {variation:.1%} of the variation of {of}."
-    return [Statement(level, text)]
+    quantity = field_of(result.volumes) or INDEX
+    name = "n" if quantity == INDEX else name_of(quantity)
+    return [Statement(level, f"Against the truth: CC {cc:.4f}, error {variation:.1%} of the variation of {name}.")]
 
 
 def _of_gas(result: Result) -> list[Statement]:
@@ -314,36 +294,28 @@ def _of_gas(result: Result) -> list[Statement]:
     low, high = TEMPERATURE_RANGE
     if ambient is None or low <= ambient <= high:
         return []
-    text = f"The ambient index would mean {ambient:.3g} K in the gas assumed"
-    return [Statement("warning", f"{text}: density and temperature do not apply here. See --gas.composition.")]
+    text = f"The ambient index corresponds to {ambient:.3g} K in the assumed gas"
+    return [Statement("warning", f"{text}: density and temperature are not valid. See --gas.composition.")]
 
 
-def repeated(result: Result) -> dict[str, Any]:
-    """Return what metrics.json has of the trials of the bootstrap; nothing where there are none."""
-    found = result.metrics.get("uncertainty")
-    return found if isinstance(found, dict) else {}
-
-
-def _of_repetitions(result: Result) -> list[Statement]:
-    diverged = repeated(result).get("diverged") or []
-    if not diverged:
-        return []
+def _of_bootstrap(result: Result) -> list[Statement]:
+    diverged = _bootstrap(result).get("diverged") or []
     names = ", ".join(map(str, diverged))
-    return [Statement("warning", f"Trials {names} diverged and are left out of the standard deviations.")]
+    text = f"Bootstrap trials {names} diverged and are excluded from the standard deviations."
+    return [Statement("warning", text)] if diverged else []
 
 
 def _of_rig(result: Result) -> list[Statement]:
-    """What a refinement found: views that are not where they were calibrated, and those of which data tell nothing."""
     table = result.metrics.get("rig")
     if not table:
         return []
     first, *lines = moved_lines(table)
-    found = [Statement("note", f"Cameras or images were {first}.")]
-    return found + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
+    remarks = [Statement("note", f"Camera refinement: {first}.")]
+    return remarks + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
 
 
 def _of_masks(result: Result) -> list[Statement]:
-    found = []
+    remarks = []
     for quantity in ("density", "temperature"):
         volume = result.volumes.get(quantity)
         count = int(volume.notes.get("masked_voxels", 0)) if volume is not None else 0
@@ -353,5 +325,5 @@ def _of_masks(result: Result) -> list[Statement]:
         voxels = "voxel" if count == 1 else "voxels"
         where = volume.notes.get("masked_where")
         text = f"{quantity.capitalize()} is masked in {count} {voxels} ({percent(share)}): {where}."
-        found.append(Statement("note" if share < 0.05 else "warning", text))
-    return found
+        remarks.append(Statement("note" if share < 0.05 else "warning", text))
+    return remarks

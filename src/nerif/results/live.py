@@ -1,10 +1,10 @@
-"""How a run goes on, for whoever looks at its directory meanwhile.
+"""The status of a live run, in its result directory.
 
-    live.json    the title of the work, step, seconds, progress, losses, and their curve: once a second at most
-    live.npz     the field on a few voxels, one view as measured and predicted: as often as SHARE of the time allows
+    live.json    title, step, seconds, progress and losses with their curves: once a second at most
+    live.npz     the field on a coarse grid, and one view as measured and predicted: as often as FIELD_SHARE allows
 
-Both appear whole or not at all. A look at the field costs a twentieth of a second or so; after it, so much time passes
-that all looks together take no more than SHARE of the run.
+Both are written atomically. After a field is written, which takes about 0.05 s, so much time passes that writing takes
+at most FIELD_SHARE of the run.
 """
 
 from __future__ import annotations
@@ -36,29 +36,29 @@ from nerif.results.directory import LIVE, LIVE_LOOK
 
 __all__ = ["Live", "Look", "read_live", "read_look"]
 
-EVERY = 1.0  # seconds between two writings of live.json
-SHARE = 0.01  # of the time that looks at the field take
-FIRST = 1.0  # seconds before the first
-VOXELS = 28  # along the longest edge of the box
-PIXELS = 40  # along the longest edge of the view
-SAMPLES = 24  # a ray
-POINTS = 400  # of the curve: of more, every second is left out
+STATUS_INTERVAL = 1.0  # s, of live.json
+FIELD_SHARE = 0.01  # of the run time, spent on live.npz
+FIELD_DELAY = 1.0  # s, before the first
+COARSE_VOXELS = 28  # along the longest edge of the box
+MAX_PIXELS = 40  # along the longest edge of the view
+RAY_SAMPLES = 24
+CURVE_POINTS = 400  # at most; then every second is dropped
 
 
 @dataclass(frozen=True)
 class Look:
-    """The field as it was, and a view of it.
+    """The field during a run, and one of its views.
 
     Parameters
     ----------
-    title : of the work meanwhile
-    seconds : spent until then
-    quantity : what the field is (volume.QUANTITIES)
+    title : of the work
+    seconds : since its start
+    quantity : of the field (volume.QUANTITIES)
     values : [z, y, x] of it
     lower, upper : corners of its box, mm
-    view : name of the view; empty where there is none
-    withheld : whether the work does without the view
-    measured, predicted : (row, column, component) of the view, on every so many pixels; NaN where not measured
+    view : name of the view; empty if there is none
+    withheld : whether the run does not use the view
+    measured, predicted : (row, column, component) of the view, on a lattice of pixels; NaN where not measured
     components : their names
     unit : of measured and predicted
     """
@@ -78,21 +78,21 @@ class Look:
 
     @property
     def volume(self) -> Volume:
-        """The field on its voxels."""
+        """The field on its grid."""
         grid = Grid(Box(self.lower, self.upper), self.values.shape)
         return Volume(torch.from_numpy(self.values), grid, self.quantity, describe(self.quantity)[0])
 
 
 class Live:
-    """Writes how a run goes on into its directory.
+    """Writes the status of a run into its directory.
 
     Parameters
     ----------
-    directory : of the result; nothing is written before it is there
-    measurement : of which a view is shown
-    reconstructor : settings of the method, whose forward model the view is predicted by
-    view : its name; the one that the others cover best if empty
-    remark : gives a line to be shown beside the figures, empty where there is none
+    directory : of the result; nothing is written before it exists
+    measurement : with the view to show
+    reconstructor : settings of the method, with its forward model
+    view : name of the view; the one best covered by the others if empty
+    remark : returns a line to show with the status, or ""
     """
 
     def __init__(
@@ -103,55 +103,55 @@ class Live:
         self.model = str(getattr(reconstructor, "model", AUTO))
         self.view = view or best_covered(measurement.cameras)[0]
         self._curve: list[dict[str, float]] = []
-        self._every = 1
+        self._interval = 1
 
     def watching(self, monitor: Monitor, withheld: bool, looks: bool = True) -> Monitor:
-        """Return a monitor that also tells the directory.
+        """Return a monitor that also writes the status.
 
         Parameters
         ----------
-        withheld : whether the work is done without the view
-        looks : whether to look at the field; of repetitions of a run there is nothing new to see
+        withheld : whether the run does not use the view
+        looks : whether to write the field
         """
 
         @contextmanager
         def training(title: str) -> Iterator[OnStep]:
-            with monitor.training(title) as told:
-                last: list[Step] = []
-                yield compose(self._teller(title, withheld, looks, last), told)
-            if last:  # where it ended
-                self._write(title, last[0])
+            with monitor.training(title) as on_step:
+                newest: list[Step] = []
+                yield compose(self._writer(title, withheld, looks, newest), on_step)
+            if newest:  # the last step
+                self._write(title, newest[0])
 
         return replace(monitor, training=training)
 
-    def _teller(self, title: str, withheld: bool, looks: bool, newest: list[Step]) -> OnStep:
-        begun = time.monotonic()
-        written, spent, last = -EVERY, 0.0, 0.0
-        self._curve, self._every = [], 1
+    def _writer(self, title: str, withheld: bool, looks: bool, newest: list[Step]) -> OnStep:
+        start = time.monotonic()
+        written, total, last = -STATUS_INTERVAL, 0.0, 0.0
+        self._curve, self._interval = [], 1
 
-        def tell(step: Step) -> None:
-            nonlocal written, spent, last
+        def on_step(step: Step) -> None:
+            nonlocal written, total, last
             if not self.directory.is_dir():
                 return
             newest[:] = [step]
-            self._remember(step)
+            self._append(step)
             now = time.monotonic()
-            if now - written >= EVERY:
+            if now - written >= STATUS_INTERVAL:
                 self._write(title, step)
                 written = now
-            if looks and now - begun >= FIRST and spent + last <= SHARE * (now - begun):
+            if looks and now - start >= FIELD_DELAY and total + last <= FIELD_SHARE * (now - start):
                 self._look(title, step, withheld)
                 last = time.monotonic() - now
-                spent += last
+                total += last
 
-        return tell
+        return on_step
 
-    def _remember(self, step: Step) -> None:
+    def _append(self, step: Step) -> None:
         losses = {k: v for k, v in step.losses.items() if isinstance(v, float)}
-        if step.step % self._every == 0:
+        if step.step % self._interval == 0:
             self._curve.append({"step": step.step, "seconds": step.seconds, **losses})
-        if len(self._curve) > POINTS:
-            self._curve, self._every = self._curve[::2], 2 * self._every
+        if len(self._curve) > CURVE_POINTS:
+            self._curve, self._interval = self._curve[::2], 2 * self._interval
 
     def _write(self, title: str, step: Step) -> None:
         entries = {"title": title, "written": time.time(), "view": self.view, "remark": self.remark()}
@@ -165,22 +165,22 @@ class Live:
     @torch.no_grad()
     def _look(self, title: str, step: Step, withheld: bool) -> None:
         m, field = self.measurement, step.field()
-        grid = Grid.of_resolution(m.box, VOXELS)
+        grid = Grid.of_resolution(m.box, COARSE_VOXELS)
         arrays: dict[str, np.ndarray] = {"values": field.sample(grid, _device(field)).numpy()}
-        about: dict[str, Any] = {"title": title, "seconds": step.seconds, "quantity": m.quantity}
-        about |= {"lower": m.box.lower, "upper": m.box.upper, "withheld": withheld}
-        about |= {"view": "", "components": (), "unit": ""}
-        shown = self._shown()
-        if shown is not None:
-            observation, forward = shown
-            measured, predicted = self._seen(field, observation, forward)
-            arrays |= {"measured": measured, "predicted": predicted}
+        about: dict[str, Any] = {
+            "title": title, "seconds": step.seconds, "quantity": m.quantity, "lower": m.box.lower,
+            "upper": m.box.upper, "withheld": withheld, "view": "", "components": (), "unit": "",
+        }  # fmt: skip
+        model = self._integral()
+        if model is not None:
+            observation, forward = model
+            arrays["measured"], arrays["predicted"] = self._maps(field, observation, forward)
             about |= {"view": self.view, "components": observation.components, "unit": observation.technique.unit}
         with OwnFiles(self.directory).writing(LIVE_LOOK) as path, atomic(path) as part:
             np.savez(part, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
-    def _shown(self) -> tuple[Observation, ForwardModel] | None:
-        """What of the view is shown: the first that is an integral along rays, if any is."""
+    def _integral(self) -> tuple[Observation, ForwardModel] | None:
+        """The first observation of the view that is an integral along rays."""
         index = self.measurement.names.index(self.view)
         for observation in self.measurement.observations:
             forward = forward_model(observation.technique, self.measurement, self.model)
@@ -188,15 +188,15 @@ class Live:
                 return observation, forward
         return None
 
-    def _seen(self, field: Field, observation: Observation, forward: ForwardModel) -> tuple[np.ndarray, np.ndarray]:
-        """The view on a lattice of pixels, as measured and as predicted."""
+    def _maps(self, field: Field, observation: Observation, forward: ForwardModel) -> tuple[np.ndarray, np.ndarray]:
+        """The measured and the predicted view on a lattice of pixels."""
         m, index = self.measurement, self.measurement.names.index(self.view)
         camera = observation.technique.seen_by(m.cameras[index])
         height, width = camera.image_size
-        step = -(-max(height, width) // PIXELS)
+        step = -(-max(height, width) // MAX_PIXELS)
         pixels = camera.pixel_grid()[::step, ::step]
         rays = camera.rays(pixels.reshape(-1, 2)).clip(m.box).to(dtype=torch.float32)
-        predicted = project(PathIntegral(forward, SAMPLES), field, rays, _device(field)).cpu()
+        predicted = project(PathIntegral(forward, RAY_SAMPLES), field, rays, _device(field)).cpu()
         at = index, slice(0, height, step), slice(0, width, step)
         usable = m.usable_for(observation)[at][..., None]
         measured = observation.values[at].where(usable, torch.tensor(float("nan")))
@@ -204,19 +204,18 @@ class Live:
 
 
 def _device(field: Field) -> torch.device:
-    """Where the field is while it is found."""
     network = getattr(field, "network", None)
     return torch.device("cpu") if network is None else next(network.parameters()).device
 
 
 def read_live(directory: Path) -> dict[str, Any]:
-    """Return live.json of a result directory; nothing where there is none."""
+    """Return live.json of a result directory; empty if there is none."""
     path = directory / LIVE
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def read_look(directory: Path) -> Look | None:
-    """Return what live.npz of a result directory holds; None where there is none."""
+    """Return the content of live.npz of a result directory; None if there is none."""
     path = directory / LIVE_LOOK
     if not path.is_file():
         return None

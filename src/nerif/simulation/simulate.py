@@ -100,7 +100,7 @@ def add_quantum_noise(measurement: Measurement, counts: float, seed: int = 0) ->
     """
     generator, noisy, sigmas = torch.Generator().manual_seed(seed), {}, {}
     for o in measurement.observations:
-        noisy[o.technique.name], sigmas[o.technique.name] = o.technique.detected(o.values, counts, generator)
+        noisy[o.technique.name], sigmas[o.technique.name] = o.technique.detect(o.values, counts, generator)
     return measurement.observed(noisy, {**sigmas})
 
 

@@ -1,4 +1,4 @@
-"""A reconstruction beside the main one, in a directory of its own: done once, gone on with where it was broken off."""
+"""A reconstruction beside the main one, in a directory of its own: not repeated if complete, resumed if interrupted."""
 
 from __future__ import annotations
 
@@ -16,66 +16,60 @@ from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, fingerpri
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.results.directory import ResultDirectory
 
-__all__ = ["KeptRun"]
+__all__ = ["CheckpointedRun"]
 
-ASKED = "asked.json"
+INPUTS = "inputs.json"
 
 
 @dataclass(frozen=True)
-class KeptRun:
-    """One reconstruction and its directory; whatever is in there of other settings or data is done again.
+class CheckpointedRun:
+    """A reconstruction and its directory; content of other settings or data is replaced.
 
     Parameters
     ----------
-    directory : of its own, in which only what this program wrote is replaced
+    directory : of its own
     reconstructor : settings
-    data : what is reconstructed
-    start : field to begin from, or None
-    made_of : what else it depends on
-    checkpoint_every : seconds
-    monitor : told how the work goes
-    afresh : whatever is there
-    free : names of settings that it may be gone on with others of
+    data : to reconstruct from
+    start : initial field, or None
+    dependencies : further inputs
+    checkpoint_every : s
+    monitor : of the progress
+    restart : whether to ignore the content of the directory
+    limits : names of settings that may differ when a run is resumed
     """
 
     directory: ResultDirectory
     reconstructor: Reconstructor
     data: Measurement
     start: Field | None = None
-    made_of: Mapping[str, str] = field(default_factory=dict)
+    dependencies: Mapping[str, str] = field(default_factory=dict)
     checkpoint_every: float = 60.0
     monitor: Monitor = QUIET
-    afresh: bool = False
-    free: tuple[str, ...] = ()
+    restart: bool = False
+    limits: tuple[str, ...] = ()
 
     @property
-    def begun(self) -> bool:
-        """Whether there is something of it to read or to go on with."""
-        asked = self.directory / ASKED
-        if self.afresh or not asked.is_file():
+    def resumable(self) -> bool:
+        """Whether the directory has a field or a checkpoint of the same inputs."""
+        path = self.directory / INPUTS
+        if self.restart or not path.is_file() or path.read_text() != self._inputs:
             return False
-        return asked.read_text() == self._asked and (self._has(FIELD) or self._has(CHECKPOINT))
+        return self.directory.has(FIELD) or self.directory.has(CHECKPOINT)
 
     def __call__(self, title: str, *callbacks: OnStep) -> Reconstruction:
-        """Read it if it is there, else reconstruct; what an interruption leaves is gone on with the next time.
-
-        Parameters
-        ----------
-        title : of the work, for the monitor
-        callbacks : told every step
-        """
+        """Read the result, or reconstruct; `title` is that of the progress, `callbacks` are called after each step."""
         state: State | None = None
-        if self.begun:
+        if self.resumable:
             try:
-                if self._has(FIELD):
+                if self.directory.has(FIELD):
                     return self._read()
                 state = self.directory.state()
             except InputError as error:
-                self.monitor.say(f"{error}; {title} is done again")
-        with self.monitor.training(title) as told:
-            keep = checkpoints(self.directory.path, self.checkpoint_every)
-            steps = compose(*callbacks, self._noted(state is not None), told, keep)
-            result = self.reconstructor(self.data, steps, state, self.start if state is None else None)
+                self.monitor.say(f"{error}; {title} is repeated")
+        with self.monitor.training(title) as progress:
+            checkpoint = checkpoints(self.directory.path, self.checkpoint_every)
+            on_step = compose(*callbacks, self._write_inputs(state is not None), progress, checkpoint)
+            result = self.reconstructor(self.data, on_step, state, self.start if state is None else None)
         if result.outcome.reason == "interrupted":
             if result.state is not None:
                 write_state(self.directory.path, result.state)
@@ -84,32 +78,30 @@ class KeptRun:
             self.directory.files.remove([CHECKPOINT])
         return result
 
-    def _has(self, name: str) -> bool:
-        return self.directory.has(name)
-
     def _read(self) -> Reconstruction:
         settings = dataclasses.asdict(self.reconstructor)  # type: ignore[call-overload]
-        kept = Outcome("converged", "read from disc")
-        return Reconstruction(*self.directory.field(), [], kept, settings, quantity=self.directory.quantity())
+        outcome = Outcome("converged", "read from disk")
+        return Reconstruction(*self.directory.field(), [], outcome, settings, quantity=self.directory.quantity())
 
-    def _noted(self, resumed: bool) -> OnStep:
-        """Note at the first step what is asked for, in a directory without anything of an earlier run."""
-        done: list[bool] = [resumed]
+    def _write_inputs(self, resumed: bool) -> OnStep:
+        """Return a callback that clears the directory at the first step of a new run and writes its inputs."""
+        pending = not resumed
 
-        def note(step: Step) -> None:
-            if not done[0]:
+        def write(step: Step) -> None:
+            nonlocal pending
+            if pending:
                 self.directory.files.remove()
                 self.directory.path.mkdir(parents=True, exist_ok=True)
-                with self.directory.writing(ASKED) as path, atomic(path) as part:
-                    part.write_text(self._asked)
-                done[0] = True
+                with self.directory.writing(INPUTS) as path, atomic(path) as part:
+                    part.write_text(self._inputs)
+                pending = False
 
-        return note
+        return write
 
     @property
-    def _asked(self) -> str:
-        """What it is made by and from, as text: another one of either gives another text."""
+    def _inputs(self) -> str:
+        """Settings, data and further inputs as text."""
         settings = dataclasses.asdict(self.reconstructor)  # type: ignore[call-overload]
-        settings = {name: value for name, value in settings.items() if name not in self.free}
-        asked = {"data": fingerprint(self.data), **self.made_of, **settings}
-        return json.dumps(asked, indent=1, default=str) + "\n"
+        settings = {name: value for name, value in settings.items() if name not in self.limits}
+        inputs = {"data": fingerprint(self.data), **self.dependencies, **settings}
+        return json.dumps(inputs, indent=1, default=str) + "\n"

@@ -1,4 +1,4 @@
-"""A view is kept out first: a short run tells how well it is predicted, and the run with all goes on from there."""
+"""Cross-validation: a short run without one view gives its prediction error; the run with all views starts from it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerif.analysis.asymmetry import HALVES, kept_half
+from nerif.analysis.asymmetry import HALVES, withhold_half
 from nerif.analysis.evaluation import evaluate_views, rms_text
 from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
@@ -20,69 +20,57 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.checkpointed import KeptRun
+from nerif.workflow.checkpointed import CheckpointedRun
 
-__all__ = ["AUTO", "FEWEST", "NONE", "FirstLook", "kept_apart", "kept_out"]
+__all__ = ["AUTO", "MIN_VIEWS", "NONE", "CrossValidation", "with_halves", "withheld_views"]
 
 AUTO: tuple[str, ...] = ("auto",)
 NONE: tuple[str, ...] = ("none",)
-"""May be asked for in place of the names of views: AUTO, one is kept out first, and NONE."""
-
-FEWEST = 4
-"""Views of which one is kept out first: of three, the other two would tell little."""
-
+"""Values of `withhold` other than names of views: cross-validation with one view, and no withheld view."""
+MIN_VIEWS = 4  # with three, the other two constrain the field too little
 LIMITS = ("epochs", "max_steps", "time_limit", "longest", "iterations")
-"""Settings that a run may be gone on with others of."""
-
 SCORES = "views.json"
 
 
-def kept_out(withhold: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the views that are kept out of the whole run, out of all names."""
+def withheld_views(withhold: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the views that the whole run withholds; `names`: of all views."""
     words = tuple(withhold)
     return () if words in (AUTO, NONE) and words[0] not in names else words
 
 
-def kept_apart(
+def with_halves(
     withhold: Sequence[str], measurement: Measurement, reconstructor: Reconstructor
 ) -> tuple[Measurement, Reconstructor, tuple[str, ...]]:
-    """Return the measurement, in halves if one of them is to be kept out, what reconstructs it, and what is kept out.
+    """Return measurement and settings, split into halves of images if one is withheld, and the withheld views.
 
     Parameters
     ----------
     withhold : names of views, one of HALVES, AUTO or NONE
-    measurement : with all views
-    reconstructor : settings
-
-    Raises
-    ------
-    InputError
-        If a half is asked for without an axis, or more harmonics than the views could tell.
     """
     axis = None
     if isinstance(reconstructor, SharedSettings):
         check_views(reconstructor, measurement)
         if tuple(withhold) in [(half,) for half in HALVES]:
-            axis = axis_of(reconstructor, measurement)  # by both halves: one does not tell
-    parts, names = kept_half(measurement, withhold, None if axis is None else axis.symmetry)
+            axis = axis_of(reconstructor, measurement)  # from both halves: one does not determine it
+    parts, names = withhold_half(measurement, withhold, None if axis is None else axis.symmetry)
     if axis is not None and parts is not measurement:
         assert isinstance(reconstructor, SharedSettings)
         reconstructor = with_axis(reconstructor, axis.symmetry)
-    return parts, reconstructor, kept_out(names, parts.names)
+    return parts, reconstructor, withheld_views(names, parts.names)
 
 
 @dataclass(frozen=True)
-class FirstLook:
-    """The short run without a view, kept in the result directory.
+class CrossValidation:
+    """The short run without a view, in the result directory.
 
     Parameters
     ----------
     out : the result directory
     reconstructor : settings of the whole run
-    data : that the whole run reconstructs from
-    checkpoint_every : seconds
-    monitor : told how the work goes
-    afresh : whatever is in the directory
+    data : of the whole run
+    checkpoint_every : s
+    monitor : of the progress
+    restart : whether to ignore the content of the directory
     """
 
     out: ResultDirectory
@@ -90,50 +78,50 @@ class FirstLook:
     data: Measurement
     checkpoint_every: float = 60.0
     monitor: Monitor = QUIET
-    afresh: bool = False
+    restart: bool = False
 
     @property
     def view(self) -> str:
-        """Which is kept out: the one that the others cover best."""
+        """The withheld view: the one best covered by the others."""
         return best_covered(self.data.cameras)[0]
 
     @property
-    def begun(self) -> bool:
-        """Whether there is something of it to go on with."""
-        return self._run.begun
+    def resumable(self) -> bool:
+        """Whether there is a field or a checkpoint of it."""
+        return self._run.resumable
 
     def __call__(self, begin: OnStep) -> Reconstruction | None:
-        """Reconstruct without the view, or read what is there; None, which is told, where no field is found without it.
+        """Reconstruct without the view, or read the result; None if that yields no field.
 
         Parameters
         ----------
-        begin : told every step
+        begin : called after each step
         """
-        started, name, say = time.monotonic(), self.view, self.monitor.say
+        start, name, say = time.monotonic(), self.view, self.monitor.say
         try:
-            result = self._run(f"without {name} first", begin)
+            result = self._run(f"cross-validation without {name}", begin)
         except InputError as error:
-            say(f"no view is kept out first: without {name}, {error}")
+            say(f"cross-validation skipped: without {name}, {error}")
             return None
         if result.outcome.reason == "interrupted" or self.scores():
             return result
         if result.outcome.failed:
-            say(f"without {name}: {result.outcome.reason}; all views begin from nothing")
+            say(f"cross-validation without {name}: {result.outcome.reason}; the main run starts from the ambient field")
             return None
         other = best_covered(self.data.cameras)[1]
         with self.monitor.counting(f"predicting {name}"):
             pair = reproject(result.field, self.data.select([name, other]), [name], result.device, model=result.model)
             scores = evaluate_views(pair)
-        views, used = ([v for v in scores if v["withheld"] is held] for held in (True, False))
-        taken = time.monotonic() - started
+        views, fitted = ([v for v in scores if v["withheld"] is flag] for flag in (True, False))
+        entries = {"views": views, "fitted_views": fitted, "seconds": time.monotonic() - start}
         with self._directory.writing(SCORES) as path:
-            write_json(path, {"views": views, "fitted_views": used, "seconds": taken})
+            write_json(path, entries)
         for v in views:
-            say(f"{name}, not seen so far, is predicted with CC {v['cc']:.4f}, rms error {rms_text(v)}")
+            say(f"cross-validation: withheld view {name} predicted with CC {v['cc']:.4f}, rms error {rms_text(v)}")
         return result
 
     def scores(self) -> dict[str, Any]:
-        """Return how well the views were predicted, and in which time; nothing where they were not."""
+        """Return prediction errors and duration, empty if there are none yet."""
         path = self._directory / SCORES
         return json.loads(path.read_text()) if path.is_file() else {}
 
@@ -142,9 +130,9 @@ class FirstLook:
         return self.out.cross_validation
 
     @property
-    def _run(self) -> KeptRun:
-        rest = self.data.without([self.view])
-        first, _ = self.reconstructor.in_two()
-        return KeptRun(
-            self._directory, first, rest, None, {}, self.checkpoint_every, self.monitor, self.afresh, LIMITS
+    def _run(self) -> CheckpointedRun:
+        short, _ = self.reconstructor.in_two()
+        return CheckpointedRun(
+            self._directory, short, self.data.without([self.view]), checkpoint_every=self.checkpoint_every,
+            monitor=self.monitor, restart=self.restart, limits=LIMITS,
         )  # fmt: skip

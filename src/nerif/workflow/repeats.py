@@ -1,4 +1,4 @@
-"""The trials of the bootstrap in a result directory: each is kept when done; from all of them standard deviations."""
+"""Bootstrap trials in a result directory, and the standard deviations from them."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.uncertainty.bootstrap import Deviations, Found, Maps, Trials, certainty
+from nerif.reconstruction.uncertainty.bootstrap import Deviations, Maps, Original, Trials, certainty
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.checkpointed import KeptRun
+from nerif.workflow.checkpointed import CheckpointedRun
 
 __all__ = ["Members", "all_quantities"]
 
 
 def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
-    """Sample a reconstruction as all that follows from it, such as density, `voxels` along the longest edge."""
+    """Sample a field and all derived quantities, `voxels` along the longest edge."""
     return derive_all(result.volume(Grid.of_resolution(result.box, voxels)), gas)
 
 
 @dataclass(frozen=True)
 class Members:
-    """Trials of the bootstrap in a result directory.
+    """Bootstrap trials in a result directory.
 
     Parameters
     ----------
-    out : the directory, with the main result in it
-    trials : which, and how many
+    out : directory with the main result
+    trials : kind and number
     reconstructor : settings of the main result
-    training : what that was reconstructed from
-    start : field that every one starts from, or None
-    made_of : what else they depend on; those made of anything else are done again
-    checkpoint_every : seconds
-    monitor : told how the work goes
+    training : data of the main result
+    start : initial field, or None
+    dependencies : further inputs; a trial with others is repeated
+    checkpoint_every : s
+    monitor : of the progress
     """
 
     out: ResultDirectory
@@ -48,57 +48,54 @@ class Members:
     reconstructor: Reconstructor
     training: Measurement
     start: Field | None = None
-    made_of: Mapping[str, str] = field(default_factory=dict)
+    dependencies: Mapping[str, str] = field(default_factory=dict)
     checkpoint_every: float = 60.0
     monitor: Monitor = QUIET
 
     def add_to(self, main: Reconstruction, gas: GasSettings, voxels: int) -> None:
-        """Reconstruct them, and write standard deviations of every quantity beside the main result.
+        """Run the trials, and write standard deviations of every quantity beside the main result.
 
-        Those that an interrupted run of the same settings has left are not done again. An interruption leaves those
-        done so far. One that diverges is left out, and told.
+        Complete trials of an interrupted run are read; a diverged one is excluded.
         """
-        say, started, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
-        found = Found(main, self.reconstructor, self.training, lambda f: self._seen(f, main))
+        say, start, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
+        base = Original(main, self.reconstructor, self.training, lambda f: self._projections(f, main))
         with self.monitor.counting("sampling the field"):
             quantities = all_quantities(main, gas, voxels)
-        taken = Deviations(quantities[0], gas.for_field(quantities[0]), found)
+        deviations = Deviations(quantities[0], gas.for_field(quantities[0]), base)
         diverged = []
         for number in range(1, count + 1):
-            member = self.trials.member(number, found)
-            kept = KeptRun(
-                self.out.member(number), member.reconstructor, member.measurement, self.start, self.made_of,
+            member = self.trials.member(number, base)
+            run = CheckpointedRun(
+                self.out.member(number), member.reconstructor, member.measurement, self.start, self.dependencies,
                 self.checkpoint_every, self.monitor,
             )  # fmt: skip
-            result = kept(f"trial {number} of {count}{member.about}")
+            result = run(f"trial {number} of {count}")
             if result.outcome.reason == "interrupted":
-                say(f"{word}: interrupted after {number - 1} of {count} trials; --resume goes on")
+                say(f"{word}: interrupted after {number - 1} of {count} trials; continue with --resume")
                 break
             if result.outcome.failed:
-                say(f"{word}: trial {number} {result.outcome.reason} and is left out: {result.outcome.message}")
+                say(f"{word}: trial {number} {result.outcome.reason} and is excluded: {result.outcome.message}")
                 diverged.append(number)
                 continue
-            taken.add(member, result)
-        if not taken.count:
+            deviations.add(member, result)
+        if not deviations.count:
             say(f"{word}: no trial succeeded, so no standard deviation is written")
             return
-        volumes = [*quantities, *taken.volumes()]
-        excess = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
-        volumes.append(certainty(volumes[0], excess))
+        volumes = [*quantities, *deviations.volumes()]
+        std = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
+        volumes.append(certainty(volumes[0], std))
         self.out.write_volumes(volumes)
-        about: dict[str, Any] = {
-            "kind": self.trials.kind, "members": taken.count, "diverged": diverged,
-            "seconds": time.monotonic() - started,
+        entries: dict[str, Any] = {
+            "kind": self.trials.kind, "members": deviations.count, "diverged": diverged,
+            "seconds": time.monotonic() - start,
         }  # fmt: skip
-        self.out.add_metrics({word: about})
+        self.out.add_metrics({word: entries})
         for line in masked_lines(volumes):
             say(line)
-        largest = float(volumes[0].values.abs().max())
-        rms = float(excess.values.square().mean().sqrt())
-        share = f"{rms / largest:.2%} of the largest"
-        say(f"{word} of {taken.count}: rms standard deviation of {volumes[0].quantity} {rms:.3g}, {share}")
+        rms, largest = float(std.values.square().mean().sqrt()), float(volumes[0].values.abs().max())
+        size = f"rms standard deviation of {volumes[0].quantity} {rms:.3g}, {rms / largest:.2%} of the maximum"
+        say(f"{word} from {deviations.count} trials: {size}")
 
-    def _seen(self, field: Field, main: Reconstruction) -> Maps:
-        """What the views of the reconstruction would see of a field."""
-        with self.monitor.counting("measuring the field again") as bar:
+    def _projections(self, field: Field, main: Reconstruction) -> Maps:
+        with self.monitor.counting("projecting the field") as bar:
             return reproject(field, self.training, (), main.device, bar, main.model).maps

@@ -17,7 +17,7 @@ from nerif.app.live_view import LiveView
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
-from nerif.cli.commands.methods import RECORDS, Reconstruct
+from nerif.cli.commands.reconstruct import COMMANDS, Reconstruct
 from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -40,7 +40,7 @@ LABELS = {
 
 def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
     """Return the form of a method; the defaults of NeRIF are those of its preset."""
-    record = RECORDS[method](measurement=tyro.MISSING, out=tyro.MISSING, method=method)
+    record = COMMANDS[method](measurement=tyro.MISSING, out=tyro.MISSING, method=method)  # type: ignore[arg-type]
     if method == "nerif":
         record = replace(record, reconstructor=preset(preset_name), preset=preset_name)  # type: ignore[call-arg]
     return Form(record, without=WITHOUT, choices={"uncertainty": tuple(KINDS)})
@@ -48,7 +48,7 @@ def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
 
 def form_of_film(preset_name: str) -> Form[Sequence]:
     """Return the form of a film: where its frames are reconstructed, and how."""
-    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))
+    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))  # type: ignore[arg-type]
     return Form(record, without=FILM_WITHOUT)
 
 

@@ -1,4 +1,4 @@
-"""nerif design: what a rig will see, before it is built."""
+"""nerif design: predicted performance of a rig."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.cli.commands.output import check_file, say
-from nerif.cli.commands.settings import Flat, Settings, read_settings
-from nerif.common.conventions import InputError
+from nerif.cli.commands.output import check_output, say
+from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.geometry import Ring
 from nerif.simulation.design import DesignSettings, Expectation, expect
 
@@ -19,7 +18,7 @@ __all__ = ["Design", "main", "run"]
 
 @dataclass(frozen=True)
 class Design(Settings):
-    """Expected displacement, sensitivity, field of view, blur and resolution of a rig, before anyone drills a hole."""
+    """Predict displacement, sensitivity, field of view, blur and spatial resolution of a rig."""
 
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Drawing to write, .png or .pdf."""
@@ -30,38 +29,36 @@ class Design(Settings):
 
 
 def run(settings: Design) -> Expectation:
-    """Print what to expect, and draw it."""
+    """Print the prediction, and draw it."""
     if settings.out is not None:
-        if settings.out.suffix not in (".png", ".pdf"):
-            raise InputError(f"expected a name ending in .png or .pdf, got '{settings.out.name}'", field="out")
-        check_file(settings.out, settings.force)
+        check_output(settings.out, settings.force, endings=(".png", ".pdf"))
     result = expect(settings.ring, settings.flow)
-    _tell(result, settings.flow)
+    _print(result, settings.flow)
     if settings.out is not None:
         from nerif.report.design_figure import save_design
 
         save_design(settings.out, settings.ring, settings.flow)
-        say(f"{settings.out}: the rig, and what moving the background or stopping down would do")
+        say(f"{settings.out}: the rig, and the effect of background distance and f-number")
     return result
 
 
-def _tell(e: Expectation, flow: DesignSettings) -> None:
+def _print(e: Expectation, flow: DesignSettings) -> None:
     rows = (
         ("index contrast", f"{flow.contrast:.3g}", ""),
         ("field of view at the flow", f"{e.field_of_view[0]:.1f} x {e.field_of_view[1]:.1f} mm", "width x height"),
         ("pixel at the flow", f"{e.pixel_at_flow:.3f} mm", ""),
         ("pixel on the background", f"{e.pixel_at_background:.3f} mm", ""),
-        ("pattern to print", f"{e.background_size[0]:.0f} x {e.background_size[1]:.0f} mm", "a tenth to spare"),
+        ("pattern to print", f"{e.background_size[0]:.0f} x {e.background_size[1]:.0f} mm", "with a margin of 10 %"),
         ("dot of 3 px", f"{e.dot:.2f} mm", ""),
         ("sensitivity", f"{e.sensitivity:.3f} px/mrad", ""),
         ("largest deflection", f"{e.deflection:.3f} mrad", "by a Gaussian structure"),
         ("its displacement", f"{e.displacement:.3f} px", f"noise {flow.displacement_noise:g} px"),
         ("of a layer edge-on", f"{e.displacement_of_sheet:.2f} px", "upper bound"),
-        ("smallest index contrast", f"{e.smallest_contrast:.2g}", "whose displacement is the noise"),
+        ("smallest index contrast", f"{e.smallest_contrast:.2g}", "displacement equal to the noise"),
         ("cone of rays at the flow", f"{e.cone:.2f} mm", f"f/{flow.f_number:g}, focused on the background"),
         ("window of the optical flow", f"{e.window:.2f} mm", f"{flow.window:g} px"),
         ("diffraction", f"{e.diffraction:.2f} mm", ""),
-        ("spatial resolution", f"{e.resolution:.2f} mm", "the three together"),
+        ("spatial resolution", f"{e.resolution:.2f} mm", "cone, window and diffraction"),
     )
     for name, value, remark in rows:
         say(f"{name:<28}{value:>18}   {remark}".rstrip())
@@ -69,6 +66,4 @@ def _tell(e: Expectation, flow: DesignSettings) -> None:
         say(f"note: {note}")
 
 
-def main(arguments: list[str]) -> None:
-    """Parse and run."""
-    run(read_settings(Design(), arguments, "design"))
+main = command("design", Design, run)

@@ -1,4 +1,4 @@
-"""nerif displacement: from images of all views to a measurement."""
+"""nerif displacement: a measurement from the images of all views."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Ge
 
-from nerif.cli.commands.output import check_file, counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, read_settings
+from nerif.cli.commands.output import check_output, counting_bar, say
+from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
+from nerif.common.settings import Count, NonNegative
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.forward.deflection import Deflection
@@ -28,52 +30,52 @@ __all__ = ["Displacement", "main", "run"]
 
 @dataclass(frozen=True)
 class Displacement(Settings):
-    """Find the displacements of all views and write them, with the calibration, as a measurement.
+    """Compute the displacements of all views, and write them with the calibration as a measurement.
 
-    FOLDER has a folder for each view with VIEW/reference (images without flow; with three or more, the noise is taken
-    from them) and VIEW/flow (images with flow), or a views.toml that says where they are. VIEW/mask.png, if there is
-    one, tells where the flow is, VIEW/region.png where the background is seen.
+    FOLDER has for each view VIEW/reference (images without flow; three or more give the noise) and VIEW/flow (images
+    with flow), or a views.toml with their places. Optional: VIEW/mask.png (flow region), VIEW/region.png (visible
+    background).
     """
 
     folder: tyro.conf.Positional[Path]
     """Folder of the experiment."""
     calibration: Path
-    """Calibrated cameras: of nerif calibrate, or any file it can take over. Names are those of the views."""
+    """Calibrated cameras with the names of the views: output of nerif calibrate, or any file that it imports."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Measurement to write, NAME.nc, and NAME.png to show the displacements; NAME.zarr with --frames."""
+    """Measurement to write, NAME.nc, with a figure NAME.png; with --frames NAME.zarr."""
     lower: tuple[float, float, float] | None = None
-    """Lower corner (x y z) of the box to reconstruct, mm; default: the box of the calibration, if it holds one."""
+    """Lower corner x y z of the box to reconstruct, mm (default: box of the calibration)."""
     upper: tuple[float, float, float] | None = None
-    """Upper corner of the box, mm."""
+    """Upper corner x y z of the box, mm."""
     views: tuple[str, ...] = ()
-    """Only these views."""
-    frame: int = 0
-    """Which flow image to take."""
+    """Views to use (default: all)."""
+    frame: Annotated[int, Ge(0)] = 0
+    """Number of the flow image."""
     frames: str = ""
-    """Many flow images, all or FIRST:LAST (LAST not included): a sequence, --out NAME.zarr."""
+    """Flow images of a sequence: all, or FIRST:LAST (LAST excluded); requires --out NAME.zarr."""
     frame_rate: float = 0.0
-    """Flow images a second, where the recording does not tell."""
-    average: int = 1
-    """Number of flow images, from `frame` on, whose displacements are averaged."""
-    references: int = 100
-    """Most reference images to read; 0 for all."""
-    mask: float = 0.0
-    """Flow mask (for the visual hull) where |d| exceeds this many sigma; 0 for none. 4 is a good value."""
+    """Flow images per second (0: from the recording)."""
+    average: Count = 1
+    """Number of flow images, from --frame on, whose displacements are averaged."""
+    references: Annotated[int, Ge(0)] = 100
+    """Maximum number of reference images (0: all)."""
+    mask: NonNegative = 0.0
+    """Threshold of the flow mask for the visual hull: |d| in units of sigma, such as 4 (0: no mask)."""
     images: bool = True
-    """Keep the images beside the displacements, to reconstruct straight from them (not of averages or sequences)."""
+    """Store the images with the displacements, for reconstructions from images (not of averages or sequences)."""
     force: bool = False
     """Overwrite existing files."""
     surroundings: Annotated[Surroundings, Flat] = field(default_factory=Surroundings)
     method: Annotated[DisplacementSettings, Flat] = field(default_factory=DisplacementSettings)
 
     def recording(self) -> Recording:
-        """Find the images, the cameras and the box."""
+        """Return images, cameras and box."""
         from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 
         box = Box.between(self.lower, self.upper) or import_box(self.calibration)
         if box is None:
             raise InputError(
-                f"expected the corners of the box to reconstruct, since {self.calibration} holds none; "
+                f"expected the corners of the box to reconstruct, since {self.calibration} has none; "
                 "give --lower X Y Z and --upper X Y Z, mm",
                 field="lower, upper",
             )
@@ -85,25 +87,22 @@ class Displacement(Settings):
 
 
 def run(settings: Displacement) -> Measurement:
-    """Write the measurement, or the first frame's of a sequence."""
-    ending = ".zarr" if settings.frames else ".nc"
-    if settings.out.suffix != ending:
-        raise InputError(f"expected a name ending in {ending}, got '{settings.out.name}'", field="out")
-    for name, least in (("frame", 0), ("average", 1), ("references", 0), ("mask", 0)):
-        if not getattr(settings, name) >= least:
-            raise InputError(f"expected {least} or more, got {getattr(settings, name)}", field=name)
+    """Write the measurement, or a sequence, of which a complete frame is returned."""
+    image = settings.out.with_suffix(".png")
+    if settings.frames:  # a sequence that exists is continued
+        check_output(settings.out, True, endings=(".zarr",))
+    else:
+        check_output(settings.out, settings.force, image, endings=(".nc",))
     recording = settings.recording()
     box = recording.scene.box
     settings = replace(settings, lower=box.lower, upper=box.upper)
     if settings.frames:
-        return run_over_time(settings, recording).fullest()
-    image = settings.out.with_suffix(".png")
-    check_file(settings.out, settings.force, image)
-    with counting_bar("finding displacements", len(recording.views)) as bar:
+        return _run_over_time(settings, recording).fullest()
+    with counting_bar("computing displacements", len(recording.views)) as bar:
         numbers = range(settings.frame, settings.frame + settings.average)
         measurement, noise = measure_instant(recording, numbers, say, bar)
     measurement.write(settings.out)
-    _tell(measurement, noise)
+    _print(measurement, noise)
     from nerif.report.displacement_figure import save_displacements
 
     save_displacements(image, measurement)
@@ -111,26 +110,23 @@ def run(settings: Displacement) -> Measurement:
     return measurement
 
 
-def run_over_time(settings: Displacement, recording: Recording) -> MeasurementSequence:
-    """Write a measurement of every flow image asked for."""
+def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementSequence:
     if settings.average != 1 or settings.frame != 0:
-        raise InputError(
-            "expected neither with --frames, which takes every flow image by itself", field="frame, average"
-        )
+        raise InputError("expected none with --frames, which selects the flow images", field="frame, average")
     numbers = frame_numbers(settings.frames, recording.views)
     times = instants_of(numbers, recording.views[0], settings.frame_rate)
-    kept = {name: value for name, value in asdict(settings).items() if name not in ("out", "force", "config", "frames")}
-    begun = f"frames that are done are kept in {settings.out}; the same command goes on with the others"
+    attributes = {k: v for k, v in asdict(settings).items() if k not in ("out", "force", "config", "frames")}
+    remedy = f"complete frames are kept in {settings.out}; run the same command again to continue"
     count = len(recording.views) + len(numbers)
-    with if_interrupted(lambda: begun), counting_bar("references, then frames", count) as bar:
-        return measure_recording(recording, numbers, times, settings.out, kept, settings.force, say, bar)
+    with if_interrupted(lambda: remedy), counting_bar("references, then frames", count) as bar:
+        return measure_recording(recording, numbers, times, settings.out, attributes, settings.force, say, bar)
 
 
-def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
+def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:
     say(f"{'view':<12}{'valid':>8}{'rms d [px]':>12}{'max |d| [px]':>14}{'sigma [px]':>12}  noise from")
     assert measurement.sigma is not None
-    (found,) = (o for o in measurement.observations if o.technique is Deflection)
-    usable = measurement.usable_for(found)
+    (deflection,) = (o for o in measurement.observations if o.technique is Deflection)
+    usable = measurement.usable_for(deflection)
     for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
         d, sigma = measurement.displacements[i][usable[i]], measurement.sigma[i][usable[i]]
         share = len(d) / (camera.image_size[0] * camera.image_size[1])
@@ -140,7 +136,4 @@ def _tell(measurement: Measurement, noise: Mapping[str, str]) -> None:
         )
 
 
-def main(arguments: list[str]) -> None:
-    """Parse and run."""
-    missing = tyro.MISSING
-    run(read_settings(Displacement(folder=missing, calibration=missing, out=missing), arguments, "displacement"))
+main = command("displacement", Displacement, run)

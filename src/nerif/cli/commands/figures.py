@@ -1,17 +1,18 @@
-"""nerif figures: every figure of a result, as PDF and PNG for print."""
+"""nerif figures: the figures of a result for print."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
+from annotated_types import Ge, Le
 
 from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Settings, read_settings
+from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
-from nerif.report.pages import JOURNALS, save_figures
+from nerif.report.pages import save_figures
 from nerif.results.directory import FIGURES, ResultDirectory
 
 __all__ = ["Figures", "main", "run"]
@@ -24,19 +25,15 @@ class Figures(Settings):
     result: Annotated[Path, tyro.conf.Positional]
     """Result directory of nerif reconstruct."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder to write to; default: RESULT/figures."""
-    journal: str = "elsevier"
-    """Whose column widths: elsevier, aip, aps, nature or springer."""
-    dpi: int = 300
-    """Dots per inch of the PNG files."""
+    """Folder to write (default: RESULT/figures)."""
+    journal: Literal["elsevier", "aip", "aps", "nature", "springer"] = "elsevier"
+    """Journal whose column widths are used."""
+    dpi: Annotated[int, Ge(20), Le(2400)] = 300
+    """Resolution of the PNG files in dots per inch."""
 
 
 def run(settings: Figures) -> None:
-    """Write them, and say what could not be drawn."""
-    if settings.journal not in JOURNALS:
-        raise InputError(f"expected one of {', '.join(JOURNALS)}, got '{settings.journal}'", field="journal")
-    if not 20 <= settings.dpi <= 2400:
-        raise InputError(f"expected 20 to 2400 dots per inch, got {settings.dpi}", field="dpi")
+    """Write the figures, and print what could not be drawn."""
     result = ResultDirectory(settings.result).read()
     out = settings.out or settings.result / FIGURES
     if out.is_file():
@@ -45,12 +42,10 @@ def run(settings: Figures) -> None:
     with counting_bar("drawing figures"):
         paths = save_figures(result, out, settings.journal, settings.dpi)
     for gap in result.missing:
-        say(f"left out: {gap.sentence}")
+        say(f"not drawn: {gap.sentence}")
     if not paths:
         raise InputError(f"nothing to draw; {' '.join(gap.sentence for gap in result.missing)}", field=settings.result)
     say(f"{out}: {len(paths) // 2} figures, each as .pdf and .png")
 
 
-def main(arguments: list[str]) -> None:
-    """Parse and run."""
-    run(read_settings(Figures(tyro.MISSING), arguments, "figures"))
+main = command("figures", Figures, run)

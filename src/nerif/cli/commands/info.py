@@ -1,4 +1,4 @@
-"""nerif info: what a file or a result directory holds, in words."""
+"""nerif info: the content of a file or a result directory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerif.analysis.evaluation import rms_text
 from nerif.cli.commands.output import say
-from nerif.cli.commands.settings import Settings, read_settings
+from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.netcdf import opened
 from nerif.data.measurement import Measurement
@@ -29,14 +29,14 @@ __all__ = ["Info", "is_measurement", "main", "run"]
 
 @dataclass(frozen=True)
 class Info(Settings):
-    """Print what a measurement, a volume or a result directory holds."""
+    """Describe a measurement, a volume or a result directory."""
 
     path: Annotated[Path, tyro.conf.Positional]
     """Measurement (.nc), volume (.nc, .vti) or result directory."""
 
 
 def run(settings: Info) -> None:
-    """Print it."""
+    """Print the description."""
     path = settings.path
     if path.is_dir():
         _result(path)
@@ -47,12 +47,12 @@ def run(settings: Info) -> None:
 
 
 def is_measurement(path: Path) -> bool:
-    """Return whether a NetCDF file is a measurement: that says BOST, a volume CF; what says nothing counts as one."""
+    """Return whether a NetCDF file is a measurement rather than a volume, by conventions, variables or coordinates."""
     try:
         with opened(path, "a measurement or a volume") as dataset:
-            said = known_conventions(dataset.attrs.get("Conventions"))
-            said = said or any(kind.measured in dataset for kind in TECHNIQUES.values())
-            return said or not {"x", "y", "z"} <= set(dataset.coords)
+            maps = any(kind.measured in dataset for kind in TECHNIQUES.values())
+            volume = {"x", "y", "z"} <= set(dataset.coords)
+            return known_conventions(dataset.attrs.get("Conventions")) or maps or not volume
     except InputError:
         return True
 
@@ -76,44 +76,41 @@ def _measurement(path: Path, m: Measurement) -> None:
         rms = _rms(values, kind.unit)
         noise = "unknown" if sigma is None else f"rms {_rms(sigma, kind.unit)}"
         say(f"  {kind.name:<14} {len(rays)} rays cross the box; rms {kind.measured} {rms}; sigma {noise}")
-    say(f"  masked         {m.bad_pixels} pixels whose value or sigma is NaN, infinite or impossible")
+    say(f"  masked         {m.bad_pixels} pixels with NaN, infinite or impossible value or sigma")
     for camera in m.cameras:
         if camera.unseen:
-            say(f"  distortion     cannot be inverted for {camera.unseen:.1%} of the pixels of '{camera.name}'")
+            say(f"  distortion     not invertible for {camera.unseen:.1%} of the pixels of '{camera.name}'")
     lenses = {c.lens for c in m.cameras if c.lens is not None}
     for edge in sorted({lens.window for lens in lenses if lens.window}):
-        say(f"  window         {edge:g} px, over which displacements are means")
+        say(f"  window         {edge:g} px, over which displacements are averaged")
     for lens in sorted((lens for lens in lenses if lens.diameter), key=lambda lens: lens.diameter):
-        focus = "their backgrounds" if lens.focus is None else f"{lens.focus:g} mm"
+        focus = "the backgrounds" if lens.focus is None else f"{lens.focus:g} mm"
         say(f"  aperture       {lens.diameter:.4g} mm, focused on {focus}")
-    sure = [c.pose_sigma for c in m.cameras if c.pose_sigma is not None]
-    if sure:
-        turn, shift = (float(torch.stack(sure)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
-        say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (--refine cameras goes by it)")
+    sigmas = [c.pose_sigma for c in m.cameras if c.pose_sigma is not None]
+    if sigmas:
+        turn, shift = (float(torch.stack(sigmas)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
+        say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (for --refine cameras)")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
     columns = "".join(f"{f'rms {o.label}':>24}" for o in m.observations)
     say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable{columns}")
     usable, masks = m.usable, [m.usable_for(o) for o in m.observations]
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
-        away, pixel = float(c.distance(centre)), float(c.pixel_size(centre))
-        plane = c.background
+        distance, pixel, plane = float(c.distance(centre)), float(c.pixel_size(centre)), c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
-        good = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
-        sizes = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:24.4f}" for x in good)
+        data = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
+        rms = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:24.4f}" for x in data)
         share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
         size = f"{c.image_size[0]} x {c.image_size[1]}"
-        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {away:23.1f} {behind:>20} {share:8.1%}{sizes}")
+        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {distance:23.1f} {behind:>20} {share:8.1%}{rms}")
 
 
 def _volume(path: Path, v: Volume) -> None:
     say(f"{path}: volume of {v.quantity} [{v.unit}] on {' x '.join(map(str, v.grid.shape))} voxels (z, y, x)")
     say(f"  box            {_corners(v.grid.box.lower, v.grid.box.upper)}")
-    known = v.values[v.values.isfinite()]
-    low, high, mean = (
-        (float(x) for x in (known.min(), known.max(), known.mean())) if len(known) else (float("nan"),) * 3
-    )
-    say(f"  values         {low:.6g} to {high:.6g}, mean {mean:.6g}")
+    finite = v.values[v.values.isfinite()]
+    finite = finite if len(finite) else torch.full((1,), torch.nan)
+    say(f"  values         {finite.min():.6g} to {finite.max():.6g}, mean {finite.mean():.6g}")
     for name, value in {**v.attributes, **v.notes}.items():
         say(f"  {name:<14} {value}")
 
@@ -127,17 +124,15 @@ def _result(path: Path) -> None:
     if quantity == INDEX:
         say(f"  n_ambient      {n_ambient:.8g}")
     if not directory.has(METRICS):
-        say(f"  {METRICS} is missing; the run may not have ended")
+        say(f"  {METRICS} is missing; the run is not complete")
         return
     metrics = directory.metrics()
     for name, value in metrics.items():
         if not isinstance(value, list | dict):
             say(f"  {name:<18} {value}")
     for v in metrics.get("views", []):
-        held = "held out" if v["withheld"] else "training"
-        say(f"  view {v['name']:<14} {held}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_text(v)}")
+        use = "withheld" if v["withheld"] else "training"
+        say(f"  view {v['name']:<14} {use}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_text(v)}")
 
 
-def main(arguments: list[str]) -> None:
-    """Parse and run."""
-    run(read_settings(Info(tyro.MISSING), arguments, "info"))
+main = command("info", Info, run)

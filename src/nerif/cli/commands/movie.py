@@ -8,9 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from nerif.cli.commands.output import check_file, counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, read_settings
-from nerif.common.conventions import InputError
+from nerif.cli.commands.output import check_output, counting_bar, say
+from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.common.settings import Count
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.report.movie import Movie, frames_there
 
@@ -19,14 +19,14 @@ __all__ = ["MovieCommand", "main", "run"]
 
 @dataclass(frozen=True)
 class MovieCommand(Settings):
-    """Draw an isosurface or slices of a sequence over time, off-screen, as .mp4 or .gif."""
+    """Draw an isosurface or slices of a sequence over time as .mp4 or .gif, without a window."""
 
     result: Annotated[Path, tyro.conf.Positional]
-    """Result of nerif sequence (.zarr), finished or not, or the truth of nerif simulate --times."""
+    """Result of nerif sequence (.zarr), complete or not, or true field of nerif simulate --times."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Movie to write: NAME.mp4 (H.264) or NAME.gif."""
-    every: int = 1
-    """Take every so many frames."""
+    every: Count = 1
+    """Draw every Nth frame."""
     force: bool = False
     """Overwrite an existing file."""
     look: Annotated[Movie, Flat] = field(default_factory=Movie)
@@ -34,20 +34,15 @@ class MovieCommand(Settings):
 
 def run(settings: MovieCommand) -> None:
     """Write the movie."""
-    if settings.every < 1:
-        raise InputError(f"expected 1 or more, got {settings.every}", field="every")
-    check_file(settings.out, settings.force)
+    check_output(settings.out, settings.force)
     store = VolumeSequence(settings.result)
-    there = frames_there(store)
-    frames = there[:: settings.every]
+    complete = frames_there(store)
+    frames = complete[:: settings.every]
     with counting_bar("drawing frames", len(frames)) as bar:
         settings.look.write(settings.out, store, frames, bar)
-    seconds = len(frames) / settings.look.frames_per_second
-    say(f"{settings.out}: {len(frames)} frames, {seconds:.1f} s")
-    if len(there) < len(store):
-        say(f"{len(store) - len(there)} frames are missing or failed and were left out")
+    say(f"{settings.out}: {len(frames)} frames, {len(frames) / settings.look.frames_per_second:.1f} s")
+    if len(complete) < len(store):
+        say(f"{len(store) - len(complete)} missing or failed frames were left out")
 
 
-def main(arguments: list[str]) -> None:
-    """Parse and run."""
-    run(read_settings(MovieCommand(result=tyro.MISSING, out=tyro.MISSING), arguments, "movie"))
+main = command("movie", MovieCommand, run)

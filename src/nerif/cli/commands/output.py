@@ -1,4 +1,4 @@
-"""Where results go, and what is said on the way."""
+"""Output of the commands: lines, progress bars, Ctrl-C, and checks of output files."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from nerif.common.conventions import InputError
 from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
 
-__all__ = ["MONITOR", "check_file", "counting_bar", "figures_bar", "say", "silence"]
+__all__ = ["MONITOR", "check_output", "counting_bar", "figures_bar", "say", "silence"]
 
-SAME_SIGNAL = 0.5  # seconds
-SOON, EVERY = 2.0, 15.0  # seconds before the first line without a terminal, and between lines
+SAME_SIGNAL = 0.5  # s, within which a second Ctrl-C is the first one, passed on by a launcher such as torchrun
+FIRST_LINE, LINE_INTERVAL = 2.0, 15.0  # s, of progress without a terminal
 
 
 def say(text: str) -> None:
-    """Print a line for the user."""
+    """Print a line."""
     print(text, flush=True)
 
 
-def say_on(text: str) -> None:
-    """Print a line of long work, which goes on where nobody reads any more."""
+def _say_safely(text: str) -> None:
+    """Print a line of long work, which continues if standard output is closed."""
     try:
         say(text)
     except BrokenPipeError:
@@ -35,60 +35,60 @@ def say_on(text: str) -> None:
 
 
 def silence() -> None:
-    """Let what is still printed go nowhere."""
+    """Discard all further standard output."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def check_file(path: Path, force: bool, *others: Path) -> None:
-    """Refuse an output file that exists (unless forced) or whose folder does not."""
+def check_output(path: Path, force: bool, *others: Path, endings: tuple[str, ...] = ()) -> None:
+    """Check the ending of an output file (--out), that its folder exists, and that nothing is overwritten unasked.
+
+    Parameters
+    ----------
+    others : files written beside it
+    """
+    if endings and path.suffix not in endings:
+        raise InputError(f"expected a name ending in {' or '.join(endings)}, got '{path.name}'", field="out")
     for file in (path, *others):
         if not file.parent.is_dir():
-            raise InputError(f"the folder {file.parent} does not exist; make it first", field=file)
-        if file.is_dir():
-            raise InputError("expected the name of a file to write, got a folder", field=file)
+            raise InputError(f"the folder {file.parent} does not exist; create it", field=file)
+        if file.is_dir() and file.suffix != ".zarr":
+            raise InputError("expected the name of a file, got a folder", field=file)
         if file.exists() and not force:
             raise InputError("exists already and was left as it is; give another --out, or --force", field=file)
 
 
 @contextmanager
-def interruptible() -> Iterator[list[bool]]:
-    """Turn the first Ctrl-C into a request to stop (the list becomes [True]); the second one breaks off.
-
-    A second signal at once is the same Ctrl-C, passed on by a launcher such as torchrun.
-    """
-    asked, first = [False], [0.0]
+def _interruptible() -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C into a request to stop, given by a callable; the second one interrupts."""
+    times: list[float] = []
 
     def handler(number: int, frame: object) -> None:
-        if asked[0] and time.monotonic() - first[0] > SAME_SIGNAL:
+        times.append(time.monotonic())
+        if len(times) == 1:
+            print("\nstopping after this step; Ctrl-C again to interrupt", file=sys.stderr, flush=True)
+        elif times[-1] - times[0] > SAME_SIGNAL:
             raise KeyboardInterrupt
-        if asked[0]:
-            return
-        asked[0], first[0] = True, time.monotonic()
-        print("\nstopping after this step; Ctrl-C again to break off", file=sys.stderr, flush=True)
 
     try:
         before = signal.signal(signal.SIGINT, handler)
-    except ValueError:  # not in the main thread: nothing to catch here
-        yield asked
+    except ValueError:  # signals reach the main thread only
+        yield lambda: False
         return
     try:
-        yield asked
+        yield lambda: bool(times)
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
 def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """Show a bar that goes away when done: a callable that is told how many are done, and out of how many.
-
-    Without a terminal it is a line after SOON seconds, and one EVERY so many, also between counts.
-    """
+    """Give a callback (done, total) that updates a progress bar, or lines of text without a terminal."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        with _lines(title, total) as update:
+        with _counting_lines(title, total) as update:
             yield update
         return
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())  # title, bar, percent, time left; m/n
@@ -96,59 +96,56 @@ def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[...,
         task = bar.add_task(title, total=total)
 
         def update(done: int, of: int | None = None) -> None:
-            bar.update(task, completed=done, total=total if of is None else of)
+            bar.update(task, completed=done, total=of or total)
 
         yield update
 
 
 @contextmanager
-def _lines(title: str, total: int | None) -> Iterator[Callable[..., None]]:
-    """Tell how far work is in lines, from a thread of their own: a callable as counting_bar gives it."""
-    so_far, done = [""], threading.Event()
+def _counting_lines(title: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """Print progress at intervals from a thread, also between counts."""
+    count, finished = [""], threading.Event()
 
-    def update(count: int, of: int | None = None) -> None:
-        whole = total if of is None else of
-        so_far[0] = f" {count}" + (f"/{whole}" if whole else "")
+    def update(done: int, of: int | None = None) -> None:
+        count[0] = f" {done}" + (f"/{of or total}" if of or total else "")
 
-    def tell() -> None:
-        begun, wait = time.monotonic(), SOON
-        while not done.wait(wait):
-            print(f"{title}{so_far[0]}, {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
-            wait = EVERY
+    def print_lines() -> None:
+        start, wait = time.monotonic(), FIRST_LINE
+        while not finished.wait(wait):
+            print(f"{title}{count[0]}, {time.monotonic() - start:.0f} s", file=sys.stderr, flush=True)
+            wait = LINE_INTERVAL
 
-    teller = threading.Thread(target=tell, daemon=True)
-    teller.start()
+    thread = threading.Thread(target=print_lines, daemon=True)
+    thread.start()
     try:
         yield update
     finally:
-        done.set()
-        teller.join()
+        finished.set()
+        thread.join()
 
 
 @contextmanager
 def figures_bar(title: str) -> Iterator[Callable[[float, str, float], None]]:
-    """Show a bar with figures beside it: a callable that is told the share done, the figures, and the seconds so far.
-
-    Without a terminal it is a line every 15 s, and one at the end.
-    """
+    """Give a callback (progress from 0 to 1, figures, seconds) that updates a bar with figures beside it."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
     console = Console(stderr=True)
     columns = (TextColumn(title), BarColumn(bar_width=20), TextColumn("{task.percentage:3.0f}% {task.fields[figures]}"))
-    last = [0.0]
+    last_line = 0.0
     bar = Progress(
         *columns, console=console, disable=not console.is_terminal, refresh_per_second=4,
-        redirect_stdout=sys.stdout.isatty(),  # a file gets its lines, the bar or none
+        redirect_stdout=sys.stdout.isatty(),  # not where standard output is a file
     )  # fmt: skip
     task = bar.add_task(title, total=1.0, figures="")
 
-    def update(share: float, figures: str, seconds: float) -> None:
+    def update(progress: float, figures: str, seconds: float) -> None:
+        nonlocal last_line
         bar.start()
-        bar.update(task, completed=share, figures=figures)
-        if not console.is_terminal and (share >= 1 or seconds - last[0] >= 15):
-            last[0] = seconds
-            print(f"{title} {share:4.0%} {figures}", file=sys.stderr, flush=True)
+        bar.update(task, completed=progress, figures=figures)
+        if not console.is_terminal and (progress >= 1 or seconds - last_line >= LINE_INTERVAL):
+            last_line = seconds
+            print(f"{title} {progress:4.0%} {figures}", file=sys.stderr, flush=True)
 
     try:
         yield update
@@ -158,13 +155,13 @@ def figures_bar(title: str) -> Iterator[Callable[[float, str, float], None]]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[OnStep]:
-    """Show a bar of the training: a callable for each Step, with epoch, loss terms, rays/s and time left."""
+    """Give a callback for each Step that shows epoch, loss terms, rays/s and remaining time."""
     with figures_bar(title) as bar:
 
         def update(step: Step) -> None:
-            left = step.seconds * (1 / step.progress - 1) if step.progress > 0.001 else float("nan")
+            remaining = step.seconds * (1 / step.progress - 1) if step.progress > 0.001 else float("nan")
             terms = " ".join(f"{k} {v:.3g}" for k, v in step.losses.items())
-            figures = f"epoch {step.epoch:.1f} | {terms} | {step.rays_per_second:.3g} rays/s | {left:.0f} s left"
+            figures = f"epoch {step.epoch:.1f} | {terms} | {step.rays_per_second:.3g} rays/s | {remaining:.0f} s left"
             bar(step.progress, figures, step.seconds)
 
         yield update
@@ -172,15 +169,15 @@ def progress_bar(title: str) -> Iterator[OnStep]:
 
 @contextmanager
 def _training(title: str) -> Iterator[OnStep]:
-    """A bar of the training that Ctrl-C stops after the step it is in."""
-    with interruptible() as asked, progress_bar(title) as bar:
-        yield compose(bar, _say_note, lambda _: asked[0])
+    """Give a callback for each Step that shows progress, prints notes, and stops after Ctrl-C."""
+
+    def print_note(step: Step) -> None:
+        if step.note:
+            _say_safely(step.note)
+
+    with _interruptible() as stop, progress_bar(title) as bar:
+        yield compose(bar, print_note, lambda _: stop())
 
 
-def _say_note(step: Step) -> None:
-    if step.note:
-        say_on(step.note)
-
-
-MONITOR = Monitor(say_on, _training, counting_bar)
-"""The terminal, as the library tells it how the work goes."""
+MONITOR = Monitor(_say_safely, _training, counting_bar)
+"""Progress on the terminal."""

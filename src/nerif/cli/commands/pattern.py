@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.cli.commands.output import check_file, say
-from nerif.cli.commands.settings import Flat, Settings, read_settings, value_given
+from nerif.cli.commands.output import check_output, say
+from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.common.conventions import InputError
 from nerif.imaging import patterns as background
 from nerif.imaging.calibration import targets
@@ -21,12 +21,12 @@ __all__ = ["PrintBackground", "PrintTarget", "main", "run"]
 
 @dataclass(frozen=True)
 class Pattern(Settings):
-    """What the settings of every kind of pattern hold."""
+    """Settings of every kind of pattern."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """File to write: .pdf (true size, with a scale bar) or .png (true size by its resolution)."""
+    """File to write, in true size: .pdf (with a scale bar) or .png."""
     dpi: float = 600.0
-    """Of the printer; coarser where a dot has 12 pixels already."""
+    """Resolution in dots per inch; reduced where a dot has 12 pixels already."""
     force: bool = False
     """Overwrite an existing file."""
 
@@ -35,7 +35,7 @@ class Pattern(Settings):
 class PrintBackground(Pattern):
     """Write a background to print (--kind dots, wavelet, multiscale).
 
-    --kind chessboard, charuco or circles writes a calibration target; --kind charuco --help tells its options.
+    --kind chessboard, charuco or circles writes a calibration target; --kind charuco --help lists its options.
     """
 
     pattern: Annotated[Background, Flat] = field(default_factory=Background)
@@ -50,22 +50,21 @@ class PrintTarget(Pattern):
 
 def run(settings: PrintBackground | PrintTarget) -> None:
     """Write the pattern."""
-    check_file(settings.out, settings.force)
+    check_output(settings.out, settings.force)
     pattern = settings.pattern
     print_pattern(settings.out, pattern, settings.dpi)
     width, height = pattern.size
-    paper = paper_for(settings.out, pattern)
-    say(f"{settings.out}: {pattern.label}; {width:.1f} x {height:.1f} mm, fits on {paper}")
-    say("print at 100 % (no fitting to the page), and measure it with a ruler before use")
+    say(f"{settings.out}: {pattern.label}; {width:.1f} x {height:.1f} mm, fits on {paper_for(settings.out, pattern)}")
+    say("print at 100 % (not scaled to the page), and verify the size with a ruler")
 
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    kind = value_given("kind", arguments, Background.kind)
-    if kind in targets.KINDS:
-        run(read_settings(PrintTarget(tyro.MISSING, pattern=CalibrationTarget(kind)), arguments, "pattern"))
-    elif kind in background.KINDS:
-        run(read_settings(PrintBackground(tyro.MISSING, pattern=Background(kind)), arguments, "pattern"))
-    else:
+    kind = setting_of("kind", arguments, Background.kind)
+    if kind not in (*background.KINDS, *targets.KINDS):
         kinds = ", ".join((*background.KINDS, *targets.KINDS))
         raise InputError(f"expected one of {kinds}, got '{kind}'", field="kind")
+    if kind in targets.KINDS:
+        run(read_settings(PrintTarget(tyro.MISSING, pattern=CalibrationTarget(kind)), arguments, "pattern"))
+    else:
+        run(read_settings(PrintBackground(tyro.MISSING, pattern=Background(kind)), arguments, "pattern"))

@@ -2,41 +2,96 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from nerif.cli.commands.methods import RECORDS, Reconstruct
+from nerif.cli.commands.help import grouped_help
 from nerif.cli.commands.output import MONITOR
-from nerif.cli.commands.settings import flag_value, read_settings, value_given
+from nerif.cli.commands.settings import Flat, Settings, flag_value, read_settings, setting_of
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
-from nerif.reconstruction.base import OnStep, Reconstruction, Step
+from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step
+from nerif.reconstruction.methods import METHODS
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import preset
 from nerif.results.directory import RUN
+from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
 
-__all__ = ["main", "run"]
+__all__ = ["COMMANDS", "Reconstruct", "ReconstructNeRIF", "main", "run"]
 
-SCALARS_EVERY = 5.0  # seconds, where twenty steps take longer
+SCALAR_STEPS, SCALAR_SECONDS = 20, 5.0  # between TensorBoard scalars, whichever is shorter
+
+
+@dataclass(frozen=True)
+class Reconstruct(Settings):
+    """Reconstruct the field of a measurement and write a result directory."""
+
+    measurement: Annotated[Path, tyro.conf.Positional]
+    """Measurement file (.nc); may be omitted with --resume."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Result directory to write."""
+    method: Literal["nerif", "tikhonov", "landweber", "tv", "mlem", "mart"] = "nerif"
+    """Reconstruction method; --method NAME --help lists its options."""
+    force: bool = False
+    """Overwrite an existing result directory."""
+    resume: bool = False
+    """Continue an interrupted run in --out; limits such as --epochs or --iterations may be raised."""
+    tensorboard: bool = False
+    """Write TensorBoard scalars to OUT/tensorboard."""
+    live: bool = False
+    """Write OUT/live.json and OUT/live.npz during the run, for nerif app."""
+    run: Annotated[Run, Flat] = field(default_factory=Run)
+    reconstructor: Annotated[Reconstructor, tyro.conf.Suppress] = field(default_factory=NeRIF)
+
+
+@dataclass(frozen=True)
+class ReconstructNeRIF(Reconstruct):
+    """Reconstruct the field of a measurement by a neural field and write a result directory."""
+
+    preset: Literal["auto", "fast", "best", "paper"] = "auto"
+    """Default settings: fast (CPU), best (GPU), paper, or auto (best with a GPU, else fast)."""
+    voxels: int = 100
+    """Voxels of the written volume along the longest edge of the box."""
+    reconstructor: Annotated[NeRIF, Flat] = field(default_factory=NeRIF)
+
+
+def _command_of(method: str, kind: type[Reconstructor]) -> type[Reconstruct]:
+    """Return the settings of the command for a method: the common ones and those of the method."""
+    namespace = {
+        "__module__": __name__,
+        "__doc__": f"{inspect.getdoc(Reconstruct)}\n\n{(inspect.getdoc(kind) or '').splitlines()[0]}",
+        "__annotations__": {"method": Reconstruct.__annotations__["method"], "reconstructor": Annotated[kind, Flat]},
+        "method": method,
+        "reconstructor": field(default_factory=kind),
+    }
+    return dataclass(frozen=True)(type(f"Reconstruct{kind.__name__}", (Reconstruct,), namespace))
+
+
+COMMANDS = {method: _command_of(method, kind) for method, kind in METHODS.items()} | {"nerif": ReconstructNeRIF}
+"""Settings by method."""
 
 
 def run(settings: Reconstruct) -> Reconstruction:
-    """Reconstruct, and write everything that docs/formats.md lists."""
+    """Reconstruct, and write the files of docs/formats.md."""
+    attributes = {"preset": getattr(settings, "preset", None), "tensorboard": settings.tensorboard}
     with _scalars(settings) as scalars:
         return reconstruct_into(
             settings.out, settings.measurement, settings.reconstructor, settings.run,
-            voxels=settings.volume_voxels, resume=settings.resume, force=settings.force, keep=settings.kept,
+            voxels=getattr(settings, "voxels", None), resume=settings.resume, force=settings.force, keep=attributes,
             on_step=scalars, monitor=MONITOR, live=settings.live,
         )  # fmt: skip
 
 
 @contextmanager
 def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
-    """Give the callback that writes TensorBoard scalars, if asked for."""
+    """Give a callback that writes TensorBoard scalars, if requested."""
     if not settings.tensorboard:
         yield None
         return
@@ -45,16 +100,17 @@ def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
     except ImportError:
         raise InputError(f"not installed; {install('tensorboard')}", field="tensorboard") from None
     with ExitStack() as stack:
-        writer: list[SummaryWriter] = []
-        written = [0.0]
+        writer: SummaryWriter | None = None
+        last = 0.0
 
         def write(step: Step) -> None:
-            if not writer:  # the directory is looked at before the first step, and must be as it was until then
-                writer.append(stack.enter_context(SummaryWriter(str(settings.out / "tensorboard"))))
-            if step.step % 20 == 0 or step.seconds - written[0] >= SCALARS_EVERY:
-                written[0] = step.seconds
+            nonlocal writer, last
+            if writer is None:  # only now: the run checks and prepares the directory before its first step
+                writer = stack.enter_context(SummaryWriter(str(settings.out / "tensorboard")))
+            if step.step % SCALAR_STEPS == 0 or step.seconds - last >= SCALAR_SECONDS:
+                last = step.seconds
                 for name, value in {**step.losses, "rays_per_second": step.rays_per_second}.items():
-                    writer[0].add_scalar(name, value, step.step)
+                    writer.add_scalar(name, value, step.step)
 
         yield write
 
@@ -66,14 +122,18 @@ def main(arguments: list[str]) -> None:
         file = Path(out) / RUN
         if not file.is_file():
             raise InputError(f"expected an interrupted run to resume, got no {RUN} in it", field=out)
-    method = value_given("method", arguments, "nerif", file)
-    if method not in RECORDS:
-        raise InputError(f"expected one of {', '.join(RECORDS)}, got '{method}'", field="method")
-    chosen: dict[str, Any] = {"method": method}
+    method = setting_of("method", arguments, "nerif", file)
+    if method not in COMMANDS:
+        raise InputError(f"expected one of {', '.join(COMMANDS)}, got '{method}'", field="method")
+    defaults: dict[str, Any] = {"measurement": tyro.MISSING, "out": tyro.MISSING, "method": method}
     if method == "nerif":
-        name = value_given("preset", arguments, "auto", file)
-        # settings of a file are complete: there the preset has had its say already
-        chosen |= {"preset": name, "reconstructor": preset(name)}
-    default = RECORDS[method](measurement=tyro.MISSING, out=tyro.MISSING, **chosen)
-    if run(read_settings(default, arguments, "reconstruct", file)).outcome.failed:
+        name = setting_of("preset", arguments, "auto", file)
+        defaults |= {"preset": name, "reconstructor": preset(name)}
+    if arguments[-2:] == ["--help", "all"]:
+        arguments = arguments[:-1]
+    elif {"-h", "--help"} & set(arguments):
+        default = COMMANDS[method](**defaults)
+        print(grouped_help(default, "nerif reconstruct", inspect.getdoc(type(default)) or ""), end="")
+        return
+    if run(read_settings(COMMANDS[method](**defaults), arguments, "reconstruct", file)).outcome.failed:
         raise SystemExit(1)

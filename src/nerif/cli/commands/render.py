@@ -1,4 +1,4 @@
-"""nerif render: images of a whole experiment with a phantom, and its truth."""
+"""nerif render: images of an experiment with a phantom, and the true field."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, read_settings
+from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import AMBIENT_INDEX
 from nerif.common.interruption import if_interrupted
 from nerif.fields.phantoms import make_phantom
@@ -23,53 +23,49 @@ __all__ = ["Render", "main", "run"]
 
 @dataclass(frozen=True)
 class Render(Settings):
-    """Render the images that a rig would take: targets, background without and with flow; the truth comes with them.
+    """Render the images that a rig would take: targets, background without and with flow; and write the true field.
 
     In the folder OUT: VIEW/target, VIEW/background, VIEW/reference, VIEW/flow for nerif calibrate and nerif
-    displacement; calibrate.toml, the settings for the former; truth/calibration.toml and truth/volume.nc to
-    compare with.
+    displacement; calibrate.toml with the settings of the former; truth/calibration.toml and truth/volume.nc.
     """
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder to write."""
     phantom: str = "flame"
-    """One of gaussians, flame, octahedron, turbulence, fire, gaussian-jet, plume, underexpanded, 1-7 (the paper's
-    numbers)."""
+    """Phantom: gaussians, flame, octahedron, turbulence, fire, gaussian-jet, plume, underexpanded, or 1 to 7 (numbers
+    of the paper)."""
     phantom_seed: int = 0
-    """Of the phantom."""
+    """Random seed of the phantom."""
     box: tuple[float, float, float] = (50.0, 50.0, 50.0)
-    """Edges of the box around the origin, along x y z, mm."""
+    """Edges of the box, centred on the origin, along x y z, mm."""
     n_ambient: float = AMBIENT_INDEX
     """Refractive index around the flow."""
     f_number: float = 0.0
-    """Focal length over aperture of the lenses, focused on the backgrounds; 0 for pinholes."""
+    """f-number of the lenses, focused on the backgrounds (0: pinholes)."""
     truth_voxels: int = 100
-    """Voxels of the truth along the longest edge."""
+    """Voxels of the true field along the longest edge."""
     force: bool = False
-    """Write into a folder that holds something."""
+    """Write into a folder that is not empty."""
     images: Annotated[Experiment, Flat] = field(default_factory=Experiment)
     ring: Annotated[Ring, Flat] = field(default_factory=Ring)
 
 
 def run(settings: Render) -> None:
-    """Write images and truth."""
+    """Write images and true field."""
     ResultDirectory(settings.out).check_free(settings.force)
     cameras, images = settings.ring.cameras(settings.f_number), settings.images
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
-    begun = f"{settings.out} lacks images; the same command with --force starts again"
-    with if_interrupted(lambda: begun), counting_bar("rendering", images.images(len(cameras))) as bar:
+    remedy = f"{settings.out} lacks images; run the same command with --force to start again"
+    with if_interrupted(lambda: remedy), counting_bar("rendering", images.images(len(cameras))) as bar:
         images.write(
             settings.out, cameras, phantom, box, settings.n_ambient, settings.truth_voxels,
             lambda: bar(next(count)),
         )  # fmt: skip
-    target = images.target_for(cameras)
     say(f"{settings.out}: images of {len(cameras)} views, {images.sensor.bits} bit")
-    say(f"target: {target.label}")
+    say(f"target: {images.target_for(cameras).label}")
     say(f"next: nerif calibrate {settings.out} --config {settings.out / 'calibrate.toml'} -o calibration.toml")
 
 
-def main(arguments: list[str]) -> None:
-    """Parse and run."""
-    run(read_settings(Render(out=tyro.MISSING), arguments, "render"))
+main = command("render", Render, run)

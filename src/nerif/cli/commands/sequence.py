@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
+from annotated_types import Ge
 
 from nerif.cli.commands.output import MONITOR, figures_bar
-from nerif.cli.commands.settings import Flat, Settings, read_settings, value_given
+from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import preset
 from nerif.workflow.sequence.plan import SequenceSettings
@@ -22,41 +23,40 @@ __all__ = ["Sequence", "main", "run"]
 
 @dataclass(frozen=True)
 class Sequence(Settings):
-    """Reconstruct every frame of a measurement sequence into a Zarr store, which xarray opens at any time.
+    """Reconstruct every frame of a measurement sequence into a Zarr store, which xarray can open at any time.
 
-    The same command again does only what is missing. Frames are reconstructed in chunks of time, which run side by
-    side; within a chunk each frame starts from the one before it.
+    The same command continues an incomplete store. Chunks of time run in parallel; within a chunk each frame starts
+    from the previous one.
     """
 
     measurement: Annotated[Path, tyro.conf.Positional]
-    """Measurement sequence (.zarr), of nerif displacement or nerif simulate --times."""
+    """Measurement sequence (.zarr) of nerif displacement --frames or nerif simulate --times."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Result to write (.zarr), or to go on with."""
+    """Result (.zarr) to write or to continue."""
     cluster: str = "local"
-    """Either local, tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md)."""
-    workers: int = 0
-    """Of a local cluster; 0 for one for each GPU, or for each two cores."""
-    threads: int = 0
-    """Of each worker on a CPU; 0 for its share of the cores."""
+    """Where to compute: local, tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md)."""
+    workers: Annotated[int, Ge(0)] = 0
+    """Workers of a local cluster (0: one per GPU, or per two cores)."""
+    threads: Annotated[int, Ge(0)] = 0
+    """Threads of each worker on a CPU (0: its share of the cores)."""
     dashboard: bool = False
-    """Serve Dask's dashboard on 127.0.0.1, where every user of this machine can look at it."""
+    """Serve the Dask dashboard on 127.0.0.1, visible to all users of this machine."""
     retry: bool = False
-    """Try again frames that failed in an earlier run."""
+    """Retry the failed frames of an earlier run."""
     force: bool = False
-    """Begin anew, whatever --out holds."""
-    preset: str = "auto"
-    """One of fast, best, paper; auto is best where there is a GPU, else fast. Single settings below win over it."""
+    """Start again, discarding the content of --out."""
+    preset: Literal["auto", "fast", "best", "paper"] = "auto"
+    """Default settings: fast (CPU), best (GPU), paper, or auto (best with a GPU, else fast)."""
     frames: Annotated[SequenceSettings, Flat] = field(default_factory=SequenceSettings)
     reconstructor: Annotated[NeRIF, Flat] = field(default_factory=NeRIF)
 
 
 def run(settings: Sequence) -> SequenceStore:
-    """Make the store or open it, reconstruct what is missing, and say what came out."""
+    """Reconstruct the missing frames, and print a table of the result."""
     with figures_bar("frames") as bar:
 
         def update(progress: Progress) -> None:
-            settled = progress.done + progress.failed
-            figures = f"{settled}/{progress.total} | {progress.frames_per_minute:.1f} frames/min"
+            figures = f"{progress.settled}/{progress.total} | {progress.frames_per_minute:.1f} frames/min"
             figures += f" | {progress.failed} failed"
             if progress.settled:
                 figures += f" | {progress.seconds_left:.0f} s left"
@@ -72,7 +72,8 @@ def run(settings: Sequence) -> SequenceStore:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    name = value_given("preset", arguments, "auto")
-    default = Sequence(measurement=tyro.MISSING, out=tyro.MISSING, preset=name, reconstructor=preset(name))
+    name = setting_of("preset", arguments, "auto")
+    reconstructor = preset(name)
+    default = Sequence(tyro.MISSING, tyro.MISSING, preset=name, reconstructor=reconstructor)  # type: ignore[arg-type]
     if not (run(read_settings(default, arguments, "sequence")).status == DONE).any():
         raise SystemExit(1)

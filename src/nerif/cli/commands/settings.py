@@ -1,8 +1,6 @@
-"""From the command line and a TOML file to a checked record of settings.
+"""Settings of a command: defaults, overridden by a TOML file (--config), overridden by options.
 
-    nerif VERB --config FILE.toml --flag VALUE          the defaults, over them the file, over it the flags
-
-The names in the file are those of the flags; a nested flag such as --network.width stands in the table [network].
+Names in the file are those of the options; --network.width is `width` in the table [network].
 """
 
 from __future__ import annotations
@@ -18,62 +16,88 @@ import json
 import re
 import textwrap
 import typing
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import tyro
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known, read_toml
+from nerif.common.settings import check_settings
 
-__all__ = ["Flat", "Settings", "flag_value", "flat_names", "help_of", "merge", "parse", "read_settings", "value_given"]
+__all__ = [
+    "Flat",
+    "Settings",
+    "command",
+    "flag_value",
+    "flat_names",
+    "help_of",
+    "merge",
+    "parse",
+    "read_settings",
+    "setting_of",
+]
 
 T = TypeVar("T")
 
 Flat = tyro.conf.arg(name="")
-"""Marks a field whose record stands among the other settings, without a prefix."""
-
-ALIASES = {"from": "source"}
-"""Names that settings may be given by, beside their own: words that Python keeps for itself."""
-
-IGNORED = ("about",)  # the table of run.toml that tells what came out
+"""Marks a field whose own fields are options without a prefix."""
+ALIASES = {"from": "source", "drawn": "drawings"}
+"""Further names of options, and those of their fields."""
+IGNORED_TABLES = ("about",)  # results in run.toml
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What the settings of every verb hold."""
+    """Settings of every command."""
 
     config: Path | None = None
-    """TOML file of settings (such as the run.toml of a result); flags win over it."""
+    """TOML file of settings, such as the run.toml of a result; options override it."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+    @classmethod
+    def read(cls, arguments: list[str], name: str) -> Self:
+        """Return the settings of a command by the arguments of the command line."""
+        required = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING]
+        return read_settings(cls(**dict.fromkeys(required, tyro.MISSING)), arguments, name)
 
 
-def read_settings(default: T, arguments: list[str], verb: str, file: Path | None = None) -> T:
-    """Return the settings of a verb: `default`, over it the settings file, over that the flags.
+S = TypeVar("S", bound=Settings)
+
+
+def command(name: str, settings: type[S], run: Callable[[S], object]) -> Callable[[list[str]], None]:
+    """Return the function that parses the arguments of a command and runs it."""
+
+    def main(arguments: list[str]) -> None:
+        run(settings.read(arguments, name))
+
+    return main
+
+
+def read_settings(default: T, arguments: list[str], name: str, file: Path | None = None) -> T:
+    """Return the settings of a command.
 
     Parameters
     ----------
-    default : a record with tyro.MISSING where there is no default
-    arguments : of the command line, without the verb
-    verb : its name
-    file : settings file where --config names none
-
-    Raises
-    ------
-    InputError
-        If file or flags are not such settings.
+    default : settings with tyro.MISSING for required ones
+    arguments : of the command line, without the command
+    name : of the command
+    file : settings file without --config
     """
-    file = _config(arguments) or file
-    if file is not None:
+    if file := _config(arguments) or file:
         default = merge(default, _settings_file(file), str(file))
-    return parse(default, arguments, f"nerif {verb}", inspect.getdoc(type(default)) or "")
+    return parse(default, arguments, f"nerif {name}", inspect.getdoc(type(default)) or "")
 
 
-def value_given(name: str, arguments: list[str], default: str, file: Path | None = None) -> str:
-    """Return what flag or settings file say of one setting on which the defaults of the others depend."""
+def setting_of(name: str, arguments: list[str], default: str, file: Path | None = None) -> str:
+    """Return a single setting on which the defaults of others depend."""
     file = _config(arguments) or file
-    given = flag_value(arguments, f"--{name}") or (_settings_file(file).get(name) if file is not None else None)
-    return str(given or default)
+    value = flag_value(arguments, f"--{name}") or (_settings_file(file).get(name) if file is not None else None)
+    return str(value or default)
 
 
 def _config(arguments: list[str]) -> Path | None:
@@ -82,72 +106,55 @@ def _config(arguments: list[str]) -> Path | None:
 
 
 def _settings_file(path: Path) -> dict[str, Any]:
-    return {k: v for k, v in read_toml(path, "settings file (--config)").items() if k not in IGNORED}
+    return {k: v for k, v in read_toml(path, "settings file (--config)").items() if k not in IGNORED_TABLES}
 
 
 def flat_names(cls: type) -> dict[str, tuple[str, ...]]:
-    """Map each name a user may give to where it stands: fields of a record annotated name="" stand at the top."""
+    """Map the name of each option to its place: the fields of a field marked Flat are options of their own."""
     names: dict[str, tuple[str, ...]] = {}
-    for field in dataclasses.fields(cls):
-        inner = _inner_record(cls, field.name)
-        if inner is not None:
-            names |= {f.name: (field.name, f.name) for f in dataclasses.fields(inner)}
+    for name, hint in _hints(cls).items():
+        if typing.get_origin(hint) is typing.Annotated and getattr(hint.__metadata__[0], "name", None) == "":
+            names |= {f.name: (name, f.name) for f in dataclasses.fields(hint.__origin__)}
         else:
-            names[field.name] = (field.name,)
+            names[name] = (name,)
     return names
 
 
-def _hint(cls: type, name: str) -> Any:
-    return typing.get_type_hints(cls, include_extras=True)[name]
-
-
-def _inner_record(cls: type, name: str) -> type | None:
-    """The record behind a field whose own name is left out of the flags."""
-    hint = _hint(cls, name)
-    if typing.get_origin(hint) is typing.Annotated and getattr(hint.__metadata__[0], "name", None) == "":
-        return typing.cast(type, hint.__origin__)
-    return None
+def _hints(cls: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return {f.name: hints[f.name] for f in dataclasses.fields(cls)}
 
 
 def merge(default: T, values: dict[str, Any], source: str) -> T:
-    """Return a record with the values of a settings file put in, each checked against its type.
-
-    Raises
-    ------
-    InputError
-        If a key is unknown (the nearest known one is named) or a value is of the wrong type.
-    """
-    cls = type(default)
-    names = flat_names(cls)
-    groups: dict[str, dict[str, Any]] = {}
+    """Return settings with the values of a file, each checked against its type."""
+    names = flat_names(type(default))
+    flat: dict[str, dict[str, Any]] = {}
     changes: dict[str, Any] = {}
     values = {ALIASES.get(key, key.replace("-", "_")): value for key, value in values.items()}
     check_known(values, names, source)
     for key, value in values.items():
-        where = names[key]
-        if len(where) == 2:
-            groups.setdefault(where[0], {})[where[1]] = value
+        if len(names[key]) == 2:
+            flat.setdefault(names[key][0], {})[key] = value
         elif dataclasses.is_dataclass(getattr(default, key)) and isinstance(value, dict):
             changes[key] = merge(getattr(default, key), value, f"{source} [{key}]")
         else:
-            changes[key] = _typed(cls, key, value, source)
-    for name, inner in groups.items():
-        changes[name] = merge(getattr(default, name), inner, source)
+            changes[key] = _typed(_hints(type(default))[key], key, value, source)
+    changes |= {name: merge(getattr(default, name), inner, source) for name, inner in flat.items()}
     return dataclasses.replace(default, **changes)  # type: ignore[type-var]
 
 
-def _typed(cls: type, name: str, value: Any, source: str) -> Any:
+def _typed(hint: Any, name: str, value: Any, source: str) -> Any:
     from pydantic import TypeAdapter, ValidationError
 
     try:
-        return TypeAdapter(_hint(cls, name)).validate_json(json.dumps(value, default=str), strict=True)
+        return TypeAdapter(hint).validate_json(json.dumps(value, default=str), strict=True)
     except ValidationError as error:
-        detail = error.errors()[0]
-        raise InputError(f"'{name}' = {value!r}: {detail['msg'].lower()}", field=source) from None
+        reason = error.errors()[0]["msg"].lower()
+        raise InputError(f"'{name}' = {value!r}: {reason}", field=source) from None
 
 
 def flag_value(arguments: list[str], *flags: str) -> str | None:
-    """Return the value of a flag before the whole line is parsed: it decides what the defaults are."""
+    """Return the value of an option before the command line is parsed."""
     for i, word in enumerate(arguments):
         for flag in flags:
             if word == flag and i + 1 < len(arguments):
@@ -158,49 +165,60 @@ def flag_value(arguments: list[str], *flags: str) -> str | None:
 
 
 def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
-    """Parse the arguments of a verb; those not given keep the values of `default`.
-
-    Raises
-    ------
-    InputError
-        In one line, where the library would draw a box.
-    """
+    """Parse the arguments of a command; an InputError has the error of tyro in one line."""
+    arguments = [word for pair in _with_set(arguments) for word in pair]
     arguments = [
         re.sub(r"^--([\w.-]+)", lambda m: f"--{ALIASES.get(m[1], m[1].replace('_', '-'))}", a) for a in arguments
     ]
-    said = io.StringIO()
+    error = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(error):
             return tyro.cli(type(default), prog=prog, description=description, args=arguments, default=default)
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise InputError(_one_line(said.getvalue(), prog)) from None
+        raise InputError(_one_line(error.getvalue(), prog)) from None
+
+
+def _with_set(arguments: list[str]) -> Iterator[list[str]]:
+    """Turn --set NAME=VALUE into --NAME VALUE."""
+    words = iter(arguments)
+    for word in words:
+        if word != "--set":
+            yield [word]
+            continue
+        name, _, value = next(words, "").partition("=")
+        if not name or not value:
+            raise InputError(f"expected NAME=VALUE, such as network.width=128, got '{name}'", field="set")
+        yield [f"--{name}", *value.split()]
 
 
 def _one_line(box: str, prog: str) -> str:
-    """Reduce the library's box to its first sentence and the nearest option it offers."""
-    lines = [re.sub(r"[│╭╮╰╯─]+", " ", re.sub(r"\x1b\[[0-9;]*m", "", line)).strip() for line in box.splitlines()]
-    lines = [line for line in lines if line][1:]
-    text = " ".join(lines)
-    text = re.split(r"\s*(?:For full helptext|Argument helptext)", text)[0]
+    """Reduce the error box of tyro to its first sentence and the nearest option."""
+    plain = re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]+|[-|+]{5,}", " ", box)
+    lines = [line.strip() for line in plain.splitlines()]
+    text = " ".join([line for line in lines if line][1:])
+    text = re.split(r"\s*(?:For full helptext|Argument helptext)", text)[0].rstrip(". ")
+    text = re.sub(r"^Error parsing [A-Z]\w*: ", "", text)
     text = re.sub(r"\s+", " ", text)
-    text = re.sub(r" Perhaps you meant: (--[\w.-]+|-\w, --[\w.-]+).*", r"; perhaps you meant \1", text)
+    text = re.sub(r" Perhaps you meant: (--[\w.-]+|-\w, --[\w.-]+).*", r"; did you mean \1?", text)
     return f"{text}; see {prog} --help"
 
 
 def help_of(cls: type, name: str) -> str:
-    """Return the text below a field of a record, as its class or the one it has it from says it; empty if none does."""
-    for kind in cls.__mro__:
-        if name in vars(kind).get("__annotations__", {}):
-            return _texts(kind).get(name, "")
-    return ""
+    """Return the text below a field in its class or in a base class; empty if there is none."""
+    return next((text for kind in cls.__mro__ if (text := _texts(kind).get(name))), "")
 
 
 @functools.cache
 def _texts(cls: type) -> dict[str, str]:
-    """The text below each field, by name."""
-    body = typing.cast(ast.ClassDef, ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]).body
+    """Return the texts below the fields of a class, by name."""
+    if not dataclasses.is_dataclass(cls):
+        return {}
+    try:
+        body = typing.cast(ast.ClassDef, ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]).body
+    except OSError:  # a class without source
+        return {}
     return {
         node.target.id: inspect.cleandoc(below.value.value)
         for node, below in itertools.pairwise(body)

@@ -1,14 +1,13 @@
-"""Bundle adjustment: intrinsics, camera poses and target poses that together explain every point found.
+"""Bundle adjustment: intrinsics, camera poses and target poses from all detected points.
 
     minimise  sum rho(|pixel - project_i(R_i (R_j X + t_j) + t_i)|^2),      rho Huber's loss
 
-over cameras i and target poses j; one pose is the world and stays. Weak priors keep what a narrow lens cannot tell from
-a turn: the principal point near the middle of the image, distortion near none.
+over cameras i and target poses j; one pose is fixed and defines the world. Weak priors hold the parameters that a
+narrow lens does not separate from a rotation: the principal point near the middle of the image, distortion near 0.
 
-The normal equations are put together block by block and solved exactly in each step of Levenberg and Marquardt's
-method, which settles what a narrow lens can hardly tell apart too.
-
-What no image shows, such as the depth of a telecentric camera, stays where it is, with a standard deviation of 0.
+Each step of the Levenberg-Marquardt method solves the normal equations exactly, so nearly degenerate parameters
+converge too. Parameters that no image constrains, such as the depth of a telecentric camera, stay at their initial
+value, with standard deviation 0.
 
 Source: Triggs et al., Bundle adjustment - a modern synthesis, 2000.
 """
@@ -28,11 +27,11 @@ from nerif.imaging.calibration.targets import Detection
 __all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust", "crossing"]
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-HUBER = 5  # times the noise of a point: where the loss turns linear
-PRINCIPAL = 0.03  # of the image's width: how far the principal point may well be from its middle
-DISTORTION = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS: how large they may well be, by (x, y) in units of
-UNIT = 5  # times half the width of a telecentric image, mm: of a perspective one, that is 23 degrees wide
-UNSEEN = 1e-13  # share of the largest eigenvalue of the curvature: directions below it change no image
+HUBER = 5  # residual over noise beyond which the loss is linear
+PRINCIPAL_SIGMA = 0.03  # of the principal point from the middle of the image, over the image width
+DISTORTION_SIGMA = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS; of a telecentric camera with (x, y) over
+HALF_WIDTHS = 5  # times half the image width in mm: as for a perspective image that is 23 degrees wide
+MIN_EIGENVALUE = 1e-13  # of the curvature, over its largest: directions below it change no image
 INTRINSIC, POSE = 9, 6  # parameters: fx, fy, cx, cy and five of distortion; rotation vector, translation
 
 
@@ -50,16 +49,16 @@ class Pose:
     translation: Float[np.ndarray, 3]
 
     def __matmul__(self, first: Pose) -> Pose:
-        """The motion `first`, then this one."""
+        """Return the motion `first` followed by this one."""
         return Pose(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
     @property
     def inverse(self) -> Pose:
-        """The motion back."""
+        """Inverse motion."""
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
 
-    def moved(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Where the motion takes points, mm."""
+    def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return R x + t of points x, mm."""
         return points @ self.rotation.T + self.translation
 
     @property
@@ -70,8 +69,8 @@ class Pose:
         return np.concatenate([cv2.Rodrigues(self.rotation)[0].ravel(), self.translation])
 
     @property
-    def turn_by_vector(self) -> Float[np.ndarray, "3 3"]:
-        """How far about its own axes the pose turns with its rotation vector v, R(v + dv) = exp([T dv]x) R(v).
+    def rotation_jacobian(self) -> Float[np.ndarray, "3 3"]:
+        """Jacobian T of the rotation by the rotation vector v, R(v + dv) = exp([T dv]x) R(v).
 
         T = sin a / a + (1 - sin a / a) v v^T / a^2 + (1 - cos a) / a^2 [v]x,     a = |v|
         """
@@ -82,7 +81,7 @@ class Pose:
 
     @classmethod
     def of_vector(cls, vector: np.ndarray) -> Pose:
-        """From a rotation vector and a translation."""
+        """Return the pose with this rotation vector and translation."""
         import cv2
 
         return cls(cv2.Rodrigues(np.asarray(vector[:3], dtype=np.float64))[0], np.array(vector[3:], dtype=np.float64))
@@ -90,13 +89,12 @@ class Pose:
 
 @dataclass(frozen=True)
 class Observation:
-    """The target in pose `pose` as camera `camera` sees it.
+    """The target of one image.
 
     Parameters
     ----------
-    camera, pose : numbers of the camera and the pose in the bundle
-    detection : what was found
-    image : name of the image in which it was found
+    camera, pose : their indices in the bundle
+    image : name of the image
     on_background : whether the target lay on the camera's background
     """
 
@@ -109,17 +107,16 @@ class Observation:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Everything that is adjusted.
+    """All cameras and target poses.
 
     Parameters
     ----------
     intrinsics : (camera, 9) fx, fy, cx, cy (px; fx, fy of telecentric cameras px/mm), k1, k2, p1, p2, k3
     cameras : world to camera
     poses : target to world
-    fixed : the pose that is the world
+    fixed : index of the pose that defines the world
     free : (9,) which intrinsics are adjusted
-    sizes : (height, width) of every camera's images, px
-    projection : of all cameras
+    sizes : (height, width) of each camera's images, px
     """
 
     intrinsics: Float[np.ndarray, "camera 9"]
@@ -130,19 +127,19 @@ class Bundle:
     sizes: tuple[tuple[int, int], ...]
     projection: Projection = PERSPECTIVE
 
-    def project(self, seen: Observation) -> Float[np.ndarray, "n 2"]:
-        """Where the points of an observation should be, px."""
-        k, pose = self.intrinsics[seen.camera], self.cameras[seen.camera] @ self.poses[seen.pose]
-        image = self.projection.image(pose.moved(seen.detection.points))
+    def project(self, o: Observation) -> Float[np.ndarray, "n 2"]:
+        """Return the points of an observation by the model, px."""
+        k, pose = self.intrinsics[o.camera], self.cameras[o.camera] @ self.poses[o.pose]
+        image = self.projection.image(pose.apply(o.detection.points))
         x, y, _ = distort(image[:, 0], image[:, 1], k[4:])
         return np.stack([k[0] * x + k[2], k[1] * y + k[3]], axis=1)
 
-    def derivatives(self, seen: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivatives (2 n, p) of u, v of each point by intrinsics, pose of the camera and pose of the target."""
+    def derivatives(self, o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the derivatives (2 n, p) of u, v of each point by intrinsics, camera pose and target pose."""
         import cv2
 
-        k, points = self.intrinsics[seen.camera], seen.detection.points
-        a, b = self.poses[seen.pose].vector, self.cameras[seen.camera].vector
+        k, points = self.intrinsics[o.camera], o.detection.points
+        a, b = self.poses[o.pose].vector, self.cameras[o.camera].vector
         r, t, drda, drdta, drdb, drdtb, dtda, dtdta, dtdb, dtdtb = cv2.composeRT(a[:3], a[3:], b[:3], b[3:])
         rotation, turn = cv2.Rodrigues(r)
         local = points @ rotation.T + t.ravel()
@@ -162,60 +159,57 @@ class Bundle:
         by_camera = by_joint @ np.block([[drdb, drdtb], [dtdb, dtdtb]])
         return by_intrinsics, by_camera, by_joint @ np.block([[drda, drdta], [dtda, dtdta]])
 
-    def residual(self, seen: Observation) -> Float[np.ndarray, "n 2"]:
-        """Found less expected, px."""
-        return seen.detection.pixels - self.project(seen)
+    def residual(self, o: Observation) -> Float[np.ndarray, "n 2"]:
+        """Return detected minus projected points, px."""
+        return o.detection.pixels - self.project(o)
 
-    def rms(self, seen: Observation) -> float:
-        """Root mean square of the distances of an observation's points from where they should be, px."""
-        return float(np.sqrt((self.residual(seen) ** 2).sum(axis=1).mean()))
+    def rms(self, o: Observation) -> float:
+        """Return the rms reprojection error of an observation, px."""
+        return float(np.sqrt((self.residual(o) ** 2).sum(axis=1).mean()))
 
 
 def adjust(
     bundle: Bundle, observations: Sequence[Observation], noise: float, iterations: int = 100
 ) -> tuple[Bundle, Float[np.ndarray, "camera 15 15"]]:
-    """Return the adjusted bundle, and the covariance of every camera's parameters.
+    """Return the adjusted bundle, and the covariance of each camera's parameters.
+
+    The covariances (9 intrinsics, rotation about the camera's own axes in rad, translation in mm) follow from the
+    curvature of the sum and the residuals; they include detection noise, not a target that is not flat.
 
     Parameters
     ----------
-    bundle : where to start
-    observations : all points found
-    noise : of a point, px: what the priors are weighed against, and where Huber's loss turns linear (times HUBER)
-    iterations : at most
-
-    The covariances (9 intrinsics, turn about the camera's own axes in rad, translation in mm) come from the curvature
-    of the sum and the residual left; they know noise, not a target that is not flat.
+    noise : standard deviation of a point's coordinates, px, which scales the priors and Huber's loss
     """
     from scipy.linalg import cho_factor, cho_solve
 
     layout = _Layout(bundle, observations, noise)
-    x, damping, calm = layout.pack(bundle), 1e-3, 0
+    x, damping, stalls = layout.pack(bundle), 1e-3, 0
     cost, curvature, slope = layout.normal_equations(x)
     for _ in range(iterations):
         scale = _scale(curvature)
-        damped = curvature / scale[:, None] / scale + damping * np.eye(len(x))
-        there = x - cho_solve(cho_factor(damped), slope / scale) / scale
-        new = layout.cost(there)
+        matrix = curvature / scale[:, None] / scale + damping * np.eye(len(x))
+        trial = x - cho_solve(cho_factor(matrix), slope / scale) / scale
+        new = layout.cost(trial)
         if new < cost:
-            calm = calm + 1 if cost - new < 1e-9 * cost else 0
-            x, damping = there, max(damping / 10, 1e-12)
+            stalls = stalls + 1 if cost - new < 1e-9 * cost else 0
+            x, damping = trial, max(damping / 10, 1e-12)
             cost, curvature, slope = layout.normal_equations(x)
         else:
             damping *= 10
-        if calm == 3 or damping > 1e8:
+        if stalls == 3 or damping > 1e8:
             break
     count = sum(2 * len(o.detection.points) for o in observations)
-    left = sum(float((layout.unpack(x).residual(o) ** 2).sum()) for o in observations)
+    residual = sum(float((layout.unpack(x).residual(o) ** 2).sum()) for o in observations)
     scale = _scale(curvature)
-    inverse = np.linalg.pinv(curvature / scale[:, None] / scale, rcond=UNSEEN, hermitian=True)
+    inverse = np.linalg.pinv(curvature / scale[:, None] / scale, rcond=MIN_EIGENVALUE, hermitian=True)
     covariance = inverse / scale[:, None] / scale
-    variance = left / max(count - len(x), 1)
-    done, blocks = layout.unpack(x), layout.per_camera(covariance * variance)
-    for camera, block in zip(done.cameras, blocks, strict=True):
+    variance = residual / max(count - len(x), 1)
+    result, blocks = layout.unpack(x), layout.per_camera(covariance * variance)
+    for camera, block in zip(result.cameras, blocks, strict=True):
         turn = np.eye(INTRINSIC + POSE)
-        turn[INTRINSIC : INTRINSIC + 3, INTRINSIC : INTRINSIC + 3] = camera.turn_by_vector
+        turn[INTRINSIC : INTRINSIC + 3, INTRINSIC : INTRINSIC + 3] = camera.rotation_jacobian
         block[:] = turn @ block @ turn.T
-    return done, blocks
+    return result, blocks
 
 
 def crossing(vector: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
@@ -225,21 +219,21 @@ def crossing(vector: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
 
 
 def _scale(curvature: np.ndarray) -> np.ndarray:
-    """What makes parameters of one size whatever their unit."""
+    """Scales that make parameters of different units comparable."""
     diagonal = np.diag(curvature)
     return np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
 
 
 class _Layout:
-    """Where each parameter and residual stands in the long vectors."""
+    """The order of all parameters in one vector: of each camera its free intrinsics and pose, then the target poses."""
 
     def __init__(self, bundle: Bundle, observations: Sequence[Observation], noise: float) -> None:
         self.bundle, self.observations, self.noise = bundle, observations, noise
         self.free = np.flatnonzero(bundle.free)
         self.block = len(self.free) + POSE
-        moving = [j for j in range(len(bundle.poses)) if j != bundle.fixed]
-        self.pose_at = {j: len(bundle.cameras) * self.block + POSE * i for i, j in enumerate(moving)}
-        self.size = len(bundle.cameras) * self.block + POSE * len(moving)
+        others = [j for j in range(len(bundle.poses)) if j != bundle.fixed]
+        self.pose_at = {j: len(bundle.cameras) * self.block + POSE * i for i, j in enumerate(others)}
+        self.size = len(bundle.cameras) * self.block + POSE * len(others)
 
     def pack(self, bundle: Bundle) -> np.ndarray:
         x = np.empty(self.size)
@@ -252,16 +246,16 @@ class _Layout:
     def unpack(self, x: np.ndarray) -> Bundle:
         intrinsics, cameras = self.bundle.intrinsics.copy(), []
         for i in range(len(self.bundle.cameras)):
-            own = x[i * self.block : (i + 1) * self.block]
-            intrinsics[i, self.free] = own[: len(self.free)]
-            cameras.append(Pose.of_vector(own[len(self.free) :]))
+            block = x[i * self.block : (i + 1) * self.block]
+            intrinsics[i, self.free] = block[: len(self.free)]
+            cameras.append(Pose.of_vector(block[len(self.free) :]))
         poses = list(self.bundle.poses)
         for j, at in self.pose_at.items():
             poses[j] = Pose.of_vector(x[at : at + POSE])
         return replace(self.bundle, intrinsics=intrinsics, cameras=tuple(cameras), poses=tuple(poses))
 
     def cost(self, x: np.ndarray) -> float:
-        """The sum that is minimised, px^2."""
+        """Return the sum to minimise, px^2."""
         bundle = self.unpack(x)
         loss = sum(self._loss(np.linalg.norm(bundle.residual(o), axis=1)) for o in self.observations)
         return loss + float((self._prior(bundle) ** 2).sum())
@@ -272,7 +266,7 @@ class _Layout:
         return float(np.where(length < knee, length**2, 2 * knee * length - knee**2).sum())
 
     def normal_equations(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """The cost, J^T W J and J^T W r, with Huber's weights W and J the derivatives of r = expected - found."""
+        """Return the cost, J^T W J and J^T W r: Huber's weights W, derivatives J of r = projected - detected."""
         bundle = self.unpack(x)
         curvature, slope, cost = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
         for o in self.observations:
@@ -299,7 +293,7 @@ class _Layout:
         return cost + float((prior**2).sum()), curvature, slope
 
     def _prior(self, bundle: Bundle) -> np.ndarray:
-        """Distance from the middle of the image and from no distortion, in units that make `noise` one sigma."""
+        """Principal point from the middle of the image, and distortion, over their sigma, times the noise."""
         middle = np.array([((w - 1) / 2, (h - 1) / 2) for h, w in bundle.sizes])
         off = np.concatenate([bundle.intrinsics[:, 2:4] - middle, bundle.intrinsics[:, 4:]], axis=1)
         return off * self._prior_slopes()
@@ -308,15 +302,15 @@ class _Layout:
         widths = np.array([w for _, w in self.bundle.sizes], dtype=np.float64)[:, None]
         unit = np.ones_like(widths)
         if not self.bundle.projection.shows_depth:
-            unit = UNIT * widths / 2 / self.bundle.intrinsics[:, :1]
-        likely = np.concatenate([PRINCIPAL * widths.repeat(2, axis=1), DISTORTION / unit ** np.array(POWERS)], axis=1)
-        return np.asarray(self.noise / likely)
+            unit = HALF_WIDTHS * widths / 2 / self.bundle.intrinsics[:, :1]
+        distortion = DISTORTION_SIGMA / unit ** np.array(POWERS)
+        return np.asarray(self.noise / np.concatenate([PRINCIPAL_SIGMA * widths.repeat(2, axis=1), distortion], axis=1))
 
     def per_camera(self, matrix: np.ndarray) -> np.ndarray:
-        """The blocks of a matrix that belong to cameras, with 0 for intrinsics that are not adjusted."""
+        """Return the blocks of the cameras in a matrix, with 0 for intrinsics that are not adjusted."""
         at = np.concatenate([self.free, INTRINSIC + np.arange(POSE)])
         result = np.zeros((len(self.bundle.cameras), INTRINSIC + POSE, INTRINSIC + POSE))
         for i in range(len(result)):
-            own = slice(i * self.block, (i + 1) * self.block)
-            result[i][np.ix_(at, at)] = matrix[own, own]
+            block = slice(i * self.block, (i + 1) * self.block)
+            result[i][np.ix_(at, at)] = matrix[block, block]
         return result

@@ -1,9 +1,8 @@
-"""From target images of several cameras to intrinsics, poses in one world frame, and background planes.
+"""Calibration of cameras from target images: intrinsics, poses in one world frame, and background planes.
 
-1. a first guess of all poses in the world, which is the frame of one target pose (first_guess.py);
-2. bundle adjustment of everything (bundle.py), after which images that do not fit are left out, once;
-3. a plane through each camera's targets that lay on its background, and a look at what came out
-   (result.py).
+1. initial poses in the frame of one target pose, which defines the world (first_guess.py);
+2. bundle adjustment (bundle.py), repeated once without the images that do not fit;
+3. a plane through the targets on each camera's background, and checks of the result (result.py).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from nerif.common.conventions import FACES, InputError
 from nerif.common.files import check_known
 from nerif.geometry import Projection, projection_named
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
-from nerif.imaging.calibration.first_guess import first_guess, mirrored
+from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.target_images import find_targets, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget, ViewImages
@@ -26,43 +25,43 @@ from nerif.imaging.readers.views import View
 
 __all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_images"]
 
-ON_A_SIDE = 0.1  # of a unit vector towards a camera: what it has to be more on one side than its mirror image
-FREE_OR_LAID = ("target", "background")
-GUESSED_NOISE, LEAST_NOISE = 0.1, 1e-4  # px, of a point: before it is known, and what nothing is better than
+MIN_SIDE_DIFFERENCE = 0.1  # between a rig and its mirror image, of the component of a camera's direction along `side`
+SOURCES = ("target", "background")
+INITIAL_NOISE, MIN_NOISE = 0.1, 1e-4  # px, of a point: before it is estimated; lower bound of the estimate
 
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How cameras are calibrated."""
+    """Settings of a calibration from target images."""
 
     projection: str = "perspective"
-    """Of all cameras: perspective, or telecentric."""
+    """Projection of all cameras: perspective or telecentric."""
     distortion: tuple[str, ...] = ("k1", "k2", "p1", "p2")
-    """Coefficients to find, out of k1 k2 p1 p2 k3; the others are 0."""
+    """Distortion coefficients to determine, from k1 k2 p1 p2 k3; the others are 0."""
     world: str = ""
-    """Name of the target pose that is the world frame; the one that most cameras see if not given."""
+    """Name of the target pose that defines the world frame; default: the one that most cameras see."""
     axes: tuple[str, str, str] = ("x+", "z+", "y-")
-    """World x, y, z along axes of the target in that pose (x right, y down, z into the page): z is up by default."""
+    """World x, y, z along axes of the target in that pose (x right, y down, z into the page); default: z is up."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Middle of the target in that pose, in world coordinates, mm."""
+    """Centre of the target in that pose, in world coordinates, mm."""
     max_error: float = 1.0
     """Largest rms reprojection error to accept, px."""
     side: tuple[str, str] | None = None
-    """Of telecentric cameras: one view and the side of the world that it stands on, such as cam1 x+. The images of
-    flat targets fit a rig and its mirror image alike."""
+    """For telecentric cameras: one view and the side of the world on which it stands, such as cam1 x+; images of flat
+    targets do not distinguish a telecentric rig from its mirror image."""
 
     def __post_init__(self) -> None:
         for name in self.distortion:
             if name not in COEFFICIENTS:
                 raise InputError(
-                    f"expected coefficients out of {' '.join(COEFFICIENTS)}, got '{name}'", field="distortion"
+                    f"expected coefficients from {' '.join(COEFFICIENTS)}, got '{name}'", field="distortion"
                 )
         if not self.max_error > 0:
             raise InputError(f"expected a positive number of px, got {self.max_error}", field="max_error")
         if not self.kind.shows_depth and (self.side is None or self.side[1] not in FACES):
             raise InputError(
-                f"expected a view and the side of the world that it stands on ({' '.join(FACES)}), such as "
-                "cam1 x+, since images of flat targets fit a telecentric rig and its mirror image alike; got "
+                f"expected a view and the side of the world on which it stands ({' '.join(FACES)}), such as cam1 x+, "
+                "since images of flat targets do not distinguish a telecentric rig from its mirror image; got "
                 f"{self.side}",
                 field="side",
             )
@@ -74,18 +73,18 @@ class CalibrationSettings:
             )
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Refuse a view that is not among those of these names."""
+        """Refuse a side of a view that is not among these."""
         if self.side is not None and self.side[0] not in names:
             raise InputError(f"expected one of {', '.join(names)}, got '{self.side[0]}'", field="side")
 
     @property
     def kind(self) -> Projection:
-        """The projection of the cameras."""
+        """Projection of the cameras."""
         return projection_named(self.projection)
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """From the target's axes to the world's."""
+        """Rotation from the target's axes to the world's."""
         unit = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
         rows = [np.array(unit.get(a.rstrip("+-"), (0, 0, 0))) * (-1 if a.endswith("-") else 1) for a in self.axes]
         return np.array(rows, dtype=np.float64)
@@ -101,36 +100,29 @@ def calibrate_views(
     on_image: Callable[[], None] = lambda: None,
     leave_out: Sequence[str] = (),
 ) -> Calibration:
-    """Find a target in the images of all views, and calibrate their cameras by it.
+    """Detect a target in the images of all views, and calibrate their cameras.
 
     Parameters
     ----------
-    views : of find_views
     target : free in space, in the images VIEW/target
-    settings : of the calibration
-    background_scale : the target laid on the backgrounds is the same one printed this many times larger
-    background_distance : as `calibrate`
-    say : told of images that are of no use
-    on_image : called after each image (`target_images` of them in all)
-    leave_out : images that are not used, such as cam1/target/7 or cam1/background/2: view, source and pose
-
-    Raises
-    ------
-    InputError
-        If images are missing, one to be left out is none of them, or as `calibrate`.
+    background_scale : size of the target on the backgrounds over that of `target`
+    background_distance : as in `calibrate`
+    say : receives a note on each image without a detection
+    on_image : called after each of the `target_images`
+    leave_out : images not to use, such as cam1/target/7 or cam1/background/2: view, source and pose
     """
-    laid = target.scaled(background_scale)
+    background_target = target.scaled(background_scale)
     settings.check_names([view.name for view in views])
-    target_images(views)  # what is missing is said before the long work
-    there = [f"{v.name}/{s}/{p}" for v in views for s in FREE_OR_LAID if s in v.sources for p in pose_names(v.open(s))]
-    check_known(leave_out, there, "leave_out", "image")
-    found = [find_targets(view, target, say, on_image, laid).without(leave_out) for view in views]
-    return calibrate(found, settings, background_distance)
+    target_images(views)  # reports missing images before the long work
+    images = [f"{v.name}/{s}/{p}" for v in views for s in SOURCES if s in v.sources for p in pose_names(v.open(s))]
+    check_known(leave_out, images, "leave_out", "image")
+    detections = [find_targets(view, target, say, on_image, background_target).without(leave_out) for view in views]
+    return calibrate(detections, settings, background_distance)
 
 
 def target_images(views: Sequence[View]) -> int:
-    """Return how many images of the target, in space and on the background, the views have."""
-    return sum(len(view.open(s)) for view in views for s in FREE_OR_LAID if s in ("target", *view.sources))
+    """Return the number of images of the target, in space and on the background."""
+    return sum(len(view.open(s)) for view in views for s in SOURCES if s in ("target", *view.sources))
 
 
 def calibrate(
@@ -138,71 +130,67 @@ def calibrate(
     settings: CalibrationSettings = CalibrationSettings(),
     background_distance: float | None = None,
 ) -> Calibration:
-    """Calibrate all cameras from what was found in their images.
+    """Calibrate all cameras from the detections in their images.
+
+    Refused are cameras with too few poses or none in common with the others, initial poses that contradict one another
+    (a mirrored image, different poses under one name), and results that are impossible.
 
     Parameters
     ----------
-    views : what was found. Images of the target on the background say where it is unless the camera is telecentric
-    settings : of the calibration
-    background_distance : of backgrounds without such images: across the optical axis, so far behind the origin, mm
-
-    Raises
-    ------
-    InputError
-        If a camera has too few poses or is not tied to the others by shared ones, if guesses contradict one another
-        (a mirrored image, images of different poses under one name), or if the result can't be right.
+    background_distance : of backgrounds without images of a target on them (telecentric cameras: of all), from the
+        origin and across the optical axis, mm; None: unknown planes
     """
     if not views:
-        raise InputError("no view was found; expected one folder of target images a camera", field="calibrate")
+        raise InputError("expected one folder of target images per camera, got no view", field="calibrate")
     names = [v.name for v in views]
     settings.check_names(names)
     if not settings.kind.shows_depth:
         views = [replace(v, background={}) for v in views]
     bundle, observations = first_guess(views, settings.distortion, settings.world, settings.kind)
-    bundle, _ = adjust(bundle, observations, GUESSED_NOISE)
-    keep = _fitting(bundle, observations)
-    kept = [o for o, k in zip(observations, keep, strict=True) if k]
-    _check_poses(views, kept)
-    noise = float(np.median([bundle.rms(o) for o in kept])) / np.sqrt(2)
-    bundle, covariance = adjust(bundle, kept, max(noise, LEAST_NOISE))
-    bundle, covariance = _to_world(_on_the_right_side(bundle, settings, names), covariance, settings)
-    result = Calibration.of(names, bundle, covariance, observations, keep, background_distance)
+    bundle, _ = adjust(bundle, observations, INITIAL_NOISE)
+    fits = _fits(bundle, observations)
+    consistent = [o for o, fit in zip(observations, fits, strict=True) if fit]
+    _check_counts(views, consistent)
+    noise = float(np.median([bundle.rms(o) for o in consistent])) / np.sqrt(2)
+    bundle, covariance = adjust(bundle, consistent, max(noise, MIN_NOISE))
+    bundle, covariance = _to_world(_on_side(bundle, settings, names), covariance, settings)
+    result = Calibration.of(names, bundle, covariance, observations, fits, background_distance)
     result.check(settings.max_error)
     return result
 
 
-def _fitting(bundle: Bundle, observations: Sequence[Observation]) -> list[bool]:
-    """Which images fit: their rms is within five times the median of all, or a tenth of a pixel."""
+def _fits(bundle: Bundle, observations: Sequence[Observation]) -> list[bool]:
+    """Which images have an rms of at most 5 times the median of all, or 0.1 px."""
     rms = [bundle.rms(o) for o in observations]
     limit = max(5 * float(np.median(rms)), 0.1)
     return [r <= limit for r in rms]
 
 
-def _check_poses(views: Sequence[ViewImages], kept: Sequence[Observation]) -> None:
-    """Every camera has to keep half its images, or the fault is not in single images."""
+def _check_counts(views: Sequence[ViewImages], consistent: Sequence[Observation]) -> None:
+    """Refuse a camera of which more than half the images do not fit: then the fault is not in single images."""
     for i, view in enumerate(views):
-        left = sum(o.camera == i for o in kept)
-        whole = len(view.poses) + len(view.background)
-        if left < max(3, whole / 2):
+        count = sum(o.camera == i for o in consistent)
+        total = len(view.poses) + len(view.background)
+        if count < max(3, total / 2):
             raise InputError(
-                f"{whole - left} of its {whole} target images do not fit together with the other "
+                f"{total - count} of its {total} target images do not fit together with the other "
                 "cameras; is it mirrored (flip), did it move, or do its images show other poses than their names say?",
                 field=f"view '{view.name}'",
             )
 
 
-def _on_the_right_side(bundle: Bundle, settings: CalibrationSettings, names: Sequence[str]) -> Bundle:
-    """The bundle, or its mirror image if only that has the view that `side` names on its side."""
+def _on_side(bundle: Bundle, settings: CalibrationSettings, names: Sequence[str]) -> Bundle:
+    """The bundle, or its mirror image if only that has the view of `side` on its side."""
     if settings.side is None or bundle.projection.shows_depth:
         return bundle
     name, face = settings.side
     axis, sign = settings.rotation["xyz".index(face[0])], 1 if face[1] == "+" else -1
-    other = mirrored(bundle)
+    other = mirror(bundle)
     here, there = (-sign * float(axis @ b.cameras[names.index(name)].rotation[2]) for b in (bundle, other))
-    if abs(here - there) < ON_A_SIDE:
+    if abs(here - there) < MIN_SIDE_DIFFERENCE:
         raise InputError(
-            f"view '{name}' stands as much on the side {face} in the mirror image of the rig, so this does not "
-            "tell the two apart; name another view or axis",
+            f"expected a side that distinguishes the rig from its mirror image, but view '{name}' stands on the side "
+            f"{face} in both; name another view or axis",
             field="side",
         )
     return bundle if here > there else other
@@ -211,15 +199,15 @@ def _on_the_right_side(bundle: Bundle, settings: CalibrationSettings, names: Seq
 def _to_world(
     bundle: Bundle, covariance: Float[np.ndarray, "camera 15 15"], settings: CalibrationSettings
 ) -> tuple[Bundle, Float[np.ndarray, "camera 15 15"]]:
-    """From the frame of the fixed target to the world that was asked for; a depth that does not show is 0 there."""
+    """From the frame of the fixed target to the world of the settings; an unconstrained depth is 0 there."""
     move, shows = Pose(settings.rotation, np.array(settings.origin)), np.diag([1, 1, bundle.projection.shows_depth])
-    cameras, moved = [], []
+    cameras, blocks = [], []
     for camera, block in zip(bundle.cameras, covariance, strict=True):
-        there = camera @ move.inverse
-        follows = np.eye(len(block))  # t' = t + R m, which turns with the camera
-        follows[-3:, -6:-3] = -shows @ crossing(there.translation - camera.translation)
-        follows[-3:, -3:] = shows
-        cameras.append(replace(there, translation=shows @ there.translation))
-        moved.append(follows @ block @ follows.T)
+        pose = camera @ move.inverse
+        jacobian = np.eye(len(block))  # t' = t + R m, which turns with the camera
+        jacobian[-3:, -6:-3] = -shows @ crossing(pose.translation - camera.translation)
+        jacobian[-3:, -3:] = shows
+        cameras.append(replace(pose, translation=shows @ pose.translation))
+        blocks.append(jacobian @ block @ jacobian.T)
     poses = tuple(move @ p for p in bundle.poses)
-    return replace(bundle, cameras=tuple(cameras), poses=poses), np.stack(moved)
+    return replace(bundle, cameras=tuple(cameras), poses=poses), np.stack(blocks)

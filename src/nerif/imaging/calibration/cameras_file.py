@@ -1,19 +1,19 @@
-"""The calibration file: cameras as TOML that a person can read, and mend.
+"""The calibration file: cameras as TOML that can be read and edited by hand.
 
 format = "nerif-calibration-1"
-box = [[x, y, z], [x, y, z]]            # lower and upper corner of what to reconstruct, mm; may be left out
+box = [[x, y, z], [x, y, z]]            # optional: lower and upper corner of the volume to reconstruct, mm
 [[camera]]
 name = "cam1"
-projection = "perspective"              # or "telecentric"; may be left out
-image_size = [200, 240]                 # height, width, px; may be left out
+projection = "perspective"              # optional; or "telecentric"
+image_size = [200, 240]                 # optional: height, width, px
 intrinsics = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]    # px; fx, s, fy of a telecentric camera px/mm
-distortion = [k1, k2, p1, p2, k3]       # may be left out
+distortion = [k1, k2, p1, p2, k3]       # optional
 rotation = [[...], [...], [...]]        # world to camera
 translation = [tx, ty, tz]              # mm
-aperture_diameter = 6.25                # mm, of the entrance pupil; may be left out: thin rays
-focus_distance = 1200.0                 # mm along the optical axis; may be left out: focused on the background
-pose_sigma = [rx, ry, rz, cx, cy, cz]   # standard deviations of turn (rad) and centre (mm); may be left out
-[camera.background]                     # normal . x = offset; may be left out
+aperture_diameter = 6.25                # optional: diameter of the entrance pupil, mm; without it, thin rays
+focus_distance = 1200.0                 # optional: mm along the optical axis; without it, focused on the background
+pose_sigma = [rx, ry, rz, cx, cy, cz]   # optional: standard deviations of rotation (rad) and centre (mm)
+[camera.background]                     # optional: normal . x = offset
 normal = [nx, ny, nz]
 offset = -500.0                         # mm
 """
@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -36,35 +37,21 @@ from nerif.common.files import check_known, read_toml, write_toml
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 
 __all__ = [
-    "FORMAT", "CalibratedCamera", "check_distortion", "check_model", "check_names", "checked", "five", "flat",
-    "image_size", "numbers", "plane", "read_box", "read_cameras", "upright", "write_cameras",
+    "FORMAT", "CalibratedCamera", "check_camera", "check_distortion", "check_model", "check_names", "flat",
+    "numbers", "read_box", "read_cameras", "write_cameras",
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
-KEYS = ("name", "projection", "image_size", "intrinsics", "distortion", "rotation", "translation", "background",
-        "aperture_diameter", "focus_distance", "pose_sigma")  # fmt: skip
+ARRAYS = ("intrinsics", "distortion", "rotation", "translation")
+KEYS = ("name", "projection", "image_size", *ARRAYS, "background", "aperture_diameter", "focus_distance", "pose_sigma")
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
-"""Names that programs give to cameras that Brown's distortion (k1, k2, p1, p2, k3) describes."""
-LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)", re.IGNORECASE)  # no undistorted images, no distances
+"""Names that programs give to camera models with Brown's distortion (k1, k2, p1, p2, k3)."""
+LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)", re.IGNORECASE)  # neither undistorted images nor distances
 
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """A camera as a calibration knows it: its background plane and image size may be unknown.
-
-    Parameters
-    ----------
-    name : of the view
-    intrinsics : (3, 3) K, px; fx and fy of a telecentric camera in px/mm
-    rotation : (3, 3) world to camera
-    translation : (3,) world to camera, mm
-    distortion : (5,) k1, k2, p1, p2, k3
-    image_size : (height, width), px, or None
-    background : Plane, world frame, mm, or None
-    projection : perspective or telecentric
-    lens : Lens, or None for thin rays
-    pose_sigma : (6,) that of a Camera, or None
-    """
+    """A Camera (same fields) whose image size may still be unknown."""
 
     name: str
     intrinsics: Matrix3
@@ -78,35 +65,52 @@ class CalibratedCamera:
     pose_sigma: Float[Tensor, 6] | None = None
 
     def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
-        """Return the whole camera; without a background if none is known.
-
-        Raises
-        ------
-        InputError
-            If the image size is known neither here nor there.
-        """
-        image_size, background = image_size or self.image_size, background or self.background
-        if image_size is None:
+        """Return the Camera, with this image size (px) and background where they are given."""
+        size = image_size or self.image_size
+        if size is None:
             raise InputError(f"view '{self.name}' has no image size in its calibration; give --image-size HEIGHT WIDTH")
-        return Camera(
-            self.intrinsics, self.rotation, self.translation, image_size, background, self.distortion, self.name,
-            self.projection, self.lens, self.pose_sigma,
-        )  # fmt: skip
+        return Camera(**{**vars(self), "image_size": size, "background": background or self.background})
 
     @classmethod
     def from_camera(cls, camera: Camera) -> CalibratedCamera:
-        """Take over a whole camera."""
+        """Return the same camera as one of a calibration."""
+        return cls(**vars(camera))
+
+    @classmethod
+    def from_values(
+        cls, where: str, name: str, intrinsics: Any, rotation: Any, translation: Any, distortion: Any = None,
+        image_size: Any = None, background: tuple[Any, Any] | None = None, projection: Any = PERSPECTIVE.name,
+        lens: Lens | None = None, pose_sigma: Any = None,
+    ) -> CalibratedCamera:  # fmt: skip
+        """Return a camera from the numbers of a file, after checking their shapes; errors start with `where`.
+
+        Parameters
+        ----------
+        intrinsics : (3, 3) K, or its transpose (MATLAB)
+        translation : 3 numbers in any arrangement
+        distortion : up to 14 coefficients of OpenCV, of which those after the fifth have to be 0; None for none
+        image_size : height and width, px
+        background : normal of any length, and offset, mm
+        """
         return cls(
-            camera.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion,
-            camera.image_size, camera.background, camera.projection, camera.lens,
-            camera.pose_sigma,
-        )  # fmt: skip
+            name=name,
+            intrinsics=_upright(numbers(intrinsics, (3, 3), f"{where}: intrinsics")),
+            rotation=numbers(rotation, (3, 3), f"{where}: rotation"),
+            translation=numbers(flat(translation, f"{where}: translation"), (3,), f"{where}: translation"),
+            distortion=_five(distortion, f"{where}: distortion"),
+            image_size=None if image_size is None else _size(image_size, f"{where}: image_size"),
+            background=None if background is None else _plane(*background, f"{where}: background"),
+            projection=projection_named(projection, f"{where}: projection"),
+            lens=lens,
+            pose_sigma=None if pose_sigma is None else numbers(pose_sigma, (6,), f"{where}: pose_sigma"),
+        )
 
 
-def checked(camera: CalibratedCamera, source: str) -> CalibratedCamera:
-    """Return the camera if it can be one, else raise an InputError that names the source."""
+def check_camera(camera: CalibratedCamera, source: str) -> CalibratedCamera:
+    """Return the camera if it is a valid one, else raise an InputError that names the source."""
     try:
-        whole = replace(camera, lens=None).camera(camera.image_size or (1, 1))  # a background may come, to focus it on
+        # without the lens: its focus may depend on a background that is still to come
+        whole = replace(camera, lens=None).camera(camera.image_size or (1, 1))
         if camera.image_size is not None:
             whole.check_distortion()
     except InputError as error:
@@ -114,75 +118,69 @@ def checked(camera: CalibratedCamera, source: str) -> CalibratedCamera:
     return camera
 
 
-def numbers(value: Any, shape: tuple[int, ...], what: str) -> Tensor:
-    """Return an array of float64 of a given shape.
-
-    Raises
-    ------
-    InputError
-        If it is none; the message says what it should be.
-    """
+def numbers(value: Any, shape: tuple[int, ...], name: str) -> Tensor:
+    """Return finite numbers of a shape, float64."""
     expected = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
     try:
-        array = torch.as_tensor(value, dtype=torch.float64)
+        array = torch.as_tensor(value.tolist() if isinstance(value, np.ndarray) else value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"expected {expected}, got {value!r}", field=what) from None
+        raise InputError(f"expected {expected}, got {value!r}", field=name) from None
     if tuple(array.shape) != shape:
         got = " x ".join(map(str, array.shape)) or "a single number"
-        raise InputError(f"expected {expected}, got {got}", field=what)
+        raise InputError(f"expected {expected}, got {got}", field=name)
     if not bool(torch.isfinite(array).all()):
-        raise InputError(f"expected finite numbers, got {value!r}", field=what)
+        raise InputError(f"expected finite numbers, got {value!r}", field=name)
     return array
 
 
-def flat(value: Any, what: str, group: int = 1) -> np.ndarray:
-    """Return the numbers of an array of any shape one after the other, float64.
-
-    Raises
-    ------
-    InputError
-        If they are none, or not a multiple of `group`.
-    """
+def flat(value: Any, name: str, group: int = 1) -> np.ndarray:
+    """Return the numbers of an array of any shape as a float64 vector whose length is a multiple of `group`."""
     try:
-        found = np.asarray(value, dtype=np.float64).ravel()
+        vector = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        raise InputError(f"expected numbers, got {value!r}", field=what) from None
-    if found.size % group:
-        raise InputError(f"expected {group} numbers each, got {found.size} in all", field=what)
-    return found
+        raise InputError(f"expected numbers, got {value!r}", field=name) from None
+    if vector.size % group:
+        raise InputError(f"expected a multiple of {group} numbers, got {vector.size}", field=name)
+    return vector
 
 
-def image_size(value: Any, what: str) -> tuple[int, int]:
-    """Return (height, width), px; InputError if they are not two positive whole numbers."""
-    size = numbers(value, (2,), what)
-    if not bool((size > 0).all()) or bool((size % 1 != 0).any()):
-        raise InputError(f"expected height and width, whole numbers of px, got {value}", field=what)
+def _size(value: Any, name: str) -> tuple[int, int]:
+    size = numbers(value, (2,), name)
+    if not bool(((size > 0) & (size % 1 == 0)).all()):
+        raise InputError(f"expected height and width, whole numbers of px, got {value}", field=name)
     return int(size[0]), int(size[1])
 
 
-def plane(normal: Any, offset: Any, where: str) -> Plane:
-    """Return the plane normal . x = offset (mm), its normal brought to length one.
-
-    Raises
-    ------
-    InputError
-        If they are no numbers, or the normal is no direction.
-    """
-    direction = numbers(normal, (3,), f"{where}: normal")
+def _plane(normal: Any, offset: Any, name: str) -> Plane:
+    direction = numbers(normal, (3,), f"{name}: normal")
     length = float(direction.norm())
     if not length > 0:
-        raise InputError(f"normal: expected a direction, got {normal}", field=where)
-    return Plane(direction / length, float(numbers(offset, (), f"{where}: offset")) / length)
+        raise InputError(f"expected a direction, got {normal}", field=f"{name}: normal")
+    return Plane(direction / length, float(numbers(offset, (), f"{name}: offset")) / length)
+
+
+def _five(coefficients: Any, name: str) -> Tensor:
+    vector = flat([] if coefficients is None else coefficients, name)
+    if not np.isfinite(vector).all():
+        raise InputError(f"expected finite numbers as distortion coefficients, got {coefficients!r}", field=name)
+    if np.any(vector[5:] != 0):
+        raise InputError(
+            f"expected at most 5 distortion coefficients (k1 k2 p1 p2 k3), got {len(vector)}; calibrate again "
+            "without the rational, thin-prism and tilted models",
+            field=name,
+        )
+    return torch.from_numpy(np.concatenate([vector[:5], np.zeros(max(0, 5 - len(vector)))]))
+
+
+def _upright(k: Tensor) -> Tensor:
+    """K as OpenCV writes it, transposed if it is MATLAB's."""
+    if bool(k[:2, 2].abs().max() == 0) and bool(k[2, :2].abs().max() > 0):
+        k = k.T.contiguous()
+    return k / k[2, 2] if float(k[2, 2]) not in (0.0, 1.0) else k
 
 
 def check_model(model: Any, where: str) -> None:
-    """Refuse a camera model by its name in another program, unless Brown's distortion describes it.
-
-    Raises
-    ------
-    InputError
-        If it is another model: its coefficients would bend the rays wrongly.
-    """
+    """Refuse a camera model, by its name in another program, that has other than Brown's distortion."""
     if str(model).lower() not in BROWN:
         raise InputError(
             f"expected a perspective camera with Brown's distortion ({', '.join(BROWN)}), got '{model}'; "
@@ -191,66 +189,35 @@ def check_model(model: Any, where: str) -> None:
         )
 
 
-def check_distortion(given: Iterable[str], used: Collection[str], names: Sequence[str], where: str) -> None:
-    """Refuse keys that look like distortion coefficients and are not read.
+def check_distortion(keys: Iterable[str], read: Collection[str], names: Sequence[str], where: str) -> None:
+    """Refuse keys of a file that look like distortion coefficients but are not read: rays would be wrong without them.
 
     Parameters
     ----------
-    given : keys of a file
-    used : those that are read
-    names : what the coefficients may be called, with or without a number behind
-
-    Raises
-    ------
-    InputError
-        If there is one: without its coefficients the rays would be bent wrongly.
+    read : keys that are read
+    names : possible keys of the coefficients, with or without a number appended
     """
-    for key in given:
-        if key not in used and (key.rstrip("0123456789") in names or LIKE_DISTORTION.search(key)):
+    for key in keys:
+        if key not in read and (key.rstrip("0123456789") in names or LIKE_DISTORTION.search(key)):
             raise InputError(
                 f"expected distortion coefficients as one of {', '.join(names)}, got '{key}', which is not "
-                "read; rename it, or take it out of the file",
+                "read; rename it, or remove it from the file",
                 field=where,
             )
 
 
 def check_names(cameras: Sequence[CalibratedCamera], where: str) -> None:
-    """Refuse two cameras of one name; InputError naming it and where they are from."""
-    names = [camera.name for camera in cameras]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(
-                f"expected cameras of different names, got {names.count(name)} named '{name}'; rename them", field=where
-            )
-
-
-def five(values: Any, where: str) -> Tensor:
-    """Return OpenCV's five coefficients of 4 to 14; InputError if those beyond are not 0, or one is no number."""
-    given = flat(values, where)
-    if not np.isfinite(given).all():
-        raise InputError(f"expected finite numbers as distortion coefficients, got {values!r}", field=where)
-    if np.any(given[5:] != 0):
-        raise InputError(
-            f"expected at most 5 distortion coefficients (k1 k2 p1 p2 k3), got {len(given)}; calibrate again "
-            "without the rational, thin-prism and tilted models",
-            field=where,
-        )
-    return torch.from_numpy(np.concatenate([given[:5], np.zeros(max(0, 5 - len(given)))]))
-
-
-def upright(matrix: Any, where: str) -> Tensor:
-    """Return K as OpenCV writes it, transposed back if it is MATLAB's."""
-    k = numbers(matrix, (3, 3), where)
-    if bool(k[:2, 2].abs().max() == 0) and bool(k[2, :2].abs().max() > 0):
-        k = k.T.contiguous()
-    return k / k[2, 2] if float(k[2, 2]) not in (0.0, 1.0) else k
+    """Refuse two cameras of one name."""
+    for name, count in Counter(camera.name for camera in cameras).items():
+        if count > 1:
+            raise InputError(f"expected cameras of different names, got {count} named '{name}'; rename", field=where)
 
 
 def write_cameras(
     path: str | os.PathLike[str], cameras: Sequence[CalibratedCamera], about: dict[str, Any] | None = None,
     box: Box | None = None,
 ) -> None:  # fmt: skip
-    """Write cameras, the box, and what else is worth keeping under [about], atomically and in full precision."""
+    """Write cameras and box, with further entries under [about], atomically and in full precision."""
     tables = []
     for camera in cameras:
         table: dict[str, Any] = {"name": camera.name}
@@ -258,8 +225,7 @@ def write_cameras(
             table["projection"] = camera.projection.name
         if camera.image_size is not None:
             table["image_size"] = list(camera.image_size)
-        for name in ("intrinsics", "distortion", "rotation", "translation"):
-            table[name] = getattr(camera, name).tolist()
+        table |= {name: getattr(camera, name).tolist() for name in ARRAYS}
         if camera.lens is not None:
             table["aperture_diameter"] = camera.lens.diameter
             if camera.lens.focus is not None:
@@ -274,13 +240,7 @@ def write_cameras(
 
 
 def read_box(path: str | os.PathLike[str]) -> Box | None:
-    """Read the box of a calibration file, mm; None where it has none, or is another program's.
-
-    Raises
-    ------
-    InputError
-        If it is missing, no TOML, or the corners are those of no box.
-    """
+    """Read the box of a calibration file, mm; None if it has none or is of another format."""
     table = read_toml(path, "file; expected a calibration")
     if table.get("format") != FORMAT or "box" not in table:
         return None
@@ -293,13 +253,7 @@ def read_box(path: str | os.PathLike[str]) -> Box | None:
 
 
 def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
-    """Read a calibration file.
-
-    Raises
-    ------
-    InputError
-        If it is missing, no TOML, of another format, or a camera in it cannot be one; names file, camera and key.
-    """
+    """Read the cameras of a calibration file; errors name file, camera and key."""
     table = read_toml(path, "file; expected a calibration")
     if table.get("format") != FORMAT:
         raise InputError(f"expected format = '{FORMAT}', got {table.get('format')!r}", field=path)
@@ -312,41 +266,31 @@ def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
 
 
 def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
-    name = str(table.get("name", f"camera {index}"))
-    where = f"{path}: camera '{name}'"
+    where = f"{path}: camera '{table.get('name', f'camera {index}')}'"
     check_known(table, KEYS, where)
     for key in ("name", "intrinsics", "rotation", "translation"):
         if key not in table:
             raise InputError(f"'{key}' is missing", field=where)
-    given = table.get("background")
-    if given is not None and (not isinstance(given, dict) or set(given) != {"normal", "offset"}):
-        raise InputError(f"background: expected normal = [x, y, z] and offset = mm, got {given!r}", field=where)
-    camera = CalibratedCamera(
-        name=name,
-        intrinsics=numbers(table["intrinsics"], (3, 3), f"{where}: intrinsics"),
-        rotation=numbers(table["rotation"], (3, 3), f"{where}: rotation"),
-        translation=numbers(table["translation"], (3,), f"{where}: translation"),
-        distortion=numbers(table.get("distortion", [0.0] * 5), (5,), f"{where}: distortion"),
-        image_size=image_size(table["image_size"], f"{where}: image_size") if "image_size" in table else None,
-        background=None if given is None else plane(given["normal"], given["offset"], f"{where}: background"),
-        projection=projection_named(table.get("projection", PERSPECTIVE.name), f"{where}: projection"),
-        lens=_lens(table, where),
-        pose_sigma=numbers(table["pose_sigma"], (6,), f"{where}: pose_sigma") if "pose_sigma" in table else None,
-    )
-    return checked(camera, path)
+    values = {key: table[key] for key in table if key not in ("aperture_diameter", "focus_distance")}
+    values |= {"name": str(table["name"]), "lens": _lens(table, where)}
+    plane = table.get("background")
+    if plane is not None:
+        if not isinstance(plane, dict) or set(plane) != {"normal", "offset"}:
+            raise InputError(f"background: expected normal = [x, y, z] and offset = mm, got {plane!r}", field=where)
+        values["background"] = plane["normal"], plane["offset"]
+    return check_camera(CalibratedCamera.from_values(where, **values), path)
 
 
 def _lens(table: dict[str, Any], where: str) -> Lens | None:
-    """The lens of a camera; none where its aperture is not told."""
-    if "aperture_diameter" not in table:
-        if "focus_distance" in table:
-            raise InputError("focus_distance: expected together with aperture_diameter, got it alone", field=where)
-        return None
     diameter, focus = (
-        None if key not in table else float(numbers(table[key], (), f"{where}: {key}"))
+        float(numbers(table[key], (), f"{where}: {key}")) if key in table else None
         for key in ("aperture_diameter", "focus_distance")
     )
+    if diameter is None:
+        if focus is not None:
+            raise InputError("focus_distance: expected together with aperture_diameter, got it alone", field=where)
+        return None
     try:
-        return Lens(diameter or 0.0, focus)
+        return Lens(diameter, focus)
     except InputError as error:
         raise error.inside(where) from None

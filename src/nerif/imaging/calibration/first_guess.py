@@ -4,7 +4,7 @@ Perspective cameras are solved one at a time, then linked through the target pos
 
 A telecentric camera sees an affine image of a flat target: the larger singular value is the scale of the camera, the
 ratio of the singular values the cosine of the target's tilt. The sign of the tilt is ambiguous, so each image has two
-rotations. Two cameras with common poses resolve it, up to the mirror image of the whole rig (`mirrored`).
+rotations. Two cameras with common poses resolve it, up to the mirror image of the whole rig (`mirror`).
 
 Sources: Tomasi & Kanade, Shape and motion from image streams under orthography, Int. J. Comput. Vis. 9 (1992) 137;
 Collins & Bartoli, Infinitesimal plane-based pose estimation, Int. J. Comput. Vis. 109 (2014) 252.
@@ -12,8 +12,10 @@ Collins & Bartoli, Infinitesimal plane-based pose estimation, Int. J. Comput. Vi
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,88 +25,118 @@ from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose
 from nerif.imaging.calibration.targets import Detection, ViewImages
 
-__all__ = [
-    "DISAGREE",
-    "Guess",
-    "angles",
-    "contradiction",
-    "enough",
-    "first_guess",
-    "guess_perspective",
-    "guess_telecentric",
-    "mirrored",
-    "next_camera",
-]
+__all__ = ["first_guess", "mirror"]
 
-DISAGREE = 5.0  # degrees by which two guesses of a rotation may differ
+MIN_IMAGES = 3
+MAX_ANGLE = 5.0  # degrees between two estimates of one rotation
+ANGLE_CAP = 3 * MAX_ANGLE  # degrees beyond which a rotation does not fit, no matter by how much
+MAX_SHIFT = 0.1  # between two estimates of a camera's centre, over its distance
+FOCAL_LENGTHS = (1.0, 3.0, 10.0)  # over the image width, to start from: too far off, the fit ends in another minimum
+FLIP = np.diag([1.0, 1.0, -1.0])
 
 
-@dataclass(frozen=True)
-class Guess:
-    """Where cameras and targets are, to begin with.
+class Guess(NamedTuple):
+    """Initial parameters.
 
-    Parameters
-    ----------
     intrinsics : (camera, 9) as those of a Bundle
     cameras : world to camera
     targets : target to world, of the poses that cameras share, by name
-    laid : target to world, of each camera's images of the target on its background, by name
+    on_background : target to world, of each camera's images of the target on its background, by name
     """
 
     intrinsics: Float[np.ndarray, "camera 9"]
     cameras: tuple[Pose, ...]
     targets: Mapping[str, Pose]
-    laid: tuple[Mapping[str, Pose], ...]
+    on_background: tuple[Mapping[str, Pose], ...]
 
 
-def enough(view: ViewImages, images: int) -> None:
-    """Refuse fewer than three images of a target."""
-    if images < 3:
+def first_guess(
+    views: Sequence[ViewImages], distortion: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
+) -> tuple[Bundle, list[Observation]]:
+    """Return a bundle to adjust, in the frame of one target pose, and all observations.
+
+    The principal point of a telecentric camera stays in the middle of the image: shifting it is equivalent to shifting
+    the camera and, for the distortion, changing p1 and p2.
+
+    Parameters
+    ----------
+    distortion : coefficients to be adjusted
+    world : name of the target pose that defines the world; the one that most cameras see if empty
+    """
+    counts = Counter(name for view in views for name in view.poses)
+    if not counts:
+        raise InputError("expected images of the target free in space in each view, got none", field="calibrate")
+    names = sorted(counts)
+    if world and world not in counts:
         raise InputError(
-            f"expected the target in 3 images at least (10 or more, tilted in different ways, "
-            f"are good), found it in {images}",
+            f"expected a target pose with detections, one of {', '.join(names)}, got '{world}'", field="world"
+        )
+    world = world or max(names, key=lambda n: counts[n])
+    guess = GUESSES[projection](views, world)
+    poses, observations = [guess.targets[n] for n in names], []
+    for i, view in enumerate(views):
+        for name, detection in view.poses.items():
+            observations.append(Observation(i, names.index(name), detection, name))
+        for name, pose in guess.on_background[i].items():  # each image has its own pose
+            poses.append(pose)
+            observations.append(Observation(i, len(poses) - 1, view.background[name], name, on_background=True))
+    principal = projection.shows_depth
+    bundle = Bundle(
+        intrinsics=guess.intrinsics,
+        cameras=guess.cameras,
+        poses=tuple(poses),
+        fixed=names.index(world),
+        free=(True, True, principal, principal, *(c in distortion for c in COEFFICIENTS)),
+        sizes=tuple(v.size for v in views),
+        projection=projection,
+    )
+    return bundle, observations
+
+
+def mirror(bundle: Bundle) -> Bundle:
+    """Return the rig mirrored at the world's plane z = 0, cameras looking the other way: it takes the same images."""
+
+    def flip(pose: Pose) -> Pose:
+        return Pose(FLIP @ pose.rotation @ FLIP, FLIP @ pose.translation)
+
+    return replace(bundle, cameras=tuple(map(flip, bundle.cameras)), poses=tuple(map(flip, bundle.poses)))
+
+
+# -- both projections ----------------------------------------------------------------------------------------------
+
+
+def _check_count(view: ViewImages, images: int) -> None:
+    if images < MIN_IMAGES:
+        raise InputError(
+            f"expected the target in at least {MIN_IMAGES} images (better 10 or more, tilted in different ways), "
+            f"got {images}",
             field=f"view '{view.name}'",
         )
 
 
-def next_camera(
-    views: Sequence[ViewImages], tied: Collection[int], targets: Collection[str], least: int
+def _next_camera(
+    views: Sequence[ViewImages], cameras: Collection[int], targets: Collection[str], minimum: int
 ) -> tuple[int, list[str]]:
-    """Return the camera, of those not tied to the others yet, that shares most target poses with them, and which.
-
-    Parameters
-    ----------
-    views : what was found in the images of each camera
-    tied : numbers of the cameras that are
-    targets : names of the target poses that these have seen
-    least : number of poses it has to share
-
-    Raises
-    ------
-    InputError
-        If there is none that shares as many.
-    """
-    shared = {i: [n for n in view.poses if n in targets] for i, view in enumerate(views) if i not in tied}
-    chosen = max(shared, key=lambda i: len(shared[i]))
-    if len(shared[chosen]) < least:
-        number = "no target pose" if least == 1 else "fewer than two target poses"
+    """The camera that shares most target poses with those in `cameras`, which see `targets`, and these poses."""
+    shared = {i: [n for n in view.poses if n in targets] for i, view in enumerate(views) if i not in cameras}
+    best = max(shared, key=lambda i: len(shared[i]))
+    if len(shared[best]) < minimum:
         names = ", ".join(f"'{views[i].name}'" for i in shared)
         raise InputError(
-            f"{number} shared with the other cameras, so there is no common frame; take "
-            "images of one pose with neighbouring cameras at the same time, under the same number",
+            f"expected at least {minimum} in common with the other cameras, got {len(shared[best])} target poses; "
+            "take images of one pose with neighbouring cameras at the same time, under the same number",
             field=f"view {names}",
         )
-    return chosen, shared[chosen]
+    return best, shared[best]
 
 
-def angles(a: Float[np.ndarray, "*#n 3 3"], b: Float[np.ndarray, "*#n 3 3"]) -> Float[np.ndarray, "*n"]:
-    """Return the angles between rotations, degrees."""
+def _angles(a: Float[np.ndarray, "*#n 3 3"], b: Float[np.ndarray, "*#n 3 3"]) -> Float[np.ndarray, "*n"]:
+    """Angles between rotations, degrees."""
     cosine = ((a * b).sum(axis=(-2, -1)) - 1) / 2
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def contradiction(view: str, pose: str, degrees: float) -> InputError:
-    """What to say of a camera that sees target poses otherwise than the others."""
+def _contradiction(view: str, pose: str, degrees: float) -> InputError:
     return InputError(
         f"its target poses contradict those of the other cameras (by {degrees:.0f} "
         f"degrees in '{pose}'); are its images mirrored (flip), or of other poses than their names say?",
@@ -112,47 +144,44 @@ def contradiction(view: str, pose: str, degrees: float) -> InputError:
     )
 
 
-FAR = 0.1  # share of the distance by which two guesses of a camera's place may differ
+# -- perspective ---------------------------------------------------------------------------------------------------
 
-Alone = tuple[np.ndarray, dict[tuple[str, bool], Pose]]
-"""Intrinsics of one camera, and target poses before it by name and whether the target lies on the background."""
+Poses = dict[tuple[str, bool], Pose]
+"""Target to camera, by name and whether the target is on the background."""
 
 
-def guess_perspective(views: Sequence[ViewImages], world: str) -> Guess:
-    """Return intrinsics and poses in the frame of the target pose `world`.
-
-    Raises
-    ------
-    InputError
-        If a camera has too few poses, is not tied to the others by shared ones, or contradicts them.
-    """
-    alone = [_perspective_view(view) for view in views]
-    cameras, targets = _perspective_rig(views, alone, world)
+def _guess_perspective(views: Sequence[ViewImages], world: str) -> Guess:
+    intrinsics, local = zip(*(_perspective_view(view) for view in views), strict=True)
+    targets = {world: Pose(np.eye(3), np.zeros(3))}
+    cameras: dict[int, Pose] = {}
+    while len(cameras) < len(views):
+        i, shared = _next_camera(views, cameras, targets, 1)
+        estimates = {n: local[i][n, False] @ targets[n].inverse for n in shared}
+        cameras[i] = _consensus(estimates, views[i].name)
+        for n in views[i].poses:
+            targets.setdefault(n, cameras[i].inverse @ local[i][n, False])
     return Guess(
-        intrinsics=np.stack([k for k, _ in alone]),
-        cameras=tuple(cameras[i] for i in range(len(views))),
-        targets=targets,
-        laid=tuple(
-            {name: cameras[i].inverse @ found[name, True] for name in view.background}
-            for i, (view, (_, found)) in enumerate(zip(views, alone, strict=True))
-        ),
+        np.stack(intrinsics),
+        tuple(cameras[i] for i in range(len(views))),
+        targets,
+        tuple({n: cameras[i].inverse @ local[i][n, True] for n in view.background} for i, view in enumerate(views)),
     )
 
 
-def _perspective_view(view: ViewImages) -> Alone:
-    """Focal length of one camera and the pose of each target before it, by name and whether it is on the background."""
+def _perspective_view(view: ViewImages) -> tuple[np.ndarray, Poses]:
+    """Intrinsics of one camera, of which only the focal length is fitted, and its target poses."""
     import cv2
 
     images = {(n, False): d for n, d in view.poses.items()} | {(n, True): d for n, d in view.background.items()}
-    enough(view, len(images))
+    _check_count(view, len(images))
     height, width = view.size
     points = [d.points.astype(np.float32) for d in images.values()]
     pixels = [d.pixels.astype(np.float32) for d in images.values()]
-    # principal point and distortion wait for the bundle adjustment: one camera alone cannot tell them well
+    # principal point and distortion are left to the bundle adjustment: one camera alone hardly determines them
     flags = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
     best = None
-    for focal in (1.0, 3.0, 10.0):  # times the width: a guess too far off ends elsewhere
+    for focal in FOCAL_LENGTHS:
         k = np.array([[focal * width, 0, (width - 1) / 2], [0, focal * width, (height - 1) / 2], [0, 0, 1]])
         rms, k, _, rotations, translations = cv2.calibrateCamera(
             points, pixels, (width, height), k, np.zeros(5), flags=flags
@@ -167,74 +196,27 @@ def _perspective_view(view: ViewImages) -> Alone:
             field=f"view '{view.name}'",
         )
     _, k, rotations, translations = best
-    found = {
-        key: Pose.of_vector(np.concatenate([r.ravel(), t.ravel()]))
-        for key, r, t in zip(images, rotations, translations, strict=True)
-    }
-    return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0], dtype=np.float64), found
+    vectors = (np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True))
+    poses = dict(zip(images, map(Pose.of_vector, vectors), strict=True))
+    return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0], dtype=np.float64), poses
 
 
-def _perspective_rig(
-    views: Sequence[ViewImages], alone: Sequence[Alone], world: str
-) -> tuple[dict[int, Pose], dict[str, Pose]]:
-    """Poses of cameras (world to camera) and targets (to world), from camera to camera through shared poses."""
-    targets = {world: Pose(np.eye(3), np.zeros(3))}
-    cameras: dict[int, Pose] = {}
-    while len(cameras) < len(views):
-        i, shared = next_camera(views, cameras, targets, 1)
-        guesses = {n: alone[i][1][n, False] @ targets[n].inverse for n in shared}
-        cameras[i] = _agreed(guesses, views[i].name)
-        for n in views[i].poses:
-            targets.setdefault(n, cameras[i].inverse @ alone[i][1][n, False])
-    return cameras, targets
-
-
-def _agreed(guesses: dict[str, Pose], name: str) -> Pose:
-    """The guess that agrees best with the others, if they agree at all."""
-    every = list(guesses.values())
-    rotations = np.stack([guess.rotation for guess in every])
-    distances = angles(rotations[:, None], rotations)
+def _consensus(estimates: dict[str, Pose], name: str) -> Pose:
+    """The estimate of a camera's pose that agrees best with the others, if at least half of them agree."""
+    poses = list(estimates.values())
+    rotations = np.stack([pose.rotation for pose in poses])
+    distances = _angles(rotations[:, None], rotations)
     middle = int(np.argmin(np.median(distances, axis=1)))
-    best = every[middle]
-    far = np.array([np.linalg.norm(a.inverse.translation - best.inverse.translation) for a in every])
-    reach = np.linalg.norm(best.translation)
-    bad = (distances[middle] > DISAGREE) | (far > FAR * reach)
-    if bad.sum() * 2 >= len(every) and len(every) > 1:
-        worst = list(guesses)[int(np.argmax(distances[middle]))]
-        raise contradiction(name, worst, float(distances[middle].max()))
+    best = poses[middle]
+    shifts = np.array([np.linalg.norm(a.inverse.translation - best.inverse.translation) for a in poses])
+    outliers = (distances[middle] > MAX_ANGLE) | (shifts > MAX_SHIFT * np.linalg.norm(best.translation))
+    if outliers.sum() * 2 >= len(poses) and len(poses) > 1:
+        worst = list(estimates)[int(np.argmax(distances[middle]))]
+        raise _contradiction(name, worst, float(distances[middle].max()))
     return best
 
 
-FARTHEST = 3 * DISAGREE  # degrees: rotations further apart than this do not fit, no matter by how much
-FLIP = np.diag([1.0, 1.0, -1.0])
-
-
-def guess_telecentric(views: Sequence[ViewImages], world: str) -> Guess:
-    """Return intrinsics and poses in the frame of the target pose `world`; images on the background are not used.
-
-    Raises
-    ------
-    InputError
-        If a camera has too few poses, is not tied to the others by shared ones, or contradicts them.
-    """
-    alone = [_telecentric_view(view) for view in views]
-    cameras, targets = _telecentric_rig(views, alone, world)
-    places, offsets = _places(alone, cameras, targets, world)
-    return Guess(
-        intrinsics=np.stack([[a.scale, a.scale, *a.middle, 0, 0, 0, 0, 0] for a in alone]),
-        cameras=tuple(Pose(cameras[i], offsets[i]) for i in range(len(views))),
-        targets={name: Pose(turn, places[name]) for name, turn in targets.items()},
-        laid=({},) * len(views),
-    )
-
-
-def mirrored(bundle: Bundle) -> Bundle:
-    """Return the rig mirrored at the world's plane z = 0, cameras looking the other way: it takes the same images."""
-
-    def flipped(pose: Pose) -> Pose:
-        return Pose(FLIP @ pose.rotation @ FLIP, FLIP @ pose.translation)
-
-    return replace(bundle, cameras=tuple(map(flipped, bundle.cameras)), poses=tuple(map(flipped, bundle.poses)))
+# -- telecentric ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -243,13 +225,26 @@ class _TelecentricView:
 
     scale: float
     middle: tuple[float, float]
-    turns: Mapping[str, Float[np.ndarray, "2 3 3"]]
+    rotations: Mapping[str, Float[np.ndarray, "2 3 3"]]
     places: Mapping[str, Float[np.ndarray, 2]]
 
 
+def _guess_telecentric(views: Sequence[ViewImages], world: str) -> Guess:
+    """Images of the target on the background are not used."""
+    local = [_telecentric_view(view) for view in views]
+    cameras, targets = _telecentric_rotations(views, local, world)
+    places, offsets = _telecentric_places(local, cameras, targets, world)
+    return Guess(
+        np.stack([[a.scale, a.scale, *a.middle, 0, 0, 0, 0, 0] for a in local]),
+        tuple(Pose(cameras[i], offsets[i]) for i in range(len(views))),
+        {name: Pose(rotation, places[name]) for name, rotation in targets.items()},
+        ({},) * len(views),
+    )
+
+
 def _telecentric_view(view: ViewImages) -> _TelecentricView:
-    enough(view, len(view.poses))
-    affine = {name: _affine(found) for name, found in view.poses.items()}
+    _check_count(view, len(view.poses))
+    affine = {name: _affine(detection) for name, detection in view.poses.items()}
     for name, (matrix, _) in affine.items():
         if not np.linalg.det(matrix) > 0:
             raise InputError(
@@ -260,22 +255,22 @@ def _telecentric_view(view: ViewImages) -> _TelecentricView:
     return _TelecentricView(
         scale,
         middle,
-        {name: _both_turns(matrix / scale) for name, (matrix, _) in affine.items()},
+        {name: _both_rotations(matrix / scale) for name, (matrix, _) in affine.items()},
         {name: (at - middle) / scale for name, (_, at) in affine.items()},
     )
 
 
-def _affine(found: Detection) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, 2]]:
+def _affine(detection: Detection) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, 2]]:
     """From the target's x, y (mm) to pixels: matrix and offset."""
-    points = np.column_stack([found.points[:, :2], np.ones(len(found.points))])
-    solution = np.linalg.lstsq(points, found.pixels, rcond=None)[0]
+    points = np.column_stack([detection.points[:, :2], np.ones(len(detection.points))])
+    solution = np.linalg.lstsq(points, detection.pixels, rcond=None)[0]
     return solution[:2].T, solution[2]
 
 
-def _both_turns(block: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 3 3"]:
-    """Both rotations that have this upper left block, as nearly as one can."""
-    before, (_, least), after = np.linalg.svd(block)
-    cosine = min(float(least), 1.0)
+def _both_rotations(block: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 3 3"]:
+    """Both rotations whose upper left block is nearest to this one."""
+    before, (_, smaller), after = np.linalg.svd(block)
+    cosine = min(float(smaller), 1.0)
     sine = np.sqrt(1 - cosine**2)
     left, right = np.eye(3), np.eye(3)
     left[:2, :2], left[2, 2] = before, np.linalg.det(before)
@@ -284,124 +279,69 @@ def _both_turns(block: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 3 3"]:
     return np.stack([left @ t @ right for t in (tilt, tilt.T)])
 
 
-def _telecentric_rig(
-    views: Sequence[ViewImages], alone: Sequence[_TelecentricView], world: str
+def _telecentric_rotations(
+    views: Sequence[ViewImages], local: Sequence[_TelecentricView], world: str
 ) -> tuple[dict[int, np.ndarray], dict[str, np.ndarray]]:
-    """Rotations of cameras (from the world) and targets (to it): always the camera that shares most poses is next."""
+    """Rotations of cameras (from the world) and targets (to it), beginning with the camera that has most poses."""
     first = max(range(len(views)), key=lambda i: len(views[i].poses))
-    cameras = {first: np.eye(3)}  # the frame until all are tied together
-    targets = dict(alone[first].turns)  # each with both rotations or, once another camera has seen it, one
+    cameras = {first: np.eye(3)}  # the frame until all cameras are linked
+    targets = dict(local[first].rotations)  # each with both rotations or, once another camera has resolved it, one
     while len(cameras) < len(views):
-        i, shared = next_camera(views, cameras, targets, 2)
-        cameras[i], apart = _turned_alike(alone[i].turns, targets, shared)
-        if (apart > DISAGREE).sum() * 2 >= len(apart):
-            raise contradiction(views[i].name, shared[int(apart.argmax())], float(apart.max()))
-        for name, turns in alone[i].turns.items():
+        i, shared = _next_camera(views, cameras, targets, 2)
+        cameras[i], errors = _best_rotation(local[i].rotations, targets, shared)
+        if (errors > MAX_ANGLE).sum() * 2 >= len(errors):
+            raise _contradiction(views[i].name, shared[int(errors.argmax())], float(errors.max()))
+        for name, rotations in local[i].rotations.items():
             if name not in targets:
-                targets[name] = cameras[i].T @ turns
+                targets[name] = cameras[i].T @ rotations
             else:
-                left = angles(cameras[i] @ targets[name][:, None], turns).min(axis=1)
-                if left.min() < DISAGREE:
-                    targets[name] = targets[name][[left.argmin()]]
+                errors = _angles(cameras[i] @ targets[name][:, None], rotations).min(axis=1)
+                if errors.min() < MAX_ANGLE:
+                    targets[name] = targets[name][[errors.argmin()]]
     if len(views) > 1 and len(targets[world]) > 1:
         raise InputError(f"expected a target pose that two cameras see, got '{world}'", field="world")
     to_world = targets[world][0].T
-    turned = {name: to_world @ turns[0] for name, turns in targets.items()}
-    return {i: camera @ to_world.T for i, camera in cameras.items()}, turned
+    return (
+        {i: camera @ to_world.T for i, camera in cameras.items()},
+        {name: to_world @ rotations[0] for name, rotations in targets.items()},
+    )
 
 
-def _turned_alike(
-    turns: Mapping[str, np.ndarray], targets: Mapping[str, np.ndarray], shared: Sequence[str]
+def _best_rotation(
+    rotations: Mapping[str, np.ndarray], targets: Mapping[str, np.ndarray], shared: Sequence[str]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " pose"]]:
-    """The rotation under which a camera's targets are turned as the others see them, and by how much they are not."""
-    tried = np.concatenate([
-        (turns[n][:, None] @ targets[n].transpose(0, 2, 1)[None]).reshape(-1, 3, 3) for n in shared
+    """The rotation of a camera that fits its target poses best to those of the others, and its error of each, deg."""
+    candidates = np.concatenate([
+        (rotations[n][:, None] @ targets[n].transpose(0, 2, 1)[None]).reshape(-1, 3, 3) for n in shared
     ])  # fmt: skip
-    apart = np.stack([
-        angles(tried[:, None, None] @ targets[n][None, :, None], turns[n][None, None]).min(axis=(1, 2)) for n in shared
+    errors = np.stack([
+        _angles(candidates[:, None, None] @ targets[n][None, :, None], rotations[n][None, None]).min(axis=(1, 2))
+        for n in shared
     ], axis=1)  # fmt: skip
-    best = int(np.minimum(apart, FARTHEST).sum(axis=1).argmin())
-    return tried[best], apart[best]
+    best = int(np.minimum(errors, ANGLE_CAP).sum(axis=1).argmin())
+    return candidates[best], errors[best]
 
 
-def _places(
-    alone: Sequence[_TelecentricView], cameras: Mapping[int, np.ndarray], targets: Mapping[str, np.ndarray], world: str
+def _telecentric_places(
+    local: Sequence[_TelecentricView], cameras: Mapping[int, np.ndarray], targets: Mapping[str, np.ndarray], world: str
 ) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
-    """Places of targets in the world and offsets of cameras (x, y, 0), mm, by least squares; unseen depths are 0."""
+    """Places of targets and offsets of cameras (x, y, 0), mm, by least squares; unconstrained depths are 0."""
     names = [n for n in targets if n != world]
-    size, count = 2 * len(alone) + 3 * len(names), sum(len(a.places) for a in alone)
+    size, count = 2 * len(local) + 3 * len(names), sum(len(a.places) for a in local)
     matrix, right = np.zeros((count, 2, size)), np.zeros((count, 2))
-    rows = ((i, name, at) for i, a in enumerate(alone) for name, at in a.places.items())
+    rows = ((i, name, at) for i, a in enumerate(local) for name, at in a.places.items())
     for row, (i, name, at) in enumerate(rows):
         matrix[row, :, 2 * i : 2 * i + 2], right[row] = np.eye(2), at
         if name != world:
-            first = 2 * len(alone) + 3 * names.index(name)
+            first = 2 * len(local) + 3 * names.index(name)
             matrix[row, :, first : first + 3] = cameras[i][:2]
-    found = np.linalg.lstsq(matrix.reshape(-1, size), right.ravel(), rcond=1e-9)[0]
-    offsets = [np.append(found[2 * i : 2 * i + 2], 0.0) for i in range(len(alone))]
-    places = dict(zip(names, found[2 * len(alone) :].reshape(-1, 3), strict=True))
+    solution = np.linalg.lstsq(matrix.reshape(-1, size), right.ravel(), rcond=1e-9)[0]
+    offsets = [np.append(solution[2 * i : 2 * i + 2], 0.0) for i in range(len(local))]
+    places = dict(zip(names, solution[2 * len(local) :].reshape(-1, 3), strict=True))
     return {**places, world: np.zeros(3)}, offsets
 
 
 GUESSES: dict[Projection, Callable[[Sequence[ViewImages], str], Guess]] = {
-    PERSPECTIVE: guess_perspective,
-    TELECENTRIC: guess_telecentric,
+    PERSPECTIVE: _guess_perspective,
+    TELECENTRIC: _guess_telecentric,
 }
-
-
-def first_guess(
-    views: Sequence[ViewImages], distortion: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
-) -> tuple[Bundle, list[Observation]]:
-    """Return a bundle to adjust, in the frame of one target pose, and all points found.
-
-    The principal point of a camera that shows no depth stays in the middle of the image: moving it is moving the
-    camera and, for the distortion, p1 and p2.
-
-    Parameters
-    ----------
-    views : what was found in the images of each camera
-    distortion : coefficients to be adjusted
-    world : name of the target pose that is the world frame; the one that most cameras see if empty
-    projection : of all cameras
-
-    Raises
-    ------
-    InputError
-        If a camera has too few poses, is not tied to the others by shared ones, or contradicts them.
-    """
-    poses, world = _pose_names(views, world)
-    guess = GUESSES[projection](views, world)
-    every, observations = [guess.targets[n] for n in poses], []
-    for i, view in enumerate(views):
-        for name, seen in view.poses.items():
-            observations.append(Observation(i, poses.index(name), seen, name))
-        for name, pose in guess.laid[i].items():  # each a pose of its own
-            every.append(pose)
-            observations.append(Observation(i, len(every) - 1, view.background[name], name, on_background=True))
-    principal = projection.shows_depth
-    bundle = Bundle(
-        intrinsics=guess.intrinsics,
-        cameras=guess.cameras,
-        poses=tuple(every),
-        fixed=poses.index(world),
-        free=(True, True, principal, principal, *(c in distortion for c in COEFFICIENTS)),
-        sizes=tuple(v.size for v in views),
-        projection=projection,
-    )
-    return bundle, observations
-
-
-def _pose_names(views: Sequence[ViewImages], world: str) -> tuple[list[str], str]:
-    """All shared poses, and the one that is the world."""
-    seen: dict[str, int] = {}
-    for view in views:
-        for name in view.poses:
-            seen[name] = seen.get(name, 0) + 1
-    if not seen:
-        raise InputError("no image with the target free in space; expected some in every view", field="calibrate")
-    if world and world not in seen:
-        raise InputError(
-            f"expected a target pose that was found, one of {', '.join(sorted(seen))}, got '{world}'", field="world"
-        )
-    names = sorted(seen)
-    return names, world or max(names, key=lambda n: seen[n])

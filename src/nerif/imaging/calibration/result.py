@@ -1,4 +1,4 @@
-"""What a calibration found, how well it fits, and what looks wrong about it."""
+"""The result of a calibration: cameras, reprojection errors, and checks."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_camer
 __all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "rms_of"]
 
 MOUNT = 0.05, 0.005
-"""How far a camera may have been moved (mm) and turned (degrees) since it was calibrated, where nobody says."""
-COVERED = 0.4  # of the image: with less, distortion is not known at its edges
-FOCAL_KNOWN = 0.01  # of the focal length: a larger standard deviation is told
-PLANE_FLAT = 0.005  # of the distance: a background that is less flat is none
+"""Default standard deviations of the position (mm) and rotation (degrees) of a camera since its calibration."""
+MIN_COVERAGE = 0.4  # of the image: with less, distortion is not constrained at its edges
+MAX_FOCAL_SIGMA = 0.01  # of the focal length
+MAX_PLANE_RMS = 0.005  # of a background, over the distance of the camera
 
 
 @dataclass(frozen=True)
 class ImageError:
-    """Reprojection error of one image: rms over `points` points, px."""
+    """Rms reprojection error of one image over its points, px, and whether the adjustment used the image."""
 
     camera: str
     image: str
@@ -44,19 +44,13 @@ class ImageError:
 
 
 def rms_of(errors: Sequence[ImageError]) -> float:
-    """Return the rms reprojection error over the points of the images that were used, px."""
+    """Return the rms reprojection error over the points of the images in use, px."""
     used = [e for e in errors if e.used]
     return float(np.sqrt(np.average([e.rms**2 for e in used], weights=[e.points for e in used])))
 
 
 def read_errors(path: str | os.PathLike[str]) -> tuple[ImageError, ...]:
-    """Read the errors of the images that a calibration file was made from; none where it does not tell them.
-
-    Raises
-    ------
-    InputError
-        If it is missing, no TOML, or its [[about.image]] are not as nerif calibrate writes them.
-    """
+    """Read the errors of the images behind a calibration file, from its [[about.image]]; none if it has none."""
     table = read_toml(path, "file; expected a calibration")
     about = table.get("about")
     errors = []
@@ -82,7 +76,7 @@ class FittedPlane:
 
     @classmethod
     def through(cls, points: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, 3]) -> FittedPlane:
-        """Return the plane nearest to points (mm) in the sense of least squares, its normal towards a point (mm)."""
+        """Return the least-squares plane of points (mm), its normal towards a point (mm)."""
         middle = points.mean(axis=0)
         normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
         normal = normal if normal @ (towards - middle) > 0 else -normal
@@ -91,30 +85,27 @@ class FittedPlane:
 
     @classmethod
     def across(cls, camera: Pose, distance: float) -> FittedPlane:
-        """Return the plane across the optical axis of a camera (world to camera) so far (mm) behind the origin."""
+        """Return the plane across the optical axis of a camera (world to camera), `distance` mm behind the origin."""
         x, y, z = (-camera.rotation[2]).tolist()
         return cls((x, y, z), -distance, 0.0)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated cameras and how well they fit.
+    """Calibrated cameras and their errors.
 
     Parameters
     ----------
     names, sizes : of the cameras and their images (height, width)
     intrinsics : (camera, 9) as those of a Bundle
     poses : world to camera, mm
-    backgrounds : plane of each camera, or None
-    errors : one an image
+    errors : one per image
     sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm; the latter of
         telecentric cameras across the optical axis
-    sigma_focal : (camera,) share of the focal length or scale
-    residuals : (camera) arrays (n, 4) of u, v and the residual in u, v, px: to be drawn
-    projection : of all cameras
-    lens : of all cameras, or None for thin rays
+    sigma_focal : (camera,) relative standard deviation of the focal length or scale
+    residuals : per camera (n, 4) u, v and the residuals in u, v, px
     pose_sigma : (camera, 6) of a Camera, from noise alone, or None
-    mount : how far cameras may have been moved or turned since, mm and degrees, beside the noise
+    mount : standard deviations of position (mm) and rotation (degrees) to add to those of noise
     """
 
     names: tuple[str, ...]
@@ -137,16 +128,13 @@ class Calibration:
         cls, names: Sequence[str], bundle: Bundle, covariance: Float[np.ndarray, "camera 15 15"],
         observations: Sequence[Observation], used: Sequence[bool], background_distance: float | None = None,
     ) -> Calibration:  # fmt: skip
-        """Sum up an adjusted bundle.
+        """Return the result of an adjusted bundle in the world frame.
 
         Parameters
         ----------
-        names : of the cameras
-        bundle : adjusted, in the world frame
-        covariance : of every camera's parameters (bundle.adjust)
-        observations : all points found
-        used : which observations the adjustment took
-        background_distance : where no target was laid, of a plane across the optical axis, behind the origin, mm
+        covariance : of each camera's parameters (bundle.adjust)
+        used : which observations the adjustment used
+        background_distance : as in `calibrate`
         """
         errors = [
             ImageError(names[o.camera], o.image, bundle.rms(o), len(o.detection.points), u, o.on_background)
@@ -154,10 +142,10 @@ class Calibration:
         ]
         residuals, backgrounds = [], []
         for i in range(len(names)):
-            own = [o for o, u in zip(observations, used, strict=True) if u and o.camera == i]
-            residuals.append(np.concatenate([np.hstack([o.detection.pixels, bundle.residual(o)]) for o in own]))
-            laid = [bundle.poses[o.pose].moved(o.detection.points) for o in own if o.on_background]
-            backgrounds.append(_background(bundle.cameras[i], laid, background_distance))
+            images = [o for o, u in zip(observations, used, strict=True) if u and o.camera == i]
+            residuals.append(np.concatenate([np.hstack([o.detection.pixels, bundle.residual(o)]) for o in images]))
+            points = [bundle.poses[o.pose].apply(o.detection.points) for o in images if o.on_background]
+            backgrounds.append(_background(bundle.cameras[i], points, background_distance))
         sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
         return cls(
             names=tuple(names),
@@ -175,7 +163,7 @@ class Calibration:
         )
 
     def rms(self, camera: str | None = None) -> float:
-        """Rms reprojection error over the images used, of one camera or all, px."""
+        """Return the rms reprojection error over the images in use, of one camera or all, px."""
         return rms_of([e for e in self.errors if camera in (None, e.camera)])
 
     @property
@@ -201,7 +189,7 @@ class Calibration:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know: images left out, and what may be wrong with a camera, short of refusing it."""
+        """Images that were left out, and weak points of the cameras."""
         notes = [
             f"{e.camera}/{e.image}: left out, its reprojection error of {e.rms:.2f} px does not fit"
             for e in self.errors
@@ -209,60 +197,52 @@ class Calibration:
         ]
         for i, name in enumerate(self.names):
             u, v = self.residuals[i][:, :2].T
-            covered = np.ptp(u) * np.ptp(v) / (self.sizes[i][0] * self.sizes[i][1])
-            if covered < COVERED:
-                notes.append(f"{name}: the targets cover {covered:.0%} of the image; distortion is a guess beyond them")
-            if self.sigma_focal[i] > FOCAL_KNOWN:
-                notes.append(
-                    f"{name}: the {self.projection.scale} is known to {self.sigma_focal[i]:.1%} only; tilt the target "
-                    "more"
-                )
+            coverage = np.ptp(u) * np.ptp(v) / (self.sizes[i][0] * self.sizes[i][1])
+            sigma, scale = self.sigma_focal[i], self.projection.scale
+            if coverage < MIN_COVERAGE:
+                notes.append(f"{name}: the targets cover {coverage:.0%} of the image; distortion is uncertain beyond")
+            if sigma > MAX_FOCAL_SIGMA:
+                notes.append(f"{name}: the standard deviation of the {scale} is {sigma:.1%}; tilt the target more")
             if self.backgrounds[i] is None:
-                why = "no target on the background was found" if self.projection.shows_depth else "depth does not show"
-                notes.append(f"{name}: {why}, so its plane is not known; --background-distance gives it")
+                why = "no target on the background" if self.projection.shows_depth else "depth does not show"
+                notes.append(f"{name}: {why}, so its background plane is unknown; give --background-distance")
         if not self.projection.shows_depth:
             notes.append(
-                "where telecentric cameras are along their optical axes does not show in images, and does not "
-                "matter: z_cam = 0 was laid through the origin"
+                "positions of telecentric cameras along their optical axes do not show in images and have no effect: "
+                "z_cam = 0 was placed at the origin"
             )
         return tuple(notes)
 
     def check(self, max_error: float) -> None:
-        """Refuse what cannot be right; `max_error` is the largest rms reprojection error of a camera to accept, px.
-
-        Raises
-        ------
-        InputError
-            If a camera fits badly, has intrinsics that no camera has, or a background that is not flat.
-        """
+        """Refuse a camera with a larger rms reprojection error (px), impossible intrinsics or a background not flat."""
         for i, name in enumerate(self.names):
             rms, (height, width) = self.rms(name), self.sizes[i]
             if not rms <= max_error:
                 worst = max((e for e in self.errors if e.camera == name and e.used), key=lambda e: e.rms)
                 raise InputError(
-                    f"reprojection error {rms:.2f} px, expected {max_error:g} px or less; the worst "
-                    f"image is {worst.image} ({worst.rms:.2f} px). Check pitch and number of squares, and that "
+                    f"expected a reprojection error of {max_error:g} px or less, got {rms:.2f} px; the largest is of "
+                    f"image {worst.image} ({worst.rms:.2f} px). Check pitch and number of squares, and that "
                     "images under one name show one pose; or raise --max-error",
                     field=f"view '{name}'",
                 )
             fx, fy, cx, cy = self.intrinsics[i, :4]
             if not (0.8 < fx / fy < 1.25 and -0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
                 raise InputError(
-                    f"got fx = {fx:.5g}, fy = {fy:.5g} {self.projection.unit}, cx = {cx:.5g}, "
-                    f"cy = {cy:.5g} px, which no camera has; take more target images, tilted in different ways and "
-                    "filling the image",
+                    f"expected square pixels and a principal point near the image, got fx = {fx:.5g}, fy = {fy:.5g} "
+                    f"{self.projection.unit}, cx = {cx:.5g}, cy = {cy:.5g} px; take more target images, tilted in "
+                    "different ways and filling the image",
                     field=f"view '{name}'",
                 )
             plane = self.backgrounds[i]
-            if plane is not None and plane.rms > PLANE_FLAT * np.linalg.norm(self.poses[i].translation):
+            if plane is not None and plane.rms > MAX_PLANE_RMS * np.linalg.norm(self.poses[i].translation):
                 raise InputError(
-                    f"the targets on its background lie {plane.rms:.2f} mm rms off one plane; did the "
+                    f"expected targets in one plane on its background, got {plane.rms:.2f} mm rms from it; did the "
                     "background move, or does an image show the target off it?",
                     field=f"view '{name}'",
                 )
 
     def write(self, path: str | os.PathLike[str], box: Box | None = None) -> None:
-        """Write the cameras as a calibration file, with the box and, under [about], how well they fit."""
+        """Write a calibration file, with the errors under [about]."""
         about = {
             "date": datetime.date.today().isoformat(),
             "rms_px": self.rms(),
@@ -276,14 +256,13 @@ class Calibration:
 
 
 def _pose_sigma(camera: Pose, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, 6]:
-    """Standard deviations of the turn w and of the shift c of the centre along the camera's axes, c = w x t - dt."""
-    to = np.eye(6)
-    to[3:, :3], to[3:, 3:] = -crossing(camera.translation), -np.eye(3)
-    return np.sqrt(np.maximum(np.diag(to @ covariance @ to.T), 0))
+    """Standard deviations of the rotation w and of the centre c along the camera's axes, c = w x t - dt."""
+    jacobian = np.eye(6)
+    jacobian[3:, :3], jacobian[3:, 3:] = -crossing(camera.translation), -np.eye(3)
+    return np.sqrt(np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0))
 
 
-def _background(camera: Pose, laid: Sequence[np.ndarray], distance: float | None) -> FittedPlane | None:
-    """The plane through targets laid on it, or as far behind the origin as is said, or None."""
-    if laid:
-        return FittedPlane.through(np.concatenate(laid), camera.inverse.translation)
+def _background(camera: Pose, points: Sequence[np.ndarray], distance: float | None) -> FittedPlane | None:
+    if points:
+        return FittedPlane.through(np.concatenate(points), camera.inverse.translation)
     return None if distance is None else FittedPlane.across(camera, distance)

@@ -1,4 +1,4 @@
-"""Calibration targets: chessboard, ChArUco board, grid of circles; printed by us, found by OpenCV."""
+"""Calibration targets: chessboard, ChArUco board, grid of circles; to print, and to detect in images with OpenCV."""
 
 from __future__ import annotations
 
@@ -10,30 +10,24 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.corners import (
-    eight_bit,
-    first_at_a_black_square,
-    first_at_the_upper_left,
-    saddle_points,
-    spacing,
-)
 
-__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages"]
+__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages", "eight_bit", "saddle_points"]
 
 KINDS = ("chessboard", "charuco", "circles")
 DICTIONARY = "DICT_4X4_250"
-MARKER = 0.6  # of a square
+MARKER = 0.6  # edge of a marker over that of a square
+MIN_POINTS = 6  # of a detection
 
 
 @dataclass(frozen=True)
 class Detection:
-    """What was found of a target in an image.
+    """The points of a target in an image.
 
     Parameters
     ----------
-    ids : (n,) which points of the target
-    pixels : (n, 2) where, px
-    points : (n, 3) where they are on the target, mm
+    ids : (n,) their numbers on the target
+    pixels : (n, 2) their places in the image, px
+    points : (n, 3) their places on the target, mm
     """
 
     ids: Int[np.ndarray, " n"]
@@ -43,14 +37,13 @@ class Detection:
 
 @dataclass(frozen=True)
 class ViewImages:
-    """What was found in the images of one camera.
+    """Detections in the images of one camera.
 
     Parameters
     ----------
-    name : of the camera
     size : (height, width) of its images, px
     poses : the target free in space, by the name of the pose, which cameras share
-    background : the target laid on the background, by the name of the image
+    background : the target on the background, by the name of the image
     """
 
     name: str
@@ -59,10 +52,10 @@ class ViewImages:
     background: Mapping[str, Detection]
 
     def without(self, names: Collection[str]) -> ViewImages:
-        """Return what was found but for the images of these names."""
+        """Return the detections except those in images of these names, such as cam1/target/7."""
         poses, background = (
-            {pose: d for pose, d in found.items() if f"{self.name}/{source}/{pose}" not in names}
-            for source, found in (("target", self.poses), ("background", self.background))
+            {pose: d for pose, d in detections.items() if f"{self.name}/{source}/{pose}" not in names}
+            for source, detections in (("target", self.poses), ("background", self.background))
         )
         return replace(self, poses=poses, background=background)
 
@@ -71,69 +64,57 @@ class ViewImages:
 class CalibrationTarget:
     """A flat calibration target.
 
-    Raises
-    ------
-    InputError
-        If the kind is unknown, a size is impossible, or the target looks the same turned by 180 degrees.
-
-    Notes
-    -----
-    Points lie in z = 0 of the target's own frame, x along columns, y along rows down the page, so that z points into
-    the page. A chessboard needs one odd and one even number of squares: otherwise nobody can tell it from itself turned
-    by 180 degrees, and cameras that see it from both sides of a rig would disagree. A grid of circles always is such a
-    target, so it serves for a single camera, or where all cameras are upright.
+    Its points lie in z = 0 of its own frame, x along columns, y along rows down the page, so z points into the page. A
+    chessboard needs one odd and one even number of squares: otherwise it looks the same turned by 180 degrees, and
+    cameras that see it from both sides of a rig would disagree. A grid of circles always does, so it serves for a
+    single camera, or where all cameras are upright.
     """
 
     kind: str = "charuco"
     """chessboard, charuco or circles (a regular grid of black dots)."""
     columns: int = 12
-    """Squares (dots of circles) along a row."""
+    """Number of squares (circles: dots) along a row."""
     rows: int = 9
-    """Squares (dots of circles) along a column."""
+    """Number of squares (circles: dots) along a column."""
     pitch: float = 10.0
-    """Edge of a square, or distance between dots, mm."""
+    """Edge length of a square, or distance between dots, mm."""
     marker: float = 0.0
-    """Edge of a ChArUco marker, mm; 0 is 0.6 of a square."""
+    """Edge length of a ChArUco marker, mm; 0: 0.6 of a square."""
     dictionary: str = DICTIONARY
-    """Of the markers, an OpenCV name."""
+    """Dictionary of the markers, by its name in OpenCV."""
     legacy: bool = False
-    """ChArUco boards as OpenCV drew them before version 4.6."""
+    """ChArUco board in the layout of OpenCV before version 4.6."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="target kind")
-        least = 2 if self.kind == "circles" else 4
-        if self.columns < least or self.rows < least:
-            raise InputError(
-                f"expected at least {least} columns and rows, got {self.columns} x {self.rows}", field="target"
-            )
+        size, minimum = f"{self.columns} x {self.rows}", 2 if self.kind == "circles" else 4
+        if self.columns < minimum or self.rows < minimum:
+            raise InputError(f"expected at least {minimum} columns and rows, got {size}", field="target")
         if not self.pitch > 0 or not 0 <= self.marker < self.pitch:
-            raise InputError(
-                f"expected pitch > 0 mm and a marker smaller than it, got {self.pitch} and {self.marker}",
-                field="target",
-            )
+            got = f"{self.pitch} and {self.marker}"
+            raise InputError(f"expected pitch > 0 mm and a marker smaller than it, got {got}", field="target")
         if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
             raise InputError(
-                f"a chessboard of {self.columns} x {self.rows} squares looks the same turned by 180 degrees; "
-                "take one odd and one even number of squares (13 x 10, say), or ChArUco",
+                f"expected a chessboard of one odd and one even number of squares (13 x 10, say), got {size}, which "
+                "looks the same turned by 180 degrees; or use ChArUco",
                 field="target",
             )
         if self.kind == "charuco":
             import cv2
 
             if not hasattr(cv2.aruco, self.dictionary):
-                raise InputError(
-                    f"expected an OpenCV name such as {DICTIONARY}, got '{self.dictionary}'", field="dictionary"
-                )
+                name = self.dictionary
+                raise InputError(f"expected an OpenCV name such as {DICTIONARY}, got '{name}'", field="dictionary")
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Columns and rows of points."""
+        """Numbers of columns and rows of points."""
         return (self.columns, self.rows) if self.kind == "circles" else (self.columns - 1, self.rows - 1)
 
     @property
     def points(self) -> Float[np.ndarray, "n 3"]:
-        """All points in the target's frame, mm; the middle of the target is the origin."""
+        """All points in the target's frame, mm; its origin is the middle of the target."""
         columns, rows = self.shape
         y, x = np.mgrid[:rows, :columns].astype(np.float64)
         x, y = x - (columns - 1) / 2, y - (rows - 1) / 2
@@ -146,7 +127,7 @@ class CalibrationTarget:
 
     @property
     def label(self) -> str:
-        """What it is, in a line."""
+        """Kind, numbers and pitch in a line."""
         return f"{self.kind} {self.columns} x {self.rows}, pitch {self.pitch:g} mm"
 
     def scaled(self, factor: float) -> CalibrationTarget:
@@ -156,7 +137,7 @@ class CalibrationTarget:
         return replace(self, pitch=factor * self.pitch, marker=factor * self.marker)
 
     def raster(self, pixel: float) -> Float[np.ndarray, "row column"]:
-        """Return the target to print as reflectance on pixels of about `pixel` mm (a whole number a square)."""
+        """Return the reflectance of the printed target on pixels of about `pixel` mm (a whole number per square)."""
         n = max(8, round(self.pitch / pixel))
         pad = n // 2
         if self.kind == "charuco":
@@ -171,46 +152,46 @@ class CalibrationTarget:
         return np.pad(inner, pad, constant_values=1.0)
 
     def raster_pixel(self, pixel: float) -> float:
-        """Exact edge of a pixel of `raster`, mm."""
+        """Return the exact pixel size of `raster`, mm."""
         return self.pitch / max(8, round(self.pitch / pixel))
 
     def detect(self, image: np.ndarray) -> Detection | None:
-        """Find the target in an image (8 to 16 bit or float); None where it is not found."""
+        """Return the target in an image (8 to 16 bit or float), or None."""
         import cv2
 
         image = eight_bit(image)
         if self.kind == "chessboard":
             flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-            found, corners = cv2.findChessboardCornersSB(image, self.shape, flags=flags)
-            if not found:
+            success, corners = cv2.findChessboardCornersSB(image, self.shape, flags=flags)
+            if not success:
                 return None
-            pixels = first_at_a_black_square(image, corners.reshape(-1, 2).astype(np.float64), self.shape)
+            pixels = _from_black_square(image, corners.reshape(-1, 2).astype(np.float64), self.shape)
             return self._refined(image, np.arange(len(pixels)), pixels, 0.5)
         if self.kind == "circles":
-            found, corners = cv2.findCirclesGrid(image, self.shape, flags=cv2.CALIB_CB_SYMMETRIC_GRID)
-            if not found:
+            success, corners = cv2.findCirclesGrid(image, self.shape, flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+            if not success:
                 return None
-            pixels = first_at_the_upper_left(corners.reshape(-1, 2).astype(np.float64), self.shape)
+            pixels = _from_upper_left(corners.reshape(-1, 2).astype(np.float64), self.shape)
             return Detection(np.arange(len(pixels)), pixels, self.points)
         corners, ids, _, _ = cv2.aruco.CharucoDetector(self._board()).detectBoard(image)
-        if ids is None or len(ids) < 6:
+        if ids is None or len(ids) < MIN_POINTS:
             return None
         gap = (1 - (self.marker or MARKER * self.pitch) / self.pitch) / 2
         return self._refined(image, ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64), gap)
 
     def _refined(self, image: np.ndarray, ids: np.ndarray, pixels: np.ndarray, room: float) -> Detection | None:
-        """Corners moved to their saddle points; None if fewer than six are left."""
-        found, good = saddle_points(image, pixels, room * spacing(pixels, ids, self.shape))
-        return Detection(ids[good], found[good], self.points[ids[good]]) if good.sum() >= 6 else None
+        """Corners at their saddle points, `room` pitches from other edges; None if too few are left."""
+        corners, good = saddle_points(image, pixels, room * _spacing(pixels, ids, self.shape))
+        return Detection(ids[good], corners[good], self.points[ids[good]]) if good.sum() >= MIN_POINTS else None
 
     def _board(self) -> Any:
         import cv2
 
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        needed = self.columns * self.rows // 2
-        if needed > len(dictionary.bytesList):
+        markers = self.columns * self.rows // 2
+        if markers > len(dictionary.bytesList):
             raise InputError(
-                f"expected at least {needed} markers for {self.columns} x {self.rows} squares, "
+                f"expected at least {markers} markers for {self.columns} x {self.rows} squares, "
                 f"{self.dictionary} has {len(dictionary.bytesList)}",
                 field="dictionary",
             )
@@ -219,3 +200,83 @@ class CalibrationTarget:
         )
         board.setLegacyPattern(self.legacy)
         return board
+
+
+def eight_bit(image: np.ndarray) -> np.ndarray:
+    """Stretch the image to eight bits."""
+    low, high = np.percentile(image.astype(np.float64), (0.2, 99.8))
+    scaled = (image.astype(np.float32) - low) * (255 / max(float(high - low), 1e-6))
+    return np.clip(np.round(scaled), 0, 255).astype(np.uint8)
+
+
+def _from_black_square(image: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Order corners so that the square within the first corner is black, as in `raster`."""
+    columns, rows = shape
+    grid = pixels.reshape(rows, columns, 2)
+    (x1, y1), (x2, y2) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if x1 * y2 - x2 * y1 < 0:  # columns to the right and rows down, not mirrored
+        grid = grid[::-1]
+    # of the inner squares next to the first corner along the first row, the first has to be the darker one
+    first, second = (_sample(image, grid[0:2, i : i + 2].mean(axis=(0, 1))) for i in (0, 1))
+    return (grid if first < second else grid[::-1, ::-1]).reshape(-1, 2)
+
+
+def saddle_points(image: np.ndarray, pixels: np.ndarray, room: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the saddle points of the grey values next to corners, and which of them are near their corner.
+
+    A quadratic surface is fitted by least squares under a Gaussian weight, repeatedly around the new point: 0.005 to
+    0.02 px on rendered images, where OpenCV's own refinements leave 0.02 to 0.05 px.
+
+    Source: Lucchese & Mitra, Using saddle points for subpixel feature detection, 2002.
+
+    Parameters
+    ----------
+    room : reach of the fit, px: up to the markers, whose edges would bias it
+    """
+    from scipy.ndimage import map_coordinates, spline_filter
+
+    half = int(np.clip(room, 2, 7))
+    y, x = (g.ravel().astype(np.float64) for g in np.mgrid[-half : half + 1, -half : half + 1])
+    weight = np.exp(-((x**2 + y**2) / (half / 2) ** 2) / 4)
+    fit = np.linalg.pinv(np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=-1) * weight[:, None])
+    spline = spline_filter(image.astype(np.float64))
+    points = pixels.copy()
+    for _ in range(8):
+        around = [points[:, 1:] + y, points[:, :1] + x]
+        grey = map_coordinates(spline, around, order=3, prefilter=False, mode="nearest") * weight
+        a, b, c, d, e, _ = fit @ grey.T
+        determinant = 4 * a * c - b * b
+        determinant = np.where(determinant < 0, determinant, -np.inf)  # a maximum or minimum: no step
+        step = np.stack([b * e - 2 * c * d, b * d - 2 * a * e], axis=-1) / determinant[:, None]
+        points = points + np.clip(step, -1, 1)
+        if np.abs(step).max() < 1e-4:
+            break
+    return points, np.linalg.norm(points - pixels, axis=1) < max(2.0, 0.3 * half)
+
+
+def _sample(image: np.ndarray, where: np.ndarray) -> float:
+    """Mean of 3 x 3 pixels."""
+    u, v = np.round(where).astype(int)
+    return float(image[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].mean())
+
+
+def _from_upper_left(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Order circles so that rows go down and columns to the right in the image."""
+    columns, rows = shape
+    grid = pixels.reshape(rows, columns, 2)
+    if grid[0, 0, 1] + grid[0, -1, 1] > grid[-1, 0, 1] + grid[-1, -1, 1]:
+        grid = grid[::-1, ::-1]
+    return grid.reshape(-1, 2)
+
+
+def _spacing(pixels: np.ndarray, ids: np.ndarray, shape: tuple[int, int]) -> float:
+    """Shortest distance between neighbouring points in the image, px."""
+    where = {int(i): p for i, p in zip(ids, pixels, strict=True)}
+    columns, _ = shape
+    gaps = [
+        float(np.linalg.norm(where[i] - where[j]))
+        for i in where
+        for j in (i + 1, i + columns)
+        if j in where and not (j == i + 1 and j % columns == 0)
+    ]
+    return min(gaps, default=8.0)

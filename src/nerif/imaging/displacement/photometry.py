@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from nerif.forward.images import LEAST, around, difference_variance, grey_variance
+from nerif.forward.images import ROUNDING_VARIANCE, difference_variance, grey_variance, local_mean
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.frames import as_float
 
@@ -81,9 +81,9 @@ class CameraNoise:
         level = np.array([max(grey[part].mean(), 0.0) for part in classes])
         of_class = np.mean if median == 1.0 else lambda x: np.median(x) / median
         variance = np.array([of_class(squares[part]) for part in classes])
-        weight = 1 / np.maximum(variance, LEAST)  # the error of a variance is proportional to it
+        weight = 1 / np.maximum(variance, ROUNDING_VARIANCE)  # the error of a variance is proportional to it
         (read, shot), _ = nnls(np.stack([weight, weight * level], axis=1), weight * variance)
-        return cls(max(float(read), LEAST), float(shot))
+        return cls(max(float(read), ROUNDING_VARIANCE), float(shot))
 
     def variance(self, grey: Image) -> Image:
         """Return the variance of grey values."""
@@ -142,7 +142,7 @@ def _interpolation_variance(
 ) -> Image:
     """Variance of the residual caused by interpolation between the pixels of the reference."""
     steep = np.square(np.gradient(moved.astype(np.float64))).sum(axis=0)
-    share = around(np.square(d - np.round(d)).sum(axis=-1) * steep)
+    share = local_mean(np.square(d - np.round(d)).sum(axis=-1) * steep)
     squares, shares = residual[good].astype(np.float64) ** 2, share[good]
     small = squares <= np.quantile(squares, TRIMMED)
     factor = float((squares - variance[good])[small].sum() / max(shares[small].sum(), 1e-12))

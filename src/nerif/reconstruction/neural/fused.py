@@ -1,16 +1,16 @@
-"""The layers of a network on a CPU: value and slope in one function, with its derivative written out, in float32.
+"""Value and gradient of a network on a CPU as one function with its derivative written out, in float32.
 
-What `Network.value_and_gradient` lets autograd record as some fifteen operations a layer are four passes here, over
+`Network.value_and_gradient` makes autograd record about fifteen operations per layer; here they are four passes over
 tiles of points that stay in the cache. With h_i = f(a_i), a_i = W_i h_{i-1} + b_i, f = SiLU, v = w . h_L + b,
 
     u_i = c_i f'(a_i),      c_{i-1} = W_i^T u_i,      c_L = w,      dv / dh_0 = c_0,
 
-a loss whose derivatives in v and c_0 are given as g and e_0 has
+a loss with the derivatives g in v and e_0 in c_0 has
 
     e_i = f'(a_i) (W_i e_{i-1}),   k_i = f'(a_i) d_i + f''(a_i) c_i (W_i e_{i-1}),   d_{i-1} = W_i^T k_i,   d_L = g w
     dW_i = u_i e_{i-1}^T + k_i h_{i-1}^T,   db_i = k_i,   dw = e_L + g h_L.
 
-The plain twin is in fields/network.py; tests compare the two.
+The plain version is in fields/network.py; tests compare the two.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ __all__ = ["value_and_gradient"]
 
 share_threads()  # before Numba compiles
 TILE = 4096  # points
-FAST = {"reassoc", "contract", "nsz", "arcp"}
+FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
-@njit("void(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1])", parallel=True, fastmath=FAST, cache=True)
+@njit("void(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1])", parallel=True, fastmath=FASTMATH, cache=True)
 def _activate(a: np.ndarray, s: np.ndarray, h: np.ndarray, d: np.ndarray) -> None:
-    """h = f(a) and d = f'(a) of a and its sigmoid s."""
+    """h = f(a) and d = f'(a), where s is the sigmoid of a."""
     for row in prange(a.shape[0]):
         for i in range(a.shape[1]):
             value = a[row, i] * s[row, i]
@@ -43,9 +43,9 @@ def _activate(a: np.ndarray, s: np.ndarray, h: np.ndarray, d: np.ndarray) -> Non
             d[row, i] = s[row, i] + value - value * s[row, i]
 
 
-@njit(f"void({', '.join(['f4[:, ::1]'] * 6)})", parallel=True, fastmath=FAST, cache=True)
-def _turn(a: np.ndarray, s: np.ndarray, c: np.ndarray, back: np.ndarray, forth: np.ndarray, out: np.ndarray) -> None:
-    """out = f'(a) back + f''(a) c forth."""
+@njit(f"void({', '.join(['f4[:, ::1]'] * 6)})", parallel=True, fastmath=FASTMATH, cache=True)
+def _combine(a: np.ndarray, s: np.ndarray, c: np.ndarray, d: np.ndarray, we: np.ndarray, k: np.ndarray) -> None:
+    """k = f'(a) d + f''(a) c (W e), where s is the sigmoid of a."""
     one, two = np.float32(1), np.float32(2)
     for row in prange(a.shape[0]):
         for i in range(a.shape[1]):
@@ -53,24 +53,26 @@ def _turn(a: np.ndarray, s: np.ndarray, c: np.ndarray, back: np.ndarray, forth: 
             rest = one - sigmoid
             slope = sigmoid + x * sigmoid * rest
             bend = sigmoid * rest * (two + x * (one - two * sigmoid))
-            out[row, i] = slope * back[row, i] + bend * c[row, i] * forth[row, i]
+            k[row, i] = slope * d[row, i] + bend * c[row, i] * we[row, i]
 
 
-def value_and_gradient(network: Network, p: Float[Tensor, "n k"]) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """Return what `Network.value_and_gradient` does, of a network of SiLU layers without skip and heads."""
-    encoded, output = network.encode(p), network.outputs[0]
+def value_and_gradient(network: Network, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Return n and its gradient as `Network.value_and_gradient`, for a network of SiLU layers without skip and heads.
+
+    p must not require a derivative.
+    """
+    encoding, output = network.encode(p), network.outputs[0]
     weights = [z for layer in network.layers for z in (layer.weight, layer.bias)]
-    value, slope = _Layers.apply(encoded, output.weight, output.bias, *weights)
+    value, slope = _Layers.apply(encoding, output.weight, output.bias, *weights)
     value, bend = network.bounded(value)
-    return value, network.pull_back(p, encoded, slope if bend is None else slope * bend[:, None])
+    return value, network.pull_back(p, encoding, slope if bend is None else slope * bend[:, None])
 
 
 class _Layers(torch.autograd.Function):
-    """(h_0, w, b, W_1, b_1, ...) -> (v, c_0)."""
+    """(h_0, w, b, W_1, b_1, ...) -> (v, c_0); h_0 has no derivative."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, out: Tensor, shift: Tensor, *layers: Tensor) -> tuple[Tensor, Tensor]:
-        """Return v (n) and c_0 (n, e) of h_0 (n, e)."""
         share_threads()
         weights, biases = layers[::2], layers[1::2]
         n, depth, width = len(x), len(weights), weights[0].shape[0]
@@ -94,34 +96,29 @@ class _Layers(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *derivatives: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the derivatives in h_0, w, b, W_1, b_1, ..."""
         share_threads()
         g, e = derivatives
         x, out, *weights, a, s, h, d, c, u = ctx.saved_tensors
         n, depth = len(x), len(weights)
-        e, total = e.contiguous(), torch.zeros_like(out)
-        in_weights, in_biases = [torch.zeros_like(w) for w in weights], [w.new_zeros(len(w)) for w in weights]
-        in_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
-        forth, k = a.new_empty(depth, min(n, TILE), a.shape[2]), a.new_empty(min(n, TILE), a.shape[2])
-        rising, back = torch.empty_like(k), torch.empty_like(k)
+        e, dw = e.contiguous(), torch.zeros_like(out)
+        d_weights, d_biases = [torch.zeros_like(w) for w in weights], [w.new_zeros(len(w)) for w in weights]
+        we, k = a.new_empty(depth, min(n, TILE), a.shape[2]), a.new_empty(min(n, TILE), a.shape[2])
+        e_above, back = torch.empty_like(k), torch.empty_like(k)
         for begin in range(0, n, TILE):
             tile = slice(begin, min(begin + TILE, n))
             size, below = tile.stop - tile.start, e[tile]
             for i in range(depth):
-                torch.mm(below, weights[i].T, out=forth[i, :size])
-                in_weights[i].addmm_(u[i, tile].T, below)
-                below = torch.mul(forth[i, :size], d[i, tile], out=rising[:size])
-            total += below.sum(dim=0)
-            total[0].addmv_(h[-1, tile].T, g[tile])
+                torch.mm(below, weights[i].T, out=we[i, :size])
+                d_weights[i].addmm_(u[i, tile].T, below)
+                below = torch.mul(we[i, :size], d[i, tile], out=e_above[:size])
+            dw += below.sum(dim=0)
+            dw[0].addmv_(h[-1, tile].T, g[tile])
             torch.mul(g[tile, None], out, out=back[:size])
             for i in range(depth - 1, -1, -1):
-                given = a[i, tile], s[i, tile], c[i, tile], back[:size], forth[i, :size], k[:size]
-                _turn(*(z.numpy() for z in given))
-                in_weights[i].addmm_(k[:size].T, h[i - 1, tile] if i else x[tile])
-                in_biases[i] += k[:size].sum(dim=0)
+                arrays = a[i, tile], s[i, tile], c[i, tile], back[:size], we[i, :size], k[:size]
+                _combine(*(z.numpy() for z in arrays))
+                d_weights[i].addmm_(k[:size].T, h[i - 1, tile] if i else x[tile])
+                d_biases[i] += k[:size].sum(dim=0)
                 if i:
                     torch.mm(k[:size], weights[i], out=back[:size])
-                elif in_x is not None:
-                    torch.mm(k[:size], weights[i], out=in_x[tile])
-        of_layers = [z for pair in zip(in_weights, in_biases, strict=True) for z in pair]
-        return in_x, total, g.sum()[None], *of_layers
+        return None, dw, g.sum()[None], *(z for pair in zip(d_weights, d_biases, strict=True) for z in pair)

@@ -1,4 +1,4 @@
-"""NeRIF: a coordinate network trained until what it predicts is what was measured (paper, Alg. 1)."""
+"""NeRIF: a coordinate network trained to predict the measurement (paper, Alg. 1)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.neural.settings import TrainingSettings
-from nerif.reconstruction.neural.training import Training
+from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
 
 __all__ = ["NeRIF"]
@@ -25,4 +25,4 @@ class NeRIF(TrainingSettings):
         resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:
-        return Training(self, TrainingData(self, measurement, judged=not self.limited), resume, start).run(on_step)
+        return Trainer(self, TrainingData(self, measurement, withhold=not self.limited), resume, start).run(on_step)

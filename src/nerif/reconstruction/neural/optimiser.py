@@ -7,13 +7,13 @@ equally, however small their gradients (docs/decisions/003).
     Adam   m <- b1 m + (1 - b1) g,      v <- b2 v + (1 - b2) g^2,
            w <- w - rate m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + 1e-8)
 
-U V^T comes from five steps of a Newton-Schulz iteration of fifth order, which leave its singular values in 0.7 to 1.2;
-on a CPU in float32, since products in bf16 take 14 to 40 times as long without AVX512-BF16. The optimisers of PyTorch
-import its compiler when they are made, which takes two seconds; its arithmetic does not (docs/decisions/017).
+U V^T comes from five Newton-Schulz iterations of fifth order, which leave its singular values in 0.7 to 1.2; on a CPU
+in float32, since bf16 products take 14 to 40 times as long without AVX512-BF16. PyTorch's optimiser classes import its
+compiler when they are made, its arithmetic does not (docs/decisions/017).
 
-A rate is that of the reference, a network of 4 x 128 and five octaves along the axes. In another shape each weight has
-a share of it, such that a step changes the output of a layer as much as in the reference, whatever the width
-(maximal-update parametrisation):
+Rates are those of the reference, a network of 4 x 128 and five octaves along the axes. In another shape each weight has
+a share of them, such that a step changes the output of a layer as much as in the reference (maximal-update
+parametrisation):
 
     Muon   |dW|_2 ~ sqrt(fan_out / fan_in)
     Adam   |dW_ij| ~ 1 / fan_in,      biases and first layer ~ 1
@@ -26,8 +26,8 @@ learning, arXiv:2310.17813 (2023), for Muon.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -37,138 +37,102 @@ from torch.optim.adam import adam
 from nerif.common.conventions import InputError
 from nerif.fields.network import Network, NetworkShape, encoded_width
 
-__all__ = ["OPTIMISERS", "Adam", "Muon", "NetworkOptimiser", "Update"]
+__all__ = ["OPTIMISERS", "NetworkOptimiser", "Optimiser", "adam_step"]
+
+OPTIMISERS = ("muon", "adam")
+REFERENCE = NetworkShape(width=128, directions=3)
+SPECTRAL = 0.2 * math.sqrt(REFERENCE.width)  # of a square matrix of the reference: the root mean square of Adam's step
+ITERATIONS = 5
+A, B, C = 3.4445, -4.7750, 2.0315  # of the polynomial a s + b s^3 + c s^5 of the singular values
 
 
-class Update(ABC):
-    """A rule that moves weights, with a memory of each.
+class Optimiser:
+    """Updates weights by a rule, with a memory for each.
 
     Parameters
     ----------
-    weights : to move
-    shares : of the rate of a step, one for each
+    shares : of the rate, one for each weight
+    rule : updates a weight and its memory, empty at first, in place; called with weight, gradient, memory and rate
     """
 
-    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float]) -> None:
-        self.weights, self.shares = list(weights), list(shares)
+    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], rule: Callable[..., None]) -> None:
+        self.weights, self.shares, self.rule = list(weights), list(shares), rule
         self.memory: list[dict[str, Tensor]] = [{} for _ in self.weights]
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Discard the gradients."""
         for weight in self.weights:
             weight.grad = None
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
-        """Move all weights that have a gradient."""
+        """Update all weights that have a gradient."""
         for weight, share, memory in zip(self.weights, self.shares, self.memory, strict=True):
             if weight.grad is not None:
-                self.move(weight, weight.grad, memory, rate * share)
-
-    @abstractmethod
-    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        """Move one weight in place, and remember what the next step asks for; the memory is empty at first."""
+                self.rule(weight, weight.grad, memory, rate * share)
 
 
-NEWTON_SCHULZ = 5
-A, B, C = 3.4445, -4.7750, 2.0315  # of the polynomial a s + b s^3 + c s^5 of the singular values
-
-
-class Muon(Update):
-    """Muon for weight matrices.
-
-    Parameters
-    ----------
-    weights, shares : see Update
-    momentum : mu
-    """
-
-    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], momentum: float) -> None:
-        super().__init__(weights, shares)
-        self.momentum = momentum
-
-    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        if not memory:
-            memory["momentum_buffer"] = torch.zeros_like(weight)
-        kept = memory["momentum_buffer"]
-        kept.lerp_(gradient, 1 - self.momentum)
-        weight.add_(orthogonal(gradient.lerp(kept, self.momentum)).to(weight), alpha=-rate)
+def muon_step(weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float, momentum: float) -> None:
+    """Update a weight matrix by Muon."""
+    if not memory:
+        memory["momentum_buffer"] = torch.zeros_like(weight)
+    buffer = memory["momentum_buffer"]
+    buffer.lerp_(gradient, 1 - momentum)
+    weight.add_(orthogonal(gradient.lerp(buffer, momentum)).to(weight), alpha=-rate)
 
 
 def orthogonal(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
-    """Return nearly U V^T, where U S V^T is the matrix."""
+    """Return approximately U V^T of the matrix U S V^T."""
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
     x = wide.bfloat16() if matrix.is_cuda else wide.float()
     x = x / x.norm().clamp_min(1e-7)
-    for _ in range(NEWTON_SCHULZ):
+    for _ in range(ITERATIONS):
         gram = x @ x.T
         x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=B, alpha=C), x, beta=A)
     return x if wide is matrix else x.T
 
 
-class Adam(Update):
-    """Adam.
-
-    Parameters
-    ----------
-    weights, shares : see Update
-    betas : decay rates b1 and b2
-    """
-
-    def __init__(self, weights: Iterable[Tensor], shares: Iterable[float], betas: tuple[float, float]) -> None:
-        super().__init__(weights, shares)
-        self.betas = betas
-
-    def move(self, weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float) -> None:
-        if not memory:
-            memory |= {"step": torch.tensor(0.0), "exp_avg": torch.zeros_like(weight)}
-            memory["exp_avg_sq"] = torch.zeros_like(weight)
-        adam(
-            [weight], [gradient], [memory["exp_avg"]], [memory["exp_avg_sq"]], [], [memory["step"]], amsgrad=False,
-            beta1=self.betas[0], beta2=self.betas[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
-        )  # fmt: skip
-
-
-OPTIMISERS = ("muon", "adam")
-REFERENCE = NetworkShape(width=128, directions=3)
-SPECTRAL = 0.2 * math.sqrt(REFERENCE.width)  # of a square matrix of the reference: the root mean square of Adam's step
+def adam_step(
+    weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate: float, betas: tuple[float, float]
+) -> None:
+    """Update a weight by Adam."""
+    if not memory:
+        memory |= {"step": torch.tensor(0.0), "exp_avg": torch.zeros_like(weight)}
+        memory["exp_avg_sq"] = torch.zeros_like(weight)
+    adam(
+        [weight], [gradient], [memory["exp_avg"]], [memory["exp_avg_sq"]], [], [memory["step"]], amsgrad=False,
+        beta1=betas[0], beta2=betas[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
+    )  # fmt: skip
 
 
 class NetworkOptimiser:
-    """Steps the weights of a network.
-
-    Parameters
-    ----------
-    kind : one of OPTIMISERS
-    betas : Adam's decay rates
-    momentum : Muon's
-    by_shape : whether the rates of other shapes than the reference's follow from it; else all weights have Adam's
-    """
+    """Updates the weights of a network by one of OPTIMISERS; with `by_shape` Adam's rates depend on its shape."""
 
     def __init__(
         self, kind: str, network: Network, betas: tuple[float, float], momentum: float, by_shape: bool = True
     ) -> None:
-        parameters = list(network.parameters())
-        matrices = [p for p in parameters if kind == "muon" and p.ndim == 2 and min(p.shape) > 1]
-        chosen = {id(p) for p in matrices}
-        others = [p for p in parameters if id(p) not in chosen]
+        matrices: list[Tensor] = []
+        others: list[Tensor] = []
+        for p in network.parameters():
+            (matrices if kind == "muon" and p.ndim == 2 and min(p.shape) > 1 else others).append(p)
         shares = [adam_share(network, p) if by_shape else 1.0 for p in others]
-        self.parts: dict[str, Update] = {"adam": Adam(others, shares, betas)}
+        self.parts: dict[str, Optimiser] = {"adam": Optimiser(others, shares, partial(adam_step, betas=betas))}
         if matrices:
-            self.parts["muon"] = Muon(matrices, [muon_share(network, p) for p in matrices], momentum)
+            shares = [muon_share(network, p) for p in matrices]
+            self.parts["muon"] = Optimiser(matrices, shares, partial(muon_step, momentum=momentum))
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Discard the gradients."""
         for part in self.parts.values():
             part.zero_grad()
 
     def step(self, rates: dict[str, float]) -> None:
-        """Step, with a learning rate for each part by name."""
+        """Step with a learning rate for each part by name."""
         for name, part in self.parts.items():
             part.step(rates[name])
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Return copies of all that the next step depends on, by name."""
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of the memories by part, number of the weight, and entry."""
         return {
             f"{name}.{i}.{key}": value.clone()
             for name, part in self.parts.items()
@@ -176,30 +140,28 @@ class NetworkOptimiser:
             for key, value in memory.items()
         }
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Take back what `tensors` gave; those of another optimiser are an error."""
-        found = {key.split(".")[0] for key in tensors}
-        if tensors and found != set(self.parts):  # before the first step there is nothing to take back
-            asked = " and ".join(sorted(self.parts))
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Load what `state_dict` returned; that of another optimiser is an error."""
+        names = {key.split(".")[0] for key in state}
+        if state and names != set(self.parts):  # empty before the first step
+            expected, got = (" and ".join(sorted(n)) for n in (self.parts, names))
             raise InputError(
-                f"expected a checkpoint of {asked}, got one of {' and '.join(sorted(found))}; "
-                "give the same --optimiser",
-                field="resume",
+                f"expected a checkpoint of {expected}, got {got}; give the same --optimiser", field="resume"
             )
         for part in self.parts.values():
             for memory in part.memory:
                 memory.clear()
-        for key, tensor in tensors.items():
+        for key, tensor in state.items():
             name, i, entry = key.split(".")
             part = self.parts[name]
-            where = tensor.device if entry == "step" else part.weights[int(i)].device  # Adam counts on the CPU
-            part.memory[int(i)][entry] = tensor.to(where, copy=True)
+            device = tensor.device if entry == "step" else part.weights[int(i)].device  # Adam counts on the CPU
+            part.memory[int(i)][entry] = tensor.to(device, copy=True)
 
 
 def muon_share(network: Network, matrix: Tensor) -> float:
     """Return the spectral norm of a step of Muon, in units of its rate."""
     fan_out, fan_in = matrix.shape
-    if matrix is network.layers[0].weight:  # its inputs are as many as the octaves ask for, whatever the width
+    if matrix is network.layers[0].weight:  # its fan-in depends on the octaves, not on the width
         inputs = [encoded_width(shape.octaves, shape.directions) for shape in (REFERENCE, network.shape)]
         return SPECTRAL * math.sqrt(fan_out / REFERENCE.width * inputs[0] / inputs[1])
     return SPECTRAL * math.sqrt(fan_out / fan_in)

@@ -1,6 +1,6 @@
-"""One reconstruction on several processes, under torchrun: each takes a share of the rays of every step.
+"""One reconstruction on several processes, under torchrun.
 
-The processes draw the same batch, differentiate the loss of their own rays, and average the gradients, so that they all
+All processes draw the same batch, differentiate the loss of their share of its rays, and average the gradients. So all
 take the step that one process would take with the whole batch.
 """
 
@@ -19,62 +19,55 @@ __all__ = ["Ranks"]
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes that work on one reconstruction.
-
-    Parameters
-    ----------
-    rank : number of this process; that with 0 decides, and writes
-    size : how many there are
-    """
+    """The processes of one reconstruction: number of this one, and count. Process 0 decides and writes."""
 
     rank: int = 0
     size: int = 1
 
     @classmethod
     def from_environment(cls) -> Ranks:
-        """Return what torchrun tells in RANK and WORLD_SIZE; one process where it tells nothing."""
+        """Return RANK and WORLD_SIZE as torchrun sets them; one process without torchrun."""
         return cls(int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
 
     @property
     def is_first(self) -> bool:
-        """Whether this process decides, and writes."""
+        """Whether this process decides and writes."""
         return self.rank == 0
 
+    @property
+    def share(self) -> slice:
+        """This process's rays of a batch."""
+        return slice(self.rank, None, self.size)
+
     def join(self, device: torch.device) -> None:
-        """Meet the other processes, by NCCL between GPUs and by gloo between CPUs."""
+        """Connect to the other processes, by NCCL between GPUs and by gloo between CPUs."""
         if self.size > 1 and not dist.is_initialized():
             if device.type == "cuda":
                 torch.cuda.set_device(device)
             dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
             atexit.register(dist.destroy_process_group)
 
-    @property
-    def share(self) -> slice:
-        """Which rays of a batch are this process's."""
-        return slice(self.rank, None, self.size)
-
-    def average_gradients(self, network: nn.Module, mine: int, rays: int) -> None:
-        """Replace gradients of a mean over `mine` rays by those of the mean over all `rays` of the batch."""
-        if self.size == 1:
-            return
-        gradients = [p.grad for p in network.parameters() if p.grad is not None]
-        flat = torch.cat([g.reshape(-1) for g in gradients]) * (mine / rays)
-        dist.all_reduce(flat)
-        for g, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
-            g.copy_(part.reshape(g.shape))
-
-    def average(self, values: Tensor, mine: int, rays: int) -> Tensor:
-        """Return the mean over the batch of what are means over `mine` of its rays."""
+    def average(self, values: Tensor, own_rays: int, rays: int) -> Tensor:
+        """Return the mean over the rays of the batch of what each process has averaged over its own rays."""
         if self.size == 1:
             return values
-        values = values * (mine / rays)
+        values = values * (own_rays / rays)
         dist.all_reduce(values)
         return values
 
-    def decided(self, values: list[float], device: torch.device) -> list[float]:
+    def average_gradients(self, network: nn.Module, own_rays: int, rays: int) -> None:
+        """Replace the gradients of each process by their mean over the batch."""
+        if self.size == 1:
+            return
+        gradients = [p.grad for p in network.parameters() if p.grad is not None]
+        flat = self.average(torch.cat([g.reshape(-1) for g in gradients]), own_rays, rays)
+        for g, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            g.copy_(part.reshape(g.shape))
+
+    def broadcast(self, values: list[float], device: torch.device) -> list[float]:
         """Return the values of the first process."""
         if self.size == 1:
             return values
-        told = torch.tensor(values, dtype=torch.float64, device=device)
-        dist.broadcast(told, 0)
-        return [float(v) for v in told]
+        tensor = torch.tensor(values, dtype=torch.float64, device=device)
+        dist.broadcast(tensor, 0)
+        return tensor.tolist()

@@ -1,8 +1,6 @@
-"""Settings by name. Where a preset departs from the paper, the figures behind it are in benchmarks/."""
+"""Presets of the training settings; benchmarks/ compares them with those of the paper."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import torch
 
@@ -14,16 +12,16 @@ from nerif.reconstruction.neural.neural import NeRIF
 __all__ = ["PRESETS", "preset"]
 
 PRESETS: dict[str, NeRIF] = {
-    # a small network and the exact gradient alone: made for a CPU
+    # for a CPU: a small network, exact gradient only
     "fast": NeRIF(),
-    # the paper's network, trained by the exact gradient: made for a GPU
+    # for a GPU: the network of the paper, exact gradient only
     "best": NeRIF(
         network=NetworkShape(depth=7, width=256, octaves=5, skip=4, head_width=64),
         samples=(24, 64),
         points_per_batch=1 << 17,
         learning_rate=6e-3,
     ),
-    # the paper: three terms, lengths of residuals, constant learning rate, its stopping rule (docs/method.md)
+    # the paper (docs/method.md): three loss terms, l2 norm, constant learning rate, its stopping rule
     "paper": NeRIF(
         network=NetworkShape(depth=7, width=256, octaves=5, directions=3, skip=4, head_width=64, gradient_head=True),
         wave_pixels=0,
@@ -45,15 +43,9 @@ PRESETS: dict[str, NeRIF] = {
 
 
 def preset(name: str) -> NeRIF:
-    """Return the settings of a preset; "auto" is `best` where there is a GPU, else `fast`.
-
-    Raises
-    ------
-    InputError
-        If there is no preset of that name.
-    """
+    """Return the settings of a preset; "auto" is `best` with a GPU, else `fast`."""
     if name == "auto":
-        return PRESETS["best" if torch.cuda.is_available() else "fast"]
+        name = "best" if torch.cuda.is_available() else "fast"
     if name not in PRESETS:
         raise InputError(f"expected auto, {', '.join(PRESETS)}, got '{name}'", field="preset")
-    return replace(PRESETS[name])
+    return PRESETS[name]

@@ -1,51 +1,165 @@
-"""How much a run has used of what it may: steps, passes over the rays, seconds."""
+"""When a training ends: its limits, convergence on withheld pixels, and collapse to the ambient field.
+
+Cycles. A run without a limit consists of cycles, each twice as long as the one before. Each ends at the smallest
+learning rate, so that the ends can be compared. With e the mean square of the residual over sigma on withheld pixels,
+of which the noise is 1, the run has converged when the last PATIENCE cycles have reduced e by no more than
+
+    min e before them - min e of them <= max(FALL (e - 1), SCATTER e)
+
+One cycle is not enough: few pixels are withheld, so e scatters from cycle to cycle.
+
+Collapse. A network that takes too large a step ends at the ambient field, whose gradient is zero. There
+
+    q = |prediction - d|^2 / |d|^2        over the last steps, each over sigma^2
+
+stays at 1.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import torch
 
-from nerif.reconstruction.base import Outcome
-from nerif.reconstruction.neural.convergence import Cycles
+from nerif.reconstruction.base import Outcome, Reconstructor, Step
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.settings import TrainingSettings
 
-__all__ = ["Budget"]
+__all__ = ["Cycles", "Schedule", "SlowRun", "duration"]
 
 
-class Budget:
-    """The steps, rays and seconds of a run, earlier parts of a resumed run included.
+class Resumable:
+    """An object whose STATE attributes are stored in checkpoints."""
+
+    STATE: ClassVar[tuple[str, ...]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the attributes that a checkpoint stores."""
+        return {name: getattr(self, name) for name in self.STATE}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the state of a checkpoint."""
+        for name, value in state.items():
+            setattr(self, name, value)
+
+
+PATIENCE = 2  # cycles
+FALL = (
+    0.08  # of the excess over the noise: a doubling that gains less leaves 5 % of the error (its root) to the next two
+)
+SCATTER = 0.003  # of e: smaller changes are random
+MAX_CYCLES = 6
+
+
+class Cycles(Resumable):
+    """The cycles of a run without a limit: `first` steps in the first, at most `longest` seconds in all."""
+
+    STATE = ("length", "step", "seconds", "errors", "verdict")
+
+    def __init__(self, first: int, longest: float) -> None:
+        self.length, self.longest = first, longest
+        self.step, self.seconds = 0, 0.0  # at which the present cycle began
+        self.errors: list[float] = []
+        self.verdict = ""  # why the run has converged
+
+    def progress(self, step: int, seconds: float) -> float:
+        """Return the share of the present cycle: 0 at its start, 1 at its end."""
+        left = self.longest - self.seconds
+        return max((step - self.step) / self.length, (seconds - self.seconds) / left if left > 0 else 1.0)
+
+    def end(
+        self, error: float, noise: float, step: int, seconds: float, label: str = "residual of withheld pixels"
+    ) -> Outcome | None:
+        """End a cycle at a step and time of the run: begin the next, or return why there is none.
+
+        Parameters
+        ----------
+        error, noise : mean square of the residual over sigma, and its part due to noise; 0 if sigma is unknown
+        """
+        self.errors.append(error)
+        before, least = min(self.errors[:-PATIENCE], default=math.inf), min(self.errors[-PATIENCE:])
+        length, duration_s = self.length, seconds - self.seconds
+        self.step, self.seconds, self.length = step, seconds, 2 * length
+        level = f"{label} {math.sqrt(min(self.errors)):.3g}{' sigma' if noise else ''}"
+        if before - least <= max(FALL * (least - noise), SCATTER * least):
+            self.verdict = f"{level}, not reduced by the last {length + length // 2} steps"
+        elif len(self.errors) == MAX_CYCLES:
+            self.verdict = f"{level} after {MAX_CYCLES} cycles, the maximum"
+        elif seconds + duration_s > self.longest:
+            message = f"{level} after {seconds:.0f} s; --time-limit {4 * seconds:.0f} may reduce it"
+            return Outcome("time_limit", message)
+        return self.outcome
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """Outcome of a run that has converged."""
+        return Outcome("converged", self.verdict) if self.verdict else None
+
+    @property
+    def best(self) -> bool:
+        """Whether the last cycle has the smallest error so far."""
+        return self.errors[-1] <= min(self.errors)
+
+
+class Schedule:
+    """Steps, rays, seconds and learning rate of a run, earlier parts of a resumed run included.
 
     Parameters
     ----------
-    settings : epochs, max_steps and time_limit are the limits; where there is none the run goes in Cycles
-    rays : of one pass over all of them
-    ranks : processes that go by the clock of the first
-    device : where the ranks talk to each other
+    settings : epochs, max_steps and time_limit are the limits; without one the run consists of Cycles
+    rays : per epoch
+    ranks : all processes follow the clock of the first
+
+    Attributes
+    ----------
+    outcome : why the run is over; None before
+    rate_factor : of the learning rate, below 1 after a fit to a start and after rolling back
+    ray_count : rays of all batches, in bins of any size
     """
+
+    outcome: Outcome | None = None
 
     def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
         self.settings, self.rays, self.ranks, self.device = settings, rays, ranks, device
-        self.step, self.rays_done = 0, 0
+        self.step, self.rays_done, self.ray_count, self.rate_factor = 0, 0, 0, 1.0
         self.cycles = None if settings.limited else Cycles(settings.first_cycle, settings.longest)
-        self._before, self._began, self._agreed = 0.0, time.perf_counter(), 0.0
-        self.begin_pace()
+        self._before, self._start, self._synchronised = 0.0, time.perf_counter(), 0.0
+        self.restart_pace()
 
-    def agree(self) -> None:
-        """Let all processes go by the clock of the first."""
+    def synchronise(self) -> None:
+        """Take over the clock of the first process."""
         if self.ranks.size > 1:
-            (self._agreed,) = self.ranks.decided([self._clock()], self.device)
+            (self._synchronised,) = self.ranks.broadcast([self._clock()], self.device)
 
     @property
     def seconds(self) -> float:
-        """Spent on training."""
-        return self._clock() if self.ranks.size == 1 else self._agreed
+        """Time spent on training, s."""
+        return self._clock() if self.ranks.size == 1 else self._synchronised
 
     def _clock(self) -> float:
-        return self._before + time.perf_counter() - self._began
+        return self._before + time.perf_counter() - self._start
+
+    @property
+    def done(self) -> bool:
+        """Whether the run is over."""
+        return self.outcome is not None
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rates of the next step, by optimiser."""
+        settings, rate = self.settings, self.rate_factor * self.settings.learning_rate
+        if settings.schedule == "cosine":
+            warm_up = min(settings.warm_up, settings.max_steps / 6 or math.inf)
+            rate *= min(1.0, (self.step + 1) / warm_up)
+            rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(self.progress, 1.0)))
+        return {"adam": rate, "muon": rate * settings.matrix_rate}
+
+    def advance(self) -> None:
+        """Count a step."""
+        self.step += 1
 
     @property
     def epoch(self) -> float:
@@ -54,79 +168,124 @@ class Budget:
 
     @property
     def progress(self) -> float:
-        """0 at the start, 1 when the first of the limits is reached, or the end of a cycle."""
-        settings = self.settings
+        """0 at the start, 1 at the first limit or at the end of a cycle."""
         if self.cycles is not None:
             return self.cycles.progress(self.step, self.seconds)
-        shares = [self.epoch / settings.epochs] if settings.epochs else []
-        if settings.max_steps:
-            shares.append(self.step / settings.max_steps)
-        if settings.time_limit:
-            shares.append(self.seconds / settings.time_limit)
-        return max(shares)
+        shares = [self.epoch / self.settings.epochs] if self.settings.epochs else []
+        return max(shares + self._shares())
+
+    def _shares(self) -> list[float]:
+        """Used shares of the limits of steps and time."""
+        settings = self.settings
+        shares = [self.step / settings.max_steps] if settings.max_steps else []
+        return shares + ([self.seconds / settings.time_limit] if settings.time_limit else [])
 
     @property
     def share(self) -> float:
-        """What of the run is done at least: 0 at the start, 1 at the latest end."""
+        """Smallest possible share of the run: 0 at the start, 1 at the latest end."""
         return self.progress if self.cycles is None else self.seconds / self.cycles.longest
 
     def count(self, rays: int) -> None:
-        """Count rays of a step."""
+        """Count the rays of a step."""
         self.rays_done += rays
-        self._paced += rays
+        self.ray_count += rays
+        self._pace_rays += rays
 
-    def begin_pace(self) -> None:
-        """Take the pace from now on: other rays, or other work on them, have another one."""
-        self._paced, self._paced_from = 0, time.perf_counter()
+    def restart_pace(self) -> None:
+        """Measure the pace from now on, as the rays or the work per ray have changed."""
+        self._pace_rays, self._pace_start = 0, time.perf_counter()
 
     @property
     def rays_per_second(self) -> float:
-        """The pace since the data last changed or the run was taken back, 1/s."""
-        return self._paced / max(time.perf_counter() - self._paced_from, 1e-9)
+        """Pace since `restart_pace`, 1/s."""
+        return self._pace_rays / max(time.perf_counter() - self._pace_start, 1e-9)
 
-    def left(self, rays: int) -> float:
-        """Return how many rays the run has time or steps for yet, at the pace so far; inf where neither is limited.
+    @property
+    def remaining(self) -> float:
+        """Rays for which there is still time; inf without a limit of steps or time."""
+        share = max(self._shares() if self.cycles is None else [*self._shares(), self.share], default=0.0)
+        return self.ray_count * (1 - share) / share if share else math.inf
 
-        Parameters
-        ----------
-        rays : done at that pace since the beginning
-        """
-        settings = self.settings
-        shares = [self.step / settings.max_steps] if settings.max_steps else []
-        shares += [self.seconds / settings.time_limit] if settings.time_limit else []
-        shares += [] if self.cycles is None else [self.share]
-        share = max(shares, default=0.0)
-        return rays * (1 - share) / share if share else math.inf
-
-    def exhausted(self) -> Outcome | None:
-        """Return which limit is reached, if one is."""
+    def limit(self) -> Outcome | None:
+        """Return the limit that is reached, if any."""
         settings = self.settings
         if settings.epochs and self.epoch >= settings.epochs:
             return Outcome("epochs", f"all {settings.epochs:g} epochs done")
         if settings.max_steps and self.step >= settings.max_steps:
-            return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may give more")
+            return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may reduce the error")
         if self.seconds >= settings.latest:
-            return Outcome("time_limit", f"time limit of {settings.latest:g} s reached; more time may give more")
+            message = f"stopped at the {settings.latest:g} s time limit; a longer run may reduce the error"
+            return Outcome("time_limit", message)
         return None if self.cycles is None else self.cycles.outcome
 
-    def recount(self, rays: int) -> None:
-        """Count passes over another number of rays from now on."""
+    def set_rays(self, rays: int) -> None:
+        """Change the number of rays per epoch; the epoch stays."""
         self.rays_done, self.rays = round(self.epoch * rays), rays
-        self.begin_pace()
+        self.restart_pace()
 
-    def where(self) -> dict[str, float]:
-        """Return step, epoch and seconds, as the history has them."""
+    def record(self) -> dict[str, float]:
+        """Return step, epoch and seconds for the history."""
         return {"step": float(self.step), "epoch": self.epoch, "seconds": self.seconds}
 
-    def used(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps."""
-        used = {"step": self.step, "rays_done": self.rays_done, "seconds": self.seconds}
-        return used if self.cycles is None else {**used, "cycles": self.cycles.kept()}
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint stores."""
+        state = {name: getattr(self, name) for name in ("step", "rays_done", "ray_count", "rate_factor", "seconds")}
+        return state if self.cycles is None else {**state, "cycles": self.cycles.state_dict()}
 
-    def restore(self, used: dict[str, Any]) -> None:
-        """Go on from what a checkpoint kept."""
-        self.step, self.rays_done = int(used["step"]), int(used["rays_done"])
-        self._before, self._began = float(used["seconds"]), time.perf_counter()
-        self.begin_pace()
-        if self.cycles is not None:  # a run that had a limit begins a cycle where it is
-            self.cycles.restore(used.get("cycles", {"step": self.step, "seconds": self._before}))
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the state of a checkpoint; a run that had a limit begins a cycle there."""
+        self.step, self.rays_done, self.ray_count = (int(state[name]) for name in ("step", "rays_done", "ray_count"))
+        self.rate_factor = float(state["rate_factor"])
+        self._before, self._start = float(state["seconds"]), time.perf_counter()
+        self.restart_pace()
+        if self.cycles is not None:
+            self.cycles.load_state_dict(state.get("cycles", {"step": self.step, "seconds": self._before}))
+
+
+MIN_RUN = 100  # steps without which no field is found
+PACE_STEPS, PACE_SHARE = 5, 0.05  # steps, or share of the time limit, after which the pace is known
+
+
+class SlowRun:
+    """Callback that warns once if the time limit allows too few steps.
+
+    The first step does not count, since it may compile the network. Methods without a network have no warning.
+    """
+
+    def __init__(self, settings: Reconstructor, say: Callable[[str], None]) -> None:
+        self.settings, self.say = settings, say
+        self.line = ""  # the warning
+        self._first: Step | None = None
+        self._done = not isinstance(settings, TrainingSettings) or math.isinf(settings.latest)
+
+    def __call__(self, step: Step) -> None:
+        settings, first = self.settings, self._first
+        if self._done or step.step == 0:  # step 0: the network is being fitted to a start
+            return
+        assert isinstance(settings, TrainingSettings)
+        if first is None or step.step <= first.step:  # another run has begun
+            self._first = step
+            return
+        limit, steps, seconds = settings.latest, step.step - first.step, step.seconds - first.seconds
+        if steps < PACE_STEPS and seconds < PACE_SHARE * limit:
+            return
+        self._done = True
+        pace, planned = seconds / steps, settings.steps(step.pass_steps)
+        possible = first.step + (limit - first.seconds) / max(pace, 1e-9)
+        if possible >= min(MIN_RUN, planned):
+            return
+        count, plan = (planned, "planned steps") if math.isfinite(planned) else (MIN_RUN, "steps")
+        self.line = (
+            f"slow: {duration(pace)} per step, so the time limit of {duration(limit)} allows about {possible:.0f} "
+            f"steps; {count:.0f} {plan} would take {duration(count * pace)}. Give a longer --time-limit, or fewer "
+            "--points-per-batch and a smaller --network.width (--preset fast suits a CPU)"
+        )
+        self.say(self.line)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration with its unit, to two figures."""
+    for unit, name in ((86400, "days"), (3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.0f} {name}" if seconds >= 10 * unit else f"{seconds / unit:.1f} {name}"
+    return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s"

@@ -1,36 +1,25 @@
-"""Settings of the training of a network: its size, its loss, where rays are sampled, rates, limits and the device."""
+"""Settings of the training of a network: its size, loss, sampling of rays, learning rates and limits."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from annotated_types import Ge, Gt
 
 from nerif.common.conventions import InputError
+from nerif.common.settings import NonNegative, Positive
 from nerif.fields.network import NetworkShape
 from nerif.forward.registry import AUTO, check_model
 from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.neural.losses import LossWeights
-from nerif.reconstruction.neural.optimiser import OPTIMISERS
-from nerif.reconstruction.shared_settings import SharedSettings
-from nerif.reconstruction.sources import check_source
+from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
 
 __all__ = ["TrainingSettings"]
-
-CHOICES = {
-    "optimiser": OPTIMISERS,
-    "sampling": ("adaptive", "random", "shifted", "regular"),
-    "norm": ("l2", "squared"),
-    "schedule": ("cosine", "constant"),
-    "precision": ("auto", "float32", "tf32", "bf16"),
-    "compile": ("auto", "on", "off"),
-}
-
-
-FIRST = 0.2  # of the limits, in a first run of two
 
 
 @dataclass(frozen=True)
@@ -39,153 +28,120 @@ class TrainingSettings(SharedSettings):
 
     network: NetworkShape = field(default_factory=NetworkShape)
     """Size of the network."""
-    wave_pixels: float = 2.5
-    """Waves of the encoding that are shorter than so many pixels in the middle of the box are left out, since pixels
-    cannot tell them from longer ones (paper: 0)."""
+    wave_pixels: NonNegative = 2.5
+    """Shortest wavelength of the encoding, in pixels at the centre of the box (0: all, as in the paper)."""
     weights: LossWeights = field(default_factory=LossWeights)
-    """Weights of the terms of the loss."""
-    norm: str = "squared"
-    """Either "squared" residuals (maximum likelihood for Gaussian noise) or "l2", the paper's."""
+    """Weights of the loss terms."""
+    norm: Literal["l2", "squared"] = "squared"
+    """Loss of residuals: squared (maximum likelihood of Gaussian noise), or l2, their length (paper)."""
     model: str = AUTO
-    """Forward model: of displacements lever_arm (auto), paraxial, or curved (along the ray as the present field bends
-    it); of absorption absorbance (auto), or, where little light is left and its logarithm skewed, intensity (noise of
-    the detector, which is even) or poisson (counted quanta)."""
+    """Forward model. Displacements: lever_arm (auto), paraxial, or curved (along bent rays). Absorption: absorbance
+    (auto), intensity (uniform detector noise) or poisson (photon counts), both for low transmission."""
     samples: tuple[int, int] = (0, 0)
-    """M at the start and at the end; a step samples N ~ Uniform(M - jitter, M + jitter) points a ray. 0 0: 12 to 24,
-    twice as many of a symmetric flow seen by one camera."""
-    sample_jitter: int = 4
-    """Half-range of the random number of samples a ray, see samples."""
-    sampling: str = "adaptive"
-    """In equal intervals, one draw each ("random", the paper's), one a ray ("shifted") or midpoints ("regular"), or
-    "adaptive", where the field varies."""
-    source: str = "auto"
-    """What to go by (also --from): displacements, images (each pixel, after a start from displacements, or from
-    blurred images), both, or auto: images where there are some."""
-    lens_rays: int = 0
-    """Rays through the lens of a pixel at the end, an even number, and about a third of them at the start; 0: 2
-    to 12, as the cone is wide in pixels."""
-    points_per_batch: int = 8192
-    """Sample points of a step; a step takes points_per_batch / N pixels of N points each."""
-    optimiser: str = "muon"
-    """Muon for weight matrices and Adam for the rest, or adam for all (the paper's)."""
-    learning_rate: float = 1.5e-2
-    """Adam's at its highest, for a network of 4 x 128; other shapes have shares of it (reconstruction/optimiser.py)."""
+    """Samples M per ray at the start and at the end; each step draws N from M - jitter to M + jitter (0 0: 12 24, or
+    24 48 for a symmetric flow and one camera)."""
+    sample_jitter: Annotated[int, Ge(0)] = 4
+    """Half-range of the random number of samples per ray, see samples."""
+    sampling: Literal["adaptive", "random", "shifted", "regular"] = "adaptive"
+    """Sample positions: adaptive (dense where the field varies), or in equal intervals: random (one draw per interval,
+    paper), shifted (one draw per ray), regular (midpoints)."""
+    source: Source = "auto"
+    """Data to fit (also --from): displacements, images (pixel by pixel, after a start from displacements or blurred
+    images), both, or auto (images where available)."""
+    lens_rays: Annotated[int, Ge(0)] = 0
+    """Rays per pixel through the aperture at the end, even; a third of them at the start (0: 2 to 12, by the width
+    of the cone in pixels)."""
+    points_per_batch: Annotated[int, Gt(0)] = 8192
+    """Sample points per step: points_per_batch / N pixels with N samples each."""
+    optimiser: Literal["muon", "adam"] = "muon"
+    """Optimiser: muon for weight matrices and Adam for the rest, or adam for all (paper)."""
+    learning_rate: Positive = 1.5e-2
+    """Maximum learning rate of Adam for a network of 4 x 128; scaled for other shapes (rates_by_shape)."""
     rates_by_shape: bool = True
-    """Whether Adam's rates follow the shape of the network, or are the same for all weights (the paper's)."""
+    """Scale Adam's learning rates with the shape of the network, or use one for all weights (paper)."""
     betas: tuple[float, float] = (0.9, 0.99)
-    """Adam's decay rates."""
-    matrix_rate: float = 2.0
-    """Muon's learning rate, in units of Adam's."""
+    """Decay rates of Adam."""
+    matrix_rate: Positive = 2.0
+    """Learning rate of Muon relative to Adam's."""
     momentum: float = 0.9
-    """Muon's."""
-    warm_up: int = 15
-    """Steps over which the learning rate rises, at most a sixth of max_steps; with the cosine schedule."""
-    schedule: str = "cosine"
-    """Learning rate: "cosine" to 1 % of the learning rate, or "constant" (the paper's)."""
-    epochs: float = 0.0
-    """Stop after so many passes over all rays (the paper's n_outer); 0 for no limit. Without any limit a run ends when
-    rays that it is not given are met no better."""
-    max_steps: int = 0
-    """Stop after so many steps; 0 for no limit."""
-    longest: float = 600.0
-    """Seconds after which a run without a limit ends, whether more would bring anything or not (no frame of a film)."""
-    first_cycle: int = 400
-    """Steps after which a run without a limit first asks whether more would; then after each twice as many."""
-    stop_ratio: float = 0.0
-    """Stop when the loss is below this share of that of the ambient field, near which a network begins; 0 never (paper:
-    0.005)."""
-    fit_steps: int = 400
-    """Steps in which the network is fitted to the field it starts from (--start-from)."""
-    rate_after_fit: float = 0.3
-    """Share of the learning rate that a run goes on with from such a start."""
+    """Momentum of Muon."""
+    warm_up: Annotated[int, Gt(0)] = 15
+    """Steps over which the learning rate rises, at most a sixth of max_steps (cosine schedule)."""
+    schedule: Literal["cosine", "constant"] = "cosine"
+    """Learning rate over the run: cosine (falls to 1 %), or constant (paper)."""
+    epochs: NonNegative = 0.0
+    """Limit in passes over all rays, n_outer of the paper (0: none). Without any limit the run ends when the residual
+    on withheld rays stops falling."""
+    max_steps: Annotated[int, Ge(0)] = 0
+    """Limit in steps (0: none)."""
+    longest: Positive = 600.0
+    """Time limit in seconds of a run without any other limit (not of sequences)."""
+    first_cycle: Annotated[int, Gt(0)] = 400
+    """Steps before the first convergence check of a run without a limit; doubled after each check."""
+    stop_ratio: NonNegative = 0.0
+    """Stop when the loss is below this share of the loss of the ambient field (0: never; paper: 0.005)."""
+    fit_steps: Annotated[int, Gt(0)] = 400
+    """Steps in which the network is fitted to the initial field (--start-from)."""
+    rate_after_fit: Positive = 0.3
+    """Share of the learning rate used after such a fit."""
     seed: int = 0
-    """Of weights and samples; makes a CPU run repeatable that no clock ends."""
-    precision: str = "auto"
-    """One of auto, float32, tf32, bf16 (mixed; the last part of the run in float32)."""
+    """Random seed of weights and samples; CPU runs without a time limit are reproducible."""
+    precision: Literal["auto", "float32", "tf32", "bf16"] = "auto"
+    """Floating-point precision: float32, tf32, bf16 (mixed; the end of the run in float32), or auto."""
     full_precision_from: float = 0.85
-    """Share of the run after which bf16 gives way to float32."""
-    compile: str = "auto"
-    """Compile the network: on, off, or auto, on CUDA by PyTorch and its layers on a CPU in float32 by Numba."""
+    """Share of the run after which bf16 changes to float32."""
+    compile: Literal["auto", "on", "off"] = "auto"
+    """Compile the network: on, off, or auto (on CUDA by PyTorch; layers on a CPU in float32 by Numba)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, allowed in CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise InputError(f"expected one of {', '.join(allowed)}, got '{getattr(self, name)}'", field=name)
-        for name in (
-            "longest",
-            "first_cycle",
-            "learning_rate",
-            "matrix_rate",
-            "points_per_batch",
-            "fit_steps",
-            "rate_after_fit",
-            "warm_up",
-        ):
-            if not getattr(self, name) > 0:
-                raise InputError(f"expected a positive number, got {getattr(self, name)}", field=name)
-        for name in ("epochs", "max_steps", "stop_ratio", "sample_jitter", "wave_pixels"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"expected 0 or more, got {getattr(self, name)}", field=name)
-        if not (len(self.samples) == 2 and min(self._samples()) > self.sample_jitter):
+        samples = self._samples()
+        if not (len(samples) == 2 and min(samples) > self.sample_jitter):
             raise InputError(
-                f"expected two counts above sample_jitter ({self.sample_jitter}), or 0 0, got {self.samples}",
+                f"expected two counts above sample_jitter ({self.sample_jitter}), or 0 0, got {samples}",
                 field="samples",
             )
-        if self.lens_rays < 0 or self.lens_rays % 2:
+        if self.lens_rays % 2:
+            raise InputError(f"expected an even number, or 0 for automatic, got {self.lens_rays}", field="lens_rays")
+        if self.points_per_batch < (ray := max(samples) + self.sample_jitter):
             raise InputError(
-                f"expected an even number, or 0 for as many as it takes, got {self.lens_rays}", field="lens_rays"
-            )
-        if self.points_per_batch < max(self._samples()) + self.sample_jitter:
-            raise InputError(
-                f"expected room for one ray ({max(self._samples()) + self.sample_jitter} points), "
-                f"got {self.points_per_batch}",
-                field="points_per_batch",
+                f"expected at least the {ray} points of one ray, got {self.points_per_batch}", field="points_per_batch"
             )
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
             raise InputError("the head and consistency terms need gradient_head = true", field="weights")
         check_model(self.model)
-        check_source(self.source)
 
     def resolved_by(self, measurement: Measurement) -> TrainingSettings:
-        """Return them with what they leave to a measurement: the waves of the encoding, and the samples of a ray."""
+        """Return the settings with the encoding and the samples per ray that suit a measurement."""
         pixel = min(measurement.pixel_sizes) / (max(measurement.box.edges) / 2)
         network = self.network.without_waves_below(self.wave_pixels * pixel)
         samples = self._samples(self.symmetry != NO_SYMMETRY and len(measurement.cameras) == 1)
         return replace(self, network=network, wave_pixels=0.0, samples=samples)
 
     def _samples(self, steep: bool = False) -> tuple[int, int]:
-        """Samples of a ray at the start and at the end; more where fronts are as steep as one camera sees them."""
+        """Return samples per ray at the start and at the end; more for the steep fronts of a single view."""
         if any(self.samples):
             return self.samples
         return (24, 48) if steep else (12, 24)
 
     def in_two(self) -> tuple[TrainingSettings, TrainingSettings]:
-        if self.limited:
-            steps = max(1, round(FIRST * self.max_steps)) if self.max_steps else 0
-            first = replace(
-                self, epochs=FIRST * self.epochs, max_steps=steps, time_limit=FIRST * self.time_limit
-            )  # fmt: skip
-        else:
-            first = replace(self, max_steps=self.first_cycle)
-        return first, replace(self, rate_after_fit=1.0)  # a field found in haste is no end to start from
+        steps = (
+            (max(1, round(SHORT_RUN * self.max_steps)) if self.max_steps else 0) if self.limited else self.first_cycle
+        )
+        short = replace(self, epochs=SHORT_RUN * self.epochs, max_steps=steps, time_limit=SHORT_RUN * self.time_limit)
+        return short, replace(self, rate_after_fit=1.0)  # a short run ends too early for a reduced rate
 
     @property
     def latest(self) -> float:
-        """Seconds after which a run ends at the latest."""
+        """Time limit in seconds, inf if there is none."""
         return self.time_limit or (math.inf if self.limited else self.longest)
 
     def steps(self, of_pass: float) -> float:
-        """Return how many steps were asked for, inf where no limit but a clock ends the run.
-
-        Parameters
-        ----------
-        of_pass : steps of a pass over all rays
-        """
-        asked = [float(self.max_steps)] if self.max_steps else []
-        return min([*asked, *([self.epochs * of_pass] if self.epochs else [])], default=math.inf)
+        """Return the limit in steps, inf if there is none; `of_pass`: steps per pass over all rays."""
+        limits = [self.max_steps or math.inf, self.epochs * of_pass if self.epochs else math.inf]
+        return float(min(limits))
 
     @property
     def limited(self) -> bool:
-        """Whether the run ends by a limit that was asked for."""
+        """Whether epochs, steps or time are limited by the user."""
         return bool(self.epochs or self.max_steps or self.time_limit)

@@ -1,11 +1,11 @@
-"""How well the data tell the numbers of a rig, when the field may follow: their covariance afterwards.
+"""Posterior covariance of the refined parameters of a rig, with a field that adapts.
 
     S = J^T W J - J^T W F (F^T W F + P)^-1 F^T W J + Sigma^-1,      covariance = S^-1
 
-J is what the numbers change of what was measured, F the voxels' map, on a coarse grid and bins of pixels of its size;
-P the curvature of total variation about the field found, its scale that of the field's own gradients. Each column of J
-is first explained by voxels as far as they can; what is left tells of the camera. W is that of
-the noise, or of what is left unexplained where that is more.
+J is the derivative of the measurement by the parameters. F is the forward projector of voxels on a coarse grid, with
+bins of pixels of its size. P is the curvature of total variation about the field, on the scale of its own gradients.
+The voxels explain each column of J as far as they can; only the rest determines the camera. W is the inverse variance
+of the noise, or of the residual if that is larger.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from nerif.fields.grid import Boundary
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.gauge import ambient_faces
-from nerif.reconstruction.rig.refinement import Refinement, drawn
+from nerif.reconstruction.rig.refinement import Refinement, random_pixels
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.voxels.levels import bins_of
@@ -36,99 +36,95 @@ from nerif.reconstruction.voxels.total_variation import at_faces, gradient_squar
 __all__ = ["covariance", "with_posterior"]
 
 VOXELS, BASIS = 14, "cubic"  # along the longest edge of the box
-LEAST = 1e-9  # of the mean curvature: what keeps voxels finite that no ray sees
-SAMPLES = 64  # of a ray
-FREEDOM = 0.01  # of that penalty: a field that stands elsewhere has as much total variation, which its curvature denies
-SOFT = 0.05  # of the mean gradient: below it the penalty is quadratic
+RIDGE = 1e-9  # of the mean curvature, for voxels that no ray crosses
+SAMPLES = 64  # per ray
+PENALTY_SHARE = 0.01  # of the curvature: a shifted field has the same total variation, which its curvature denies
+SOFT = 0.05  # of the mean gradient, below which the penalty is quadratic
+
+Progress = Callable[[int, int], None]
 
 
 def with_posterior(
     table: Sequence[dict[str, Any]], measurement: Measurement, field: Field, settings: Mapping[str, Any],
-    on_voxel: Callable[[int, int], None] = lambda done, total: None,
+    on_voxel: Progress = lambda done, total: None,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Return a table of refined numbers with their standard deviations afterwards, and what is left of each view.
+    """Return a table of refined parameters with their posterior standard deviations and the residuals of each view.
 
-    `sigma_after` are these; `aside_sigma_px` is by how much what a view shows of the middle of the box may stand
-    elsewhere, in the worse direction; `told` is 1 less the share of it beforehand that is left; `rms_before` and
-    `rms_after` are the residuals over sigma as calibrated and as refined, both against the field that was found.
+    `sigma_after` are these deviations; `aside_sigma_px` that of the middle of the box in the image, in the worse
+    direction; `constrained` is 1 minus the posterior share of its prior uncertainty; `rms_before` and `rms_after` are
+    the residuals over sigma as calibrated and as refined, both with the given field. Rows of views that are not in the
+    measurement or have no displacements are unchanged.
 
     Parameters
     ----------
-    table : of the views of the measurement (Refinement.table)
-    measurement : with the cameras as calibrated
-    field : that was found
+    table : see Refinement.table
+    measurement : with the calibrated cameras
     settings : of the reconstruction
-    on_voxel : told how many voxels are done, the bulk of the work
+    on_voxel : called with the finished and the total number of voxels
     """
     measurement = of_source(measurement, "auto", preferred="displacements")
     rig, faces = Refinement.of_table(measurement, settings, table), tuple(settings["open_faces"])
-    found = covariance(rig, measurement, field, faces, on_voxel)
-    there = residuals(rig, measurement, field, faces)
-    rig.restore({**rig.kept(), "values": torch.zeros_like(rig.values)})
+    posterior = covariance(rig, measurement, field, faces, on_voxel)
+    after = residuals(rig, measurement, field, faces)
+    rig.values = torch.zeros_like(rig.values)
     before = residuals(rig, measurement, field, faces)
+    sigma_known = all(o.sigma is not None for o in measurement.observations)
     k, rows = len(rig.columns), list[dict[str, Any]]()
     for row in table:
-        if row["name"] not in rig.names:  # displacements tell nothing of a view that has none
+        if row["name"] not in rig.names:
             rows.append(row)
             continue
         v = rig.names.index(row["name"])
-        own = found[v * k : (v + 1) * k, v * k : (v + 1) * k]
-        after = own.diagonal().clamp(min=0).sqrt() * rig.sigma[v, rig.columns]
-        look = rig.aside(v) * rig.sigma[v, rig.columns]  # px by a standard deviation of each number
-        there_px, before_px = look @ own @ look.T, look @ look.T
-        share = torch.linalg.eigvals(torch.linalg.pinv(before_px, hermitian=True) @ there_px).real.max()
-        named = dict(zip(row["values"], after.tolist(), strict=True))
-        left = {"rms_before": float(before[v]), "rms_after": float(there[v])} if _sigma_known(measurement) else {}
-        aside = float(torch.linalg.eigvalsh(there_px)[-1].clamp(min=0).sqrt())
-        told = 1 - float(share.clamp(0, 1).sqrt())
-        rows.append({**row, "told": told, "aside_sigma_px": aside, "sigma_after": named, **left})
+        block, sigma = posterior[v * k : (v + 1) * k, v * k : (v + 1) * k], rig.sigma[v, rig.columns]
+        sigma_after = (block.diagonal().clamp(min=0).sqrt() * sigma).tolist()
+        slopes = rig.aside(v) * sigma  # px per sigma of each parameter
+        after_px, before_px = slopes @ block @ slopes.T, slopes @ slopes.T
+        share = torch.linalg.eigvals(torch.linalg.pinv(before_px, hermitian=True) @ after_px).real.max()
+        row = {
+            **row,
+            "constrained": 1 - float(share.clamp(0, 1).sqrt()),
+            "aside_sigma_px": float(torch.linalg.eigvalsh(after_px)[-1].clamp(min=0).sqrt()),
+            "sigma_after": dict(zip(row["values"], sigma_after, strict=True)),
+        }
+        rows.append({**row, "rms_before": float(before[v]), "rms_after": float(after[v])} if sigma_known else row)
     return rows
-
-
-def _sigma_known(measurement: Measurement) -> bool:
-    """Whether the noise of all that was measured is known."""
-    return all(o.sigma is not None for o in measurement.observations)
 
 
 def covariance(
     rig: Refinement, measurement: Measurement, field: Field, open_faces: tuple[str, ...] = (),
-    on_voxel: Callable[[int, int], None] = lambda done, total: None, voxels: int | None = None,
+    on_voxel: Progress = lambda done, total: None, voxels: int | None = None,
 ) -> Float[Tensor, "m m"]:  # fmt: skip
-    """Return the covariance of all refined numbers in units of their sigmas, view by view in the order of its columns.
+    """Return the covariance of all refined parameters in units of their sigmas, view by view.
 
     Parameters
     ----------
     rig : as refined
-    measurement : with the cameras as calibrated
-    field : that was found with it
-    open_faces : faces whose rays are dropped
-    on_voxel : told how many voxels are done, the bulk of the work
-    voxels : along the longest edge of the box, on which the field follows; None for VOXELS
+    measurement : with the calibrated cameras
+    field : reconstructed with the rig
+    voxels : along the longest edge of the box, for the adapting field; None for VOXELS
     """
     grid = Grid.of_resolution(measurement.box, voxels or VOXELS)
-    target = Target.of(measurement, open_faces, bins_of(measurement, grid), linear=True).without_outliers()
-    target = replace(target, parts=tuple(part.to("cpu") for part in target.parts))
+    target = Target.of(measurement, open_faces, bins_of(measurement, grid), linear=True).without_outliers().to("cpu")
     boundary = Boundary(ambient_faces(measurement, ()))
-    moved = tuple(rig.of(part) for part in target.parts)
-    operators = [VoxelOperator(part.rays, grid, part.model, BASIS, boundary) for part in moved]
-    problem = Problem(operators, replace(target, parts=moved))
+    corrected = tuple(rig.of(part) for part in target.parts)
+    operators = [VoxelOperator(part.rays, grid, part.model, BASIS, boundary) for part in corrected]
+    problem = Problem(operators, replace(target, parts=corrected))
     coefficients = problem.zero() + field.sample(grid, "cpu") / target.scale
 
     def predict(part: Part, rays: Rays) -> Tensor:
         operator = next(o for o, p in zip(operators, target.parts, strict=True) if p.model is part.model)
         return operator.for_rays(rays, part.model)(coefficients * target.scale)
 
-    found = [rig.slopes(part, predict) for part in target.parts]
     views, k = len(rig.cameras), len(rig.columns)
     root = math.sqrt(target.numbers)
     columns = torch.zeros(problem.data.numel(), views * k, dtype=torch.float64)
     first = 0
-    for part, (_, slopes) in zip(target.parts, found, strict=True):
+    for part in target.parts:
         view = part.rays.view.long().cpu()
-        own = slopes * rig.sigma[:, rig.columns][view][:, None] / root  # (n, c, k)
-        rows = first + torch.arange(own.shape[0] * own.shape[1]).reshape(own.shape[:2])
+        slopes = rig.slopes(part, predict)[1] * rig.sigma[:, rig.columns][view][:, None] / root  # (n, c, k)
+        rows = first + torch.arange(slopes.shape[0] * slopes.shape[1]).reshape(slopes.shape[:2])
         for i in range(k):
-            columns[rows, (view * k + i)[:, None]] = own[:, :, i]
+            columns[rows, (view * k + i)[:, None]] = slopes[:, :, i]
         first += rows.numel()
     level = max(1.0, float(residuals(rig, measurement, field, open_faces).square().mean()))
     unit = level / (target.numbers * target.chi_square)  # of one chi-square in the problem's objective
@@ -136,22 +132,19 @@ def covariance(
     scale = float(magnitude.mean()) / 3  # of gradients with the density exp(-|g| / scale) in three dimensions
     soft = (magnitude.square() + (SOFT * float(magnitude.mean())) ** 2).sqrt()
     penalty = Penalty(problem, "gradient", at_faces(1 / (scale * soft)))
-    weight = FREEDOM * unit * problem.voxels
     response, curvature = _matrices(problem, penalty, on_voxel)
-    normal = response.T @ response + weight * curvature
-    normal.diagonal().add_(LEAST * float(normal.diagonal().mean()))
-    follows = torch.cholesky_solve(response.T @ columns, torch.linalg.cholesky(normal))
-    left = columns - response @ follows
-    told = (columns.T @ left) / unit
-    told = 0.5 * (told + told.T)
-    values, ways = torch.linalg.eigh(told)
-    return (ways / (1 + values.clamp(min=0))) @ ways.T
+    normal = response.T @ response + PENALTY_SHARE * unit * problem.voxels * curvature
+    normal.diagonal().add_(RIDGE * float(normal.diagonal().mean()))
+    adaptation = torch.cholesky_solve(response.T @ columns, torch.linalg.cholesky(normal))
+    information = (columns.T @ (columns - response @ adaptation)) / unit
+    values, directions = torch.linalg.eigh(0.5 * (information + information.T))
+    return (directions / (1 + values.clamp(min=0))) @ directions.T
 
 
 def _matrices(
-    problem: Problem, penalty: Penalty, on_voxel: Callable[[int, int], None]
+    problem: Problem, penalty: Penalty, on_voxel: Progress
 ) -> tuple[Float[Tensor, "n m"], Float[Tensor, "m m"]]:
-    """F and L^T L as matrices, column by column."""
+    """F and L^T L, column by column."""
     response = torch.empty(problem.data.numel(), problem.voxels, dtype=torch.float64)
     curvature = torch.empty(problem.voxels, problem.voxels, dtype=torch.float64)
     voxel = problem.zero()
@@ -168,13 +161,13 @@ def _matrices(
 def residuals(
     rig: Refinement, measurement: Measurement, field: Field, open_faces: tuple[str, ...] = ()
 ) -> Float[Tensor, " view"]:
-    """Return the rms over sigma of what a field leaves of some pixels of each view; NaN where there are none."""
+    """Return the residual over sigma, rms of random pixels of each view; NaN for a view without any."""
     total = torch.zeros(len(rig.cameras), dtype=torch.float64)
     count = torch.zeros_like(total)
-    for part in drawn(Target.of(measurement, open_faces, linear=True), len(rig.cameras), 0):
-        there = rig.of(part)
-        found = there.residual(project(PathIntegral(part.model.integral, SAMPLES), field, there.rays))
+    for part in random_pixels(Target.of(measurement, open_faces, linear=True), len(rig.cameras), 0):
+        corrected = rig.of(part)
+        residual = corrected.residual(project(PathIntegral(part.model.integral, SAMPLES), field, corrected.rays))
         view = part.rays.view.long()
-        total.index_add_(0, view, found.double().square().sum(-1))
-        count.index_add_(0, view, torch.full_like(view, found.shape[1], dtype=torch.float64))
+        total.index_add_(0, view, residual.double().square().sum(-1))
+        count.index_add_(0, view, torch.full_like(view, residual.shape[1], dtype=torch.float64))
     return (total / count).sqrt()

@@ -1,19 +1,19 @@
-"""Bootstrap estimate of the error of a reconstruction: trials on a known field, the one that was found.
+"""Bootstrap estimate of the error of a reconstruction, from trials on a known field: the reconstruction itself.
 
     std(x) = rho exp(C sqrt(1 - k^2)) (G * mean_j (q'_j - q)^2)^(1/2) (x)
     k^2 = <(q'_j - g * q'_j)^2> / <(q - g * q)^2>,    rho^2 = <(d - F q)^2> / <(d_j - F q'_j)^2>
 
-Trial q'_j is a reconstruction of the field q that was found, from its projections in the same cameras. The residuals of
-the reconstruction are added to them in blocks of random sign: noise of the right size and spatial correlation. The
-error of q'_j is then a sample of the error of q.
+Trial q'_j is reconstructed from simulated projections of the field q in the same cameras, to which the residuals of the
+reconstruction are added in blocks of random sign: noise of the right size and spatial correlation. The error of q'_j is
+then a sample of the error of q.
 
-q is smoother than the truth, and detail that the reconstruction cannot resolve is absent from q. How much is lost is
-estimated from the share k^2 of the detail of q that the trials keep, with g as fine as the pixels. Where they keep all
-of it the errors are those of noise; where they do not, q has lost more of the truth than the trials of q. C was fitted
-to random flows (benchmarks/deviations.py). If the reconstruction was trained longer than the trials, it fits its data d
+q is smoother than the truth, and detail that the reconstruction cannot resolve is absent from q. The loss is estimated
+from the share k^2 of the detail of q that the trials retain, with g as fine as the pixels. If they retain all of it,
+the errors are due to noise; if not, q has lost more of the truth than the trials have lost of q. C was fitted to
+random flows (docs/decisions/055). If the reconstruction was trained longer than the trials, it fits its data d
 better than they fit theirs, d_j, and its errors are smaller by rho.
 
-A single error is noisy, so squares are averaged around each voxel by a Gaussian G of width WIDTH. No truth is used.
+A single error is noisy, so squares are averaged around each voxel by a Gaussian G. No truth is used.
 """
 
 from __future__ import annotations
@@ -39,75 +39,53 @@ from nerif.geometry import Camera, Grid
 from nerif.physics.quantities import GasSettings, derive, deviation
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 
-__all__ = [
-    "KINDS",
-    "VOXELS",
-    "Deviations",
-    "Found",
-    "Maps",
-    "Member",
-    "Trials",
-    "best_covered",
-    "certainty",
-    "other_seed",
-]
+__all__ = ["KINDS", "VOXELS", "Deviations", "Maps", "Member", "Original", "Trials", "best_covered", "certainty"]
 
-VOXELS = 64
+KINDS = {"off": 0, "fast": 2, "full": 8}  # trials
+VOXELS = 64  # along the longest edge of the box, on which errors are compared
+WIDTH = 0.04  # of the box edge: standard deviation of G
+DETAIL_PX = 0.7  # in the middle of the box: standard deviation of g
+LOST = 1.9  # C
+MIN_DETAIL = 1e-10  # of the squares of a field: less is rounding
+BLOCK = 8  # px: edge of the blocks in which residuals keep their sign
+TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations of the percentiles
 
-Maps = Mapping[str, Float[Tensor, "view row column c"]]
-"""What views see, or its noise, by the name of the technique."""
+Maps = Mapping[str, Float[Tensor, "view row column c"]]  # projections, or their noise, by the name of the technique
 
 
 @dataclass(frozen=True)
-class Found:
-    """What there is to repeat.
-
-    Parameters
-    ----------
-    result : of the reconstruction
-    reconstructor : settings it was made by
-    measurement : that it was made from
-    seen : gives what the views would see of a field, and of them those that are named
-    """
+class Original:
+    """The reconstruction that the trials repeat."""
 
     result: Reconstruction
     reconstructor: Reconstructor
     measurement: Measurement
-    seen: Callable[[Field], Maps]
+    project: Callable[[Field], Maps]  # from a field to its projections into the views of the measurement
 
     @cached_property
-    def sampled(self) -> Volume:
-        """The result on VOXELS voxels along the longest edge, on which errors are compared."""
+    def volume(self) -> Volume:
+        """The field on VOXELS voxels along the longest edge."""
         return self.result.volume(Grid.of_resolution(self.result.box, VOXELS))
 
     @cached_property
-    def predicted(self) -> Maps:
-        """What the views see of the result as it is sampled, by a spline through it."""
-        return self.seen(VoxelField.through(self.sampled.values.double(), self.sampled.grid))
+    def projections(self) -> Maps:
+        """The projections of a spline through that volume."""
+        return self.project(VoxelField.through(self.volume.values.double(), self.volume.grid))
 
 
 @dataclass(frozen=True)
 class Member:
-    """One repetition.
-
-    Parameters
-    ----------
-    reconstructor : settings
-    measurement : what it is reconstructed from
-    expected : what it would find if it made no error
-    about : what is particular to it, in words
-    """
+    """A trial: a reconstructor, its data, and the field that would be reconstructed without error."""
 
     reconstructor: Reconstructor
     measurement: Measurement
-    expected: Volume
-    about: str = ""
+    truth: Volume
 
 
 def certainty(field: Volume, std: Volume) -> Volume:
-    """Return how sure a field is, from 0 to 1: q^2 / (q^2 + std^2), 0 where there is nothing to be sure of.
+    """Return q^2 / (q^2 + std^2), between 0 and 1; 0 where both are 0.
 
-    As the opacity of a volume it leaves out what is ambient and fades what is in doubt.
+    As the opacity of a volume it hides the ambient and fades what is uncertain.
 
     Source: the gain of Wiener's filter, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
     """
@@ -117,32 +95,9 @@ def certainty(field: Volume, std: Volume) -> Volume:
     return Volume(values.float(), field.grid, label, *describe(label)[:1], field.attributes)
 
 
-def other_seed(reconstructor: Reconstructor, number: int) -> Reconstructor:
-    """Return settings with another seed, if they have one."""
-    if not any(f.name == "seed" for f in dataclasses.fields(reconstructor)):  # type: ignore[arg-type]
-        return reconstructor
-    return replace(reconstructor, seed=getattr(reconstructor, "seed") + number)  # type: ignore[type-var]  # noqa: B009
-
-
-KINDS = {"off": 0, "fast": 2, "full": 8}
-"""How many trials."""
-
-WIDTH = 0.04  # of the box edge, standard deviation
-DETAIL = 0.7  # px in the middle of the box, standard deviation of g
-LOST = 1.9  # C
-NONE = 1e-10  # of the squares of a field: less than that is rounding, and no detail
-BLOCK = 8  # px, in which what is left unexplained keeps its sign
-TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations at which percentiles lie
-
-
 @dataclass(frozen=True)
 class Trials:
-    """Further reconstructions with known errors.
-
-    Parameters
-    ----------
-    kind : one of KINDS
-    """
+    """The trials of one of KINDS."""
 
     kind: str
 
@@ -152,20 +107,26 @@ class Trials:
 
     @property
     def members(self) -> int:
-        """How many."""
         return KINDS[self.kind]
 
-    def member(self, number: int, found: Found) -> Member:
-        """Return a trial: of the field that was found, and what was left of the measurement with other signs."""
-        drawn = torch.Generator().manual_seed(2_000_003 + number)
-        reconstructor, about = other_seed(found.reconstructor, number), ", of a field that is known"
-        return Member(reconstructor, _simulated(found, drawn), found.sampled, about)
+    def member(self, number: int, original: Original) -> Member:
+        """Return a trial: another seed, and data with residuals of random sign."""
+        generator = torch.Generator().manual_seed(2_000_003 + number)
+        reconstructor = original.reconstructor
+        if any(f.name == "seed" for f in dataclasses.fields(reconstructor)):  # type: ignore[arg-type]
+            reconstructor = replace(reconstructor, seed=getattr(reconstructor, "seed") + number)  # type: ignore[type-var]  # noqa: B009
+        maps, data = {}, original.measurement
+        for o in data.observations:
+            projections = original.projections[o.technique.name].to(o.values)
+            maps[o.technique.name] = projections + (o.values - projections) * _signs(o.values, generator)
+        sigmas = {o.technique.name: o.sigma for o in data.observations}
+        return Member(reconstructor, data.observed(maps, sigmas), original.volume)
 
 
 def best_covered(cameras: Sequence[Camera]) -> list[str]:
-    """Return the names of the views, first those that look most like two others: the others tell most of what they do.
+    """Return the names of the views, sorted by the angles to their two nearest neighbours; opposite views coincide.
 
-    A view from opposite shows the same.
+    The first is the one whose information the others contain most of.
     """
     axes = torch.stack([camera.rotation[2].double() for camera in cameras])
     apart = torch.acos((axes @ axes.T).abs().clamp(max=1.0))
@@ -176,39 +137,29 @@ def best_covered(cameras: Sequence[Camera]) -> list[str]:
     return [cameras[int(i)].name for i in order]
 
 
-def _simulated(found: Found, drawn: torch.Generator) -> Measurement:
-    """What would have been measured of the field that was found, with what was left unexplained of it."""
-    maps = {}
-    for o in found.measurement.observations:
-        predicted = found.predicted[o.technique.name].to(o.values)
-        maps[o.technique.name] = predicted + (o.values - predicted) * _signs(o.values, drawn)
-    sigmas = {o.technique.name: o.sigma for o in found.measurement.observations}
-    return found.measurement.observed(maps, sigmas)
-
-
-def _signs(like: Float[Tensor, "view row column c"], drawn: torch.Generator) -> Float[Tensor, "view row column c"]:
-    """1 or -1 by chance, the same in blocks of pixels."""
+def _signs(like: Float[Tensor, "view row column c"], generator: torch.Generator) -> Tensor:
+    """1 or -1 at random, the same in blocks of pixels."""
     views, height, width, channels = like.shape
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
-    coarse = torch.randint(0, 2, (views, rows, columns, channels), generator=drawn) * 2 - 1
+    coarse = torch.randint(0, 2, (views, rows, columns, channels), generator=generator) * 2 - 1
     fine = coarse.repeat_interleave(BLOCK, dim=1).repeat_interleave(BLOCK, dim=2)
     return fine[:, :height, :width].to(like)
 
 
-def _left(measurement: Measurement, seen: Maps) -> list[float]:
-    """Mean square of what a field leaves unexplained of each technique, over sigma^2 where that is known."""
+def _residuals(measurement: Measurement, projections: Maps) -> list[float]:
+    """Mean square residual of each technique, over sigma^2 where that is known."""
     squares = []
     for o in measurement.observations:
         used = measurement.usable_for(o) & measurement.sees_box
-        left = (o.values - seen[o.technique.name].to(o.values))[used].double()
+        residual = (o.values - projections[o.technique.name].to(o.values))[used].double()
         if o.sigma is not None:
-            left = left / o.sigma[used].double()
-        squares.append(float(left.square().mean()))
+            residual = residual / o.sigma[used].double()
+        squares.append(float(residual.square().mean()))
     return squares
 
 
 def _blurred(values: Tensor, grid: Grid, mm: float) -> Tensor:
-    """The mean over a Gaussian of that standard deviation, at least a voxel."""
+    """The mean over a Gaussian with a standard deviation in mm, at least a voxel."""
     from scipy.ndimage import gaussian_filter
 
     width = [max(1.0, mm / h) for h in grid.spacing[::-1]]  # voxels along z, y, x
@@ -216,57 +167,51 @@ def _blurred(values: Tensor, grid: Grid, mm: float) -> Tensor:
 
 
 class Deviations:
-    """Standard deviation of every quantity from the errors of trials.
+    """Standard deviations of every quantity from the errors of trials.
 
-    Parameters
-    ----------
-    main : (z, y, x) the field that was found, as it is written
-    gas : what density and temperature are computed for
-    found : what the trials are of
+    `main` is the original field on the grid of the result.
     """
 
-    def __init__(self, main: Volume, gas: GasSettings, found: Found) -> None:
-        self.main, self.gas, self.found = main, gas, found
-        self.pixel = mean(found.measurement.pixel_sizes)  # mm, in the middle of the box
+    def __init__(self, main: Volume, gas: GasSettings, original: Original) -> None:
+        self.main, self.gas, self.original = main, gas, original
+        self.pixel = mean(original.measurement.pixel_sizes)  # mm, in the middle of the box
         self.squares: list[Tensor] = []
-        self.detail: list[tuple[float, float]] = []
-        """Mean squares of the detail that a trial has, and of that of the field it is of, where that has some."""
-        self.left: list[float] = []
-        """Mean squares of what trials leave unexplained, over those of the reconstruction."""
+        self.detail: list[tuple[float, float]] = []  # mean square of a trial and of its truth, where that has any
+        self.residual_ratios: list[float] = []  # mean square of a trial over that of the reconstruction
         self.grid: Grid | None = None
 
     @property
     def count(self) -> int:
-        """How many errors are known."""
         return len(self.squares)
 
     def add(self, member: Member, result: Reconstruction) -> None:
-        """Add the error of one more trial."""
-        self.grid = member.expected.grid
-        both = result.volume(self.grid).values.double(), member.expected.values.double()
+        """Add the error of a trial."""
+        self.grid = member.truth.grid
+        both = result.volume(self.grid).values.double(), member.truth.values.double()
         self.squares.append((both[0] - both[1]).square())
-        fine = [float((v - _blurred(v, self.grid, DETAIL * self.pixel)).square().mean()) for v in both]
-        if fine[1] > NONE * float(both[1].square().mean()):
+        fine = [float((v - _blurred(v, self.grid, DETAIL_PX * self.pixel)).square().mean()) for v in both]
+        if fine[1] > MIN_DETAIL * float(both[1].square().mean()):
             self.detail.append((fine[0], fine[1]))
-        left = _left(member.measurement, self.found.seen(result.field))
-        self.left += [j / q for j, q in zip(left, self._left_by_it, strict=True) if q > 0]
+        residuals = _residuals(member.measurement, self.original.project(result.field))
+        self.residual_ratios += [j / q for j, q in zip(residuals, self._original_residuals, strict=True) if q > 0]
 
     @cached_property
-    def _left_by_it(self) -> list[float]:
-        return _left(self.found.measurement, self.found.seen(self.found.result.field))
+    def _original_residuals(self) -> list[float]:
+        return _residuals(self.original.measurement, self.original.project(self.original.result.field))
 
     @property
     def lost(self) -> float:
-        """The share of the squares of detail that trials have lost, 1 - k^2."""
+        """The share of the squared detail that trials have lost, 1 - k^2."""
         if not self.detail:
             return 0.0
-        kept, there = (sum(squares) for squares in zip(*self.detail, strict=True))
-        return max(1 - kept / there, 0.0)
+        trials, truth = (sum(squares) for squares in zip(*self.detail, strict=True))
+        return max(1 - trials / truth, 0.0)
 
     @property
     def better(self) -> float:
-        """How much less the reconstruction leaves unexplained than trials do, rho."""
-        return mean(self.left) ** -0.5 if self.left and mean(self.left) > 0 else 1.0
+        """The rms residual of the reconstruction over that of the trials, rho."""
+        ratios = self.residual_ratios
+        return mean(ratios) ** -0.5 if ratios and mean(ratios) > 0 else 1.0
 
     def local(self) -> Float[Tensor, "z y x"]:
         """Return the rms error of the trials around each voxel of `grid`."""
@@ -277,32 +222,26 @@ class Deviations:
     def std(self) -> Volume:
         """Return the standard deviation of the field."""
         assert self.grid is not None
-        whole = self.better * math.exp(LOST * math.sqrt(self.lost)) * self.local()
-        values = VoxelField.through(whole, self.grid).sample(self.main.grid).clamp(min=0)
+        values = self.better * math.exp(LOST * math.sqrt(self.lost)) * self.local()
+        values = VoxelField.through(values, self.grid).sample(self.main.grid).clamp(min=0)
         return Volume(values, self.main.grid, f"{self.main.quantity}_std")
 
     def volumes(self) -> list[Volume]:
-        """Return standard deviations as density_std and so on; of what is no linear function, percentiles too.
+        """Return the standard deviation of every quantity, such as density_std; percentiles of the temperature T.
 
-        A field x has the percentiles x + z std, and T(x) theirs.
+        The percentiles of the field x are x + z std; those of T, which is not linear in x, are T(x + z std).
         """
         std = self.std().values.double()
-        found = []
+        volumes = []
         for quantity in self.gas.quantities_of(self.main):
-            found.append(self._statistic(quantity, "std", deviation(self.main, std, quantity, self.gas)))
+            volumes.append(self._statistic(quantity, "std", deviation(self.main, std, quantity, self.gas)))
             if quantity == "temperature":
                 for name, z in TAILS.items():
-                    end = self._derived(quantity, -z * std)  # temperature falls as the index rises
-                    found.append(self._statistic(quantity, name, end))
-        return found
-
-    def _derived(self, quantity: str, more: Tensor) -> Tensor:
-        moved = Volume.of(self.main.values.double() + more, self.main.grid, self.main.quantity, self._ambient)
-        return derive(moved, quantity, self.gas).values.double()
-
-    @property
-    def _ambient(self) -> float:
-        return float(self.main.attributes.get("n_ambient", 1.0))
+                    values = self.main.values.double() - z * std  # temperature falls as the index rises
+                    n_ambient = float(self.main.attributes.get("n_ambient", 1.0))
+                    tail = Volume.of(values, self.main.grid, self.main.quantity, n_ambient)
+                    volumes.append(self._statistic(quantity, name, derive(tail, quantity, self.gas).values.double()))
+        return volumes
 
     def _statistic(self, quantity: str, statistic: str, values: Tensor) -> Volume:
         label = f"{quantity}_{statistic}"

@@ -1,12 +1,12 @@
-"""The way of a classical method: from coarse grids and large bins of pixels to fine ones, watched over step by step.
+"""The run of a voxel method: levels from coarse grids and large bins to fine ones, and the loop over iterations.
 
-What is left of the measurement is always judged by single pixels, for the noise of neighbours may be alike: a bin of
-them then has more than its share of it.
+The residual that ends a run is always that of single pixels: noise may be correlated between neighbours, and bins then
+have more of it than their sigma states.
 
-A rig is refined between solutions (refinement.py): on each level the field follows ROUNDS times.
+A rig is refined between solutions: on each level ROUNDS times, with a few iterations of the field after each.
 
-A method without a penalty is kept from the noise by stopping alone, so on coarse grids, whose residual never comes down
-to the noise, it goes on as soon as it gains little.
+A method without a penalty is regularised by stopping early. On coarse grids its residual never reaches the noise, so it
+moves on as soon as progress is slow.
 """
 
 from __future__ import annotations
@@ -24,329 +24,308 @@ from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.geometry import Rays
 from nerif.reconstruction.aperture import seen_through
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
 from nerif.reconstruction.files import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import ambient_faces, check_gauge
-from nerif.reconstruction.neural.some_pixels import some_pixels
-from nerif.reconstruction.rig.refined import kept_of, take_up
-from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, drawn
+from nerif.reconstruction.neural.bins import pixel_subset
+from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
-from nerif.reconstruction.target import Part, Target
-from nerif.reconstruction.voxels.layout import layout_of
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels.layout import InSpace, Layout, Symmetric
 from nerif.reconstruction.voxels.levels import Level, coarser, levels
 from nerif.reconstruction.voxels.problem import Iterate, Problem
-from nerif.reconstruction.voxels.weight import FIRST, choose_weight
+from nerif.reconstruction.voxels.weight import COARSE_WEIGHT, DISCREPANCY, choose_weight
 
 if TYPE_CHECKING:
     from nerif.reconstruction.voxels.settings import VoxelReconstructor
 
 __all__ = ["Descent"]
 
-JUDGES = 1 << 16  # pixels, about, by whom the rest is judged: their mean square is known to half a per cent
-ROUGHLY = 10  # times the tolerance, for trials and for what is there to start from
-EARLY = 100  # times the tolerance, for what is there to start from, where nothing but an early end keeps the noise out
-TRIALS = 8  # weights that are tried on a grid, about
-WHILE_REFINED = 0.1  # of FIRST: the weight while a rig is refined and none is chosen yet
-ROUNDS = 20  # times that a rig is refined on a level, the field following
-CALM = 5  # of them at the end without momentum
-FOLLOWING = 8  # iterations in which the field follows
-KEPT = ("level", "round", "done", "total", "weight", "guess", "chosen", "choosing")  # of a run, in a checkpoint
+PIXELS = 1 << 16  # about as many, whose residual is computed where a level has bins: to half a per cent
+COARSE_TOLERANCE = 10  # times the tolerance, for weights of a search and for solutions that are only a start
+EARLY_TOLERANCE = 100  # times the tolerance, the same for methods without a penalty
+SEARCH = 8  # solutions of a search for the weight on one grid, about
+REFINEMENT_WEIGHT = 0.1 * COARSE_WEIGHT  # while a rig is refined and no weight is chosen yet
+ROUNDS = 20  # refinements of a rig on a level
+ROUNDS_WITHOUT_MOMENTUM = 5  # at the end of them
+ROUND_ITERATIONS = 8  # of the field after each refinement
+STATE = {
+    "level": "level", "round": "round", "done": "iteration", "total": "iterations", "weight": "weight",
+    "guess": "guess", "chosen": "reason", "choosing": "search_levels",
+}  # fmt: skip
+"""Attributes of a run by their names in a checkpoint."""
 
 
 class _Stop(Exception):
-    """Asked to stop, or out of time."""
+    """The end of a run, with the arguments of its Outcome."""
 
 
 class Descent:
-    """One run: the levels, the iterations, and what is told of them."""
+    """One run of a voxel method."""
 
     def __init__(
-        self,
-        settings: VoxelReconstructor,
-        measurement: Measurement,
-        on_step: OnStep | None,
-        resume: State | None,
+        self, settings: VoxelReconstructor, measurement: Measurement, on_step: OnStep | None, resume: State | None,
         start: Field | None,
-    ) -> None:
-        measurement = seen_through(
-            of_source(measurement, settings.source, preferred="displacements"), settings.aperture
-        )
-        self.settings, self.measurement, self.on_step, self.field_before = settings, measurement, on_step, start
+    ) -> None:  # fmt: skip
+        measurement = of_source(measurement, settings.source, preferred="displacements")
+        measurement = seen_through(measurement, settings.aperture)
+        self.settings, self.measurement, self.on_step, self.start = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
         self.cores = Cores(self.device)
-        self.faces = ambient_faces(measurement, settings.ambient_faces)
-        check_gauge(measurement, self.faces, settings.hull)
+        faces = ambient_faces(measurement, settings.ambient_faces)
+        check_gauge(measurement, faces, settings.hull)
         self.axis = axis_of(settings, measurement)
-        symmetry = None if self.axis is None else self.axis.symmetry
-        self.layout = layout_of(symmetry, measurement.box, self.faces, settings.basis)
+        common: dict[str, Any] = {
+            "box": measurement.box, "faces": faces, "basis": settings.basis, "step": settings.step,
+            "device": self.device, "dtype": getattr(torch, settings.precision),
+        }  # fmt: skip
+        self.layout: Layout = Symmetric(symmetry=self.axis.symmetry, **common) if self.axis else InSpace(**common)
         grids = self.layout.grids(settings.voxels, settings.coarse_to_fine)
         self.levels = levels(measurement, grids, settings.coarse_to_fine)
-        finest = self.levels[-1].grid
-        needed = settings.memory_bytes(measurement, finest, self.device.type)
-        there = available_memory(self.device)
-        if needed > there:
-            raise InputError(
-                f"a grid of {' x '.join(map(str, finest.shape))} would need "
-                f"{needed / 2**30:.1f} GiB on {self.device}, which has {there / 2**30:.1f} GiB free; "
-                f"give fewer --voxels than {settings.voxels}",
-                field="voxels",
-            )
+        finest = grids[-1]
+        self._check_memory(finest.shape, settings.memory_bytes(measurement, finest, self.device.type))
         masked = settings.hull and measurement.flow_mask is not None
         self.free = self.layout.free(measurement, finest) if masked else None
         bounds = field_bounds(measurement, settings.lower, settings.upper)
-        self.bounds = bounds if math.isfinite(bounds[0]) or math.isfinite(bounds[1]) else None
-        self.last = self._target(self.levels[-1].edge)
-        self.scale = self.last.scale
+        self.bounds = bounds if any(map(math.isfinite, bounds)) else None
+        self.finest_target = self._target(self.levels[-1].edge)
+        self.scale = self.finest_target.scale
         self.history: list[dict[str, float]] = []
-        # a field to start from makes the coarse grids needless
-        first = [level.grid for level in self.levels].index(finest)
-        self.level, self.round, self.done, self.total = 0 if start is None else first, 0, 0, 0
+        first = grids.index(finest)
+        self.level = 0 if start is None else first  # a field to start from replaces the coarse grids
+        self.round, self.iteration, self.iterations = 0, 0, 0
         self.rig = None
         if settings.refine:
             sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg, settings.shift_sigma_px)
-            self.rig = Refinement.asked(measurement, settings.refine, *sigma)
-        # a weight is sought on the last grid but one and mended on the last; where there is no other, sought at the end
-        self.choosing = [first - 1, first if first and start is None else len(self.levels) - 1]
+            self.rig = Refinement.for_measurement(measurement, settings.refine, *sigma)
+        # the weight is searched for on the last grid but one and corrected on the last; or else searched for at the end
+        self.search_levels = [first - 1, first if first and start is None else len(self.levels) - 1]
         self.weight = settings.weight
         self.guess: float | None = None
-        self.chosen = ""
+        self.reason = ""
         self.x: Tensor | None = None
-        self.spent, self.started = 0.0, time.perf_counter()
+        self.earlier_seconds, self.begin_time = 0.0, time.perf_counter()
         self.fingerprint = fingerprint(measurement, settings.open_faces)
         if resume is not None:
             self._restore(resume)
 
-    # -- the way from coarse to fine -------------------------------------------------------------------------------
+    def _check_memory(self, shape: tuple[int, ...], required: int) -> None:
+        available = available_memory(self.device)
+        if required > available:
+            raise InputError(
+                f"a grid of {' x '.join(map(str, shape))} needs {required / 2**30:.1f} GiB on {self.device}, "
+                f"{available / 2**30:.1f} GiB are free; give fewer --voxels than {self.settings.voxels}",
+                field="voxels",
+            )
+
+    # -- levels ----------------------------------------------------------------------------------------------------
 
     def __call__(self) -> Reconstruction:
-        """Solve on one level after the other, and return what there is when something says stop."""
+        """Solve on one level after the other; return the last field at the end or when the run is stopped."""
         with self.cores:
-            return self._go()
+            try:
+                return self._result(self._outcome(self._descend()))
+            except _Stop as stop:
+                return self._result(Outcome(*stop.args))
 
-    def _go(self) -> Reconstruction:
-        try:
-            while True:
-                problem, judge = self._problems(self.here)
-                x = self._begin(problem)
-                if self.rig is not None and self.round < ROUNDS:
-                    self._refine(self.rig, problem, judge, x)
-                    continue
-                if self.weight is None and self.level in self.choosing:
-                    x = self._choose(problem, judge, x)
-                weight = self.guess if self.weight is None else self.weight
-                at_last = self.level == len(self.levels) - 1
-                before = EARLY if self.settings.weight == 0.0 else ROUGHLY
-                tolerance = self.settings.tolerance * (1 if at_last else before)
-                _, converged = self._solve(problem, judge, x, FIRST if weight is None else weight, tolerance)
-                if at_last:
-                    return self._result(self._outcome(converged))
-                self.level, self.round, self.done = self.level + 1, 0, 0
-        except _Stop as stop:
-            return self._result(Outcome(*stop.args))
+    def _descend(self) -> bool:
+        """Solve on all levels; return whether the last solution has converged."""
+        while True:
+            problem, pixels = self._problems(self.here)
+            x = self._begin(problem)
+            if self.rig is not None and self.round < ROUNDS:
+                self._refine(self.rig, problem, pixels, x)
+                continue
+            if self.weight is None and self.level in self.search_levels:
+                x = self._choose(problem, pixels, x)
+            weight = self.guess if self.weight is None else self.weight
+            at_last = self.level == len(self.levels) - 1
+            coarse = EARLY_TOLERANCE if self.settings.weight == 0.0 else COARSE_TOLERANCE
+            tolerance = self.settings.tolerance * (1 if at_last else coarse)
+            _, converged = self._solve(problem, pixels, x, COARSE_WEIGHT if weight is None else weight, tolerance)
+            if at_last:
+                return converged
+            self.level, self.round, self.iteration = self.level + 1, 0, 0
 
     @property
     def here(self) -> Level:
-        """The present level."""
         return self.levels[self.level]
 
-    def _choose(self, problem: Problem, judge: Problem | None, x: Tensor) -> Tensor:
-        """Choose the weight that the data ask for; return where to go on from."""
+    def _choose(self, problem: Problem, pixels: Problem | None, x: Tensor) -> Tensor:
+        """Choose the weight from the data; return the field to continue from."""
 
         def solve(weight: float, x: Tensor) -> Iterate:
-            self.done = 0
-            found = self._solve(problem, judge, x, weight, ROUGHLY * self.settings.tolerance)[0]
-            return replace(found, residual=_left(judge, found))
+            self.iteration = 0
+            iterate, _ = self._solve(problem, pixels, x, weight, COARSE_TOLERANCE * self.settings.tolerance)
+            return replace(iterate, residual=_residual(pixels, iterate))
 
-        noise = _noise(problem, judge)
+        noise = _noise(problem, pixels)
         choice = choose_weight(solve, x, noise, self.guess)
-        self.guess, self.chosen, self.done = choice.weight, choice.reason, 0
-        if noise is None or self.level == self.choosing[-1]:
+        self.guess, self.reason, self.iteration = choice.weight, choice.reason, 0
+        if noise is None or self.level == self.search_levels[-1]:
             self.weight = choice.weight
         return choice.x
 
-    def _refine(self, rig: Refinement, problem: Problem, judge: Problem | None, x: Tensor) -> None:
-        """Let the field follow the rig for a while, then move the rig by a step."""
-        weight = next((w for w in (self.weight, self.guess) if w is not None), FIRST * WHILE_REFINED)
-        tolerance = ROUGHLY * self.settings.tolerance
-        if not self.done:
-            self.done = max(0, self.settings.iterations - FOLLOWING * (1 + 2 * (self.round == 0)))
-        found, _ = self._solve(problem, judge, x, weight, tolerance)
-
-        def predict(part: Part, rays: Rays) -> Tensor:
-            operator = next(o for o, p in zip(problem.operators, self.last.parts, strict=True) if p.model is part.model)
-            return operator.for_rays(rays, part.model)(found.x * self.scale)
-
-        momentum = MOMENTUM if self.round < ROUNDS - CALM else 0.0
-        parts = drawn(self.last, len(self.measurement.names), self.round)
-        rig.step(parts, predict, self.last.sigma_known, momentum)
-        self.round, self.done = self.round + 1, 0
+    def _refine(self, rig: Refinement, problem: Problem, pixels: Problem | None, x: Tensor) -> None:
+        """Iterate the field for the present rig, then refine the rig by a step."""
+        weight = next((w for w in (self.weight, self.guess) if w is not None), REFINEMENT_WEIGHT)
+        tolerance = COARSE_TOLERANCE * self.settings.tolerance
+        if not self.iteration:
+            self.iteration = max(0, self.settings.iterations - ROUND_ITERATIONS * (1 + 2 * (self.round == 0)))
+        iterate, _ = self._solve(problem, pixels, x, weight, tolerance)
+        momentum = MOMENTUM if self.round < ROUNDS - ROUNDS_WITHOUT_MOMENTUM else 0.0
+        parts = random_pixels(self.finest_target, len(self.measurement.names), self.round)
+        sigma_known = self.finest_target.sigma_known
+        rig.step(parts, lambda part, rays: problem.predict(part, rays, iterate.x), sigma_known, momentum)
+        self.round, self.iteration = self.round + 1, 0
 
     def _begin(self, problem: Problem) -> Tensor:
-        """Where to start on a grid: a checkpoint, a given field, the solution on the grid before, or nothing."""
-        shape = problem.operator.domain_shape
+        """The start on a grid: a checkpoint, a given field, the solution on the grid before, or the ambient field."""
+        shape, device, dtype = problem.operator.domain_shape, problem.operator.device, problem.operator.dtype
         if self.x is not None and tuple(self.x.shape) == shape:
-            return self.x.to(problem.operator.device, problem.operator.dtype)
-        if self.x is not None:
-            field: Field = self._field(self.levels[self.level - 1])
-        elif self.field_before is not None:
-            field = self.field_before
-        else:
+            return self.x.to(device, dtype)
+        field = self.start if self.x is None else self._field(self.levels[self.level - 1])
+        if field is None:
             return self.settings.begin(problem, problem.zero())
-        values = self.layout.sample(field, problem.operator.grid, self.device)
-        values = values.to(problem.operator.device, problem.operator.dtype)
-        return self.settings.begin(problem, values / self.scale)
+        values = self.layout.sample(field, problem.operator.grid)
+        return self.settings.begin(problem, values.to(device, dtype) / self.scale)
 
     def _field(self, level: Level) -> Field:
-        """The field of the present solution, which is on that level's grid."""
+        """The field of the present solution, on the grid of the level."""
         assert self.x is not None
         return self.layout.field(self.x * self.scale, level.grid)
 
     def _target(self, edge: int, measurement: Measurement | None = None) -> Target:
-        """What bins of so many pixels along an edge measured; of a measurement, or of all."""
         settings, measurement = self.settings, measurement or self.measurement
         return Target.of(measurement, settings.open_faces, edge, settings.model, linear=True).to(self.device)
 
     @cached_property
-    def judges(self) -> Target:
-        """The pixels that judge what bins leave."""
-        return replace(self._target(1, some_pixels(self.measurement, JUDGES)), scale=self.scale)
+    def pixel_target(self) -> Target:
+        """A random sample of pixels, for the residual on levels with bins."""
+        return replace(self._target(1, pixel_subset(self.measurement, PIXELS)), scale=self.scale)
 
     def _problems(self, level: Level) -> tuple[Problem, Problem | None]:
-        """The problem of a level and, where it has bins, that of the pixels that judge what they leave."""
+        """The problem of a level and, where it has bins, that of single pixels."""
         same = level.edge == self.levels[-1].edge
-        target = self.last if same else replace(self._target(level.edge), scale=self.scale)
-        return self._problem(level, target), None if level.edge == 1 else self._problem(level, self.judges)
+        target = self.finest_target if same else replace(self._target(level.edge), scale=self.scale)
+        return self._problem(level, target), None if level.edge == 1 else self._problem(level, self.pixel_target)
 
     def _problem(self, level: Level, target: Target) -> Problem:
-        settings, grid = self.settings, level.grid
-        dtype = getattr(torch, settings.precision)
         if self.rig is not None:
             target = replace(target, parts=tuple(self.rig.of(part) for part in target.parts))
-        operators = [
-            self.layout.operator(part.rays, grid, part.model, settings.step, self.device, dtype)
-            for part in target.parts
-        ]
-        return Problem(operators, target, None if self.free is None else coarser(self.free, grid), self.bounds)
+        operators = [self.layout.operator(part.rays, level.grid, part.model) for part in target.parts]
+        return Problem(operators, target, None if self.free is None else coarser(self.free, level.grid), self.bounds)
 
-    # -- the loop ------------------------------------------------------------------------------------------------
+    # -- iterations ------------------------------------------------------------------------------------------------
 
     def _solve(
-        self, problem: Problem, judge: Problem | None, x: Tensor, weight: float, tolerance: float
+        self, problem: Problem, pixels: Problem | None, x: Tensor, weight: float, tolerance: float
     ) -> tuple[Iterate, bool]:
-        """Iterate until it converges or the iterations are used up; which, is told."""
-        settings, past, noise = self.settings, [math.inf] * self.settings.patience, _noise(problem, judge)
+        """Iterate until convergence or the last iteration; return the last iterate, and whether it has converged."""
+        settings, past, noise = self.settings, [math.inf] * self.settings.patience, _noise(problem, pixels)
         if settings.weight is not None:
-            self.chosen = ""
+            self.reason = ""
         self.x = x
         for iterate in settings.iterate(problem, x, weight):
             objective = iterate.objective(weight)
             if not math.isfinite(objective):
-                message = "the objective turned non-finite, the field before that was kept"
-                raise _Stop("diverged", f"{message}; look for extreme values or sigma in the measurement")
+                message = "the objective became non-finite; the last finite field is returned"
+                raise _Stop("diverged", f"{message}. Check the measurement for extreme values, and its sigma")
             pause()
-            self.x, self.done, self.total = iterate.x, self.done + 1, self.total + 1
+            self.x, self.iteration, self.iterations = iterate.x, self.iteration + 1, self.iterations + 1
             before, past = past[0], [*past[1:], objective]
-            self._tell(problem, judge, iterate, weight)
+            self._report(problem, pixels, iterate, weight)
             converged = 0 <= before - objective < tolerance * settings.patience * objective
-            if settings.weight == 0.0 and noise is not None and _left(judge, iterate) <= noise:
-                self.chosen, converged = "residual is the noise (discrepancy principle)", True
-            if converged or self.done >= settings.iterations:
+            if settings.weight == 0.0 and noise is not None and _residual(pixels, iterate) <= noise:
+                self.reason, converged = DISCREPANCY, True
+            if converged or self.iteration >= settings.iterations:
                 return iterate, converged
         raise AssertionError("a method iterates without end")
 
-    def _tell(self, problem: Problem, judge: Problem | None, iterate: Iterate, weight: float) -> None:
-        """Record the iteration, tell the callback, and stop where that or the clock asks for it."""
+    def _report(self, problem: Problem, pixels: Problem | None, iterate: Iterate, weight: float) -> None:
+        """Record the iteration and call on_step; stop the run if that requests it, or at the time limit."""
         voxels = float(max(self.here.grid.shape))
         record = {
-            "step": float(self.total),
-            "seconds": self.seconds,
-            "voxels": voxels,
-            "bin_edge": float(self.here.edge),
-            "weight": weight,
-            "residual": math.sqrt(iterate.residual),
-            "penalty": iterate.penalty,
-            "objective": iterate.objective(weight),
-        }
-        if judge is None and problem.target.noise is not None:
+            "step": float(self.iterations), "seconds": self.seconds, "voxels": voxels,
+            "bin_edge": float(self.here.edge), "weight": weight, "residual": math.sqrt(iterate.residual),
+            "penalty": iterate.penalty, "objective": iterate.objective(weight),
+        }  # fmt: skip
+        if pixels is None and problem.target.noise is not None:
             record["residual_over_sigma"] = math.sqrt(iterate.residual / problem.target.noise)
         self.history.append(record)
         losses = {k: v for k, v in record.items() if k in ("voxels", "weight", "residual", "residual_over_sigma")}
-        speed = len(problem.target) * self.total / max(self.seconds, 1e-9)
+        speed = len(problem.target) * self.iterations / max(self.seconds, 1e-9)
         limit = self.settings.time_limit
         step = Step(
-            self.total, float(self.total), self.seconds, self._progress(), losses, speed, self._capture,
+            self.iterations, float(self.iterations), self.seconds, self._progress(), losses, speed, self._capture,
             lambda: self._field(self.here),
         )  # fmt: skip
         if self.on_step is not None and self.on_step(step):
-            raise _Stop("interrupted", f"stopped on request at {voxels:.0f} voxels; --resume goes on from here")
+            raise _Stop("interrupted", f"stopped on request at {voxels:.0f} voxels; continue with --resume")
         if limit and self.seconds >= limit:
-            raise _Stop(
-                "time_limit", f"time limit of {limit:g} s reached at {voxels:.0f} voxels; more time may give more"
-            )
+            message = f"stopped at the {limit:g} s time limit, at {voxels:.0f} voxels"
+            raise _Stop("time_limit", f"{message}; a longer run may reduce the error")
 
     def _progress(self) -> float:
-        """Share of the work done, at worst: the cost of a level goes with its rays and the voxels along them."""
-        most, costs = [], []
+        """Share of the work done if all iterations are used; the cost of a level is that of rays times their voxels."""
+        counts, costs = [], []
         for i, level in enumerate(self.levels):
-            trials = TRIALS if i in self.choosing and self.settings.weight is None else 1
-            most.append(trials * self.settings.iterations)
+            solutions = SEARCH if i in self.search_levels and self.settings.weight is None else 1
+            counts.append(solutions * self.settings.iterations)
             costs.append(max(level.grid.shape) / level.edge**2)
-        work = [m * c for m, c in zip(most, costs, strict=True)]
+        work = [m * c for m, c in zip(counts, costs, strict=True)]
         here = (float(max(self.here.grid.shape)), float(self.here.edge))
         on_this = sum(1 for record in self.history if (record["voxels"], record["bin_edge"]) == here)
-        done = sum(work[: self.level]) + costs[self.level] * min(on_this, most[self.level])
+        past = sum(work[: self.level]) + costs[self.level] * min(on_this, counts[self.level])
         limit = self.settings.time_limit
-        return min(1.0, max(done / sum(work), self.seconds / limit if limit else 0.0))
+        return min(1.0, max(past / sum(work), self.seconds / limit if limit else 0.0))
 
     @property
     def seconds(self) -> float:
-        """Spent, earlier parts of a resumed run included."""
-        return self.spent + time.perf_counter() - self.started
+        """Time of the run, earlier parts of a resumed one included."""
+        return self.earlier_seconds + time.perf_counter() - self.begin_time
 
-    # -- what is kept --------------------------------------------------------------------------------------------
+    # -- results ---------------------------------------------------------------------------------------------------
 
     def _capture(self) -> State:
         assert self.x is not None
-        scalars: dict[str, Any] = {name: getattr(self, name) for name in KEPT}
+        scalars: dict[str, Any] = {name: getattr(self, attribute) for name, attribute in STATE.items()}
         scalars |= {"method": type(self.settings).__name__, "seconds": self.seconds, "history": list(self.history)}
         scalars["fingerprint"] = self.fingerprint
-        return State({"x": self.x.detach().clone(), **kept_of(self.rig)}, scalars)
+        return State({"x": self.x.detach().clone(), **rig_state(self.rig)}, scalars)
 
     def _restore(self, state: State) -> None:
-        scalars, shapes = dict(state.scalars), [level.grid.shape for level in self.levels]
-        check_fingerprint(scalars.pop("fingerprint", None), self.fingerprint)
+        scalars, shapes = state.scalars, [level.grid.shape for level in self.levels]
+        check_fingerprint(scalars.get("fingerprint"), self.fingerprint)
         level = scalars.get("level", -1)
-        if (
-            scalars.pop("method", None) != type(self.settings).__name__
-            or not 0 <= level < len(shapes)
-            or tuple(state.tensors["x"].shape) != shapes[level]
-        ):
+        same = scalars.get("method") == type(self.settings).__name__ and 0 <= level < len(shapes)
+        if not same or tuple(state.tensors["x"].shape) != shapes[level]:
             raise InputError("the checkpoint is of another method or grid; give the same settings", field="resume")
         self.x = state.tensors["x"].clone()
-        take_up(self.rig, state.tensors)
-        self.spent, self.started = scalars.pop("seconds"), time.perf_counter()
-        self.history = list(scalars.pop("history"))
-        for name, value in scalars.items():
-            setattr(self, name, value)
+        load_rig(self.rig, state.tensors)
+        self.earlier_seconds, self.begin_time = scalars["seconds"], time.perf_counter()
+        self.history = list(scalars["history"])
+        for name, attribute in STATE.items():
+            setattr(self, attribute, scalars[name])
         if self.settings.weight is not None:
             self.weight = self.settings.weight
-        elif self.level > self.choosing[-1] and self.weight is None:
+        elif self.level > self.search_levels[-1] and self.weight is None:
             self.weight = self.guess
 
     def _outcome(self, converged: bool) -> Outcome:
-        chosen = f"; weight {self.weight:.3g}: {self.chosen}" if self.settings.weight is None else ""
-        if converged and self.chosen and self.settings.weight is not None:
-            return Outcome("discrepancy", self.chosen)
+        settings = self.settings
+        weight = f"; weight {self.weight:.3g}: {self.reason}" if settings.weight is None else ""
+        if converged and self.reason and settings.weight is not None:
+            return Outcome("discrepancy", self.reason)
         if converged:
-            text = f"the objective falls by less than {self.settings.tolerance:g} an iteration"
-            return Outcome("converged", text + chosen)
-        text = f"all {self.settings.iterations} iterations done; more --iterations may give more"
-        return Outcome("iterations", text + chosen)
+            text = f"the objective falls by less than {settings.tolerance:g} per iteration"
+            return Outcome("converged", text + weight)
+        text = f"stopped after {settings.iterations} iterations; more --iterations may reduce the error"
+        return Outcome("iterations", text + weight)
 
     def _result(self, outcome: Outcome) -> Reconstruction:
         assert self.x is not None
@@ -367,11 +346,11 @@ class Descent:
         )
 
 
-def _left(judge: Problem | None, iterate: Iterate) -> float:
-    """|F x - b|^2 of the pixels that judge, or of all where there are none."""
-    return iterate.residual if judge is None else float((judge.data - judge.forward(iterate.x)).square().sum())
+def _residual(pixels: Problem | None, iterate: Iterate) -> float:
+    """|F x - b|^2 of single pixels."""
+    return iterate.residual if pixels is None else pixels.residual(iterate.x)
 
 
-def _noise(problem: Problem, judge: Problem | None) -> float | None:
-    """What the noise alone leaves of that; None where sigma is not known."""
-    return (judge or problem).target.noise
+def _noise(problem: Problem, pixels: Problem | None) -> float | None:
+    """The residual of the noise alone; None where sigma is not known."""
+    return (pixels or problem).target.noise

@@ -1,10 +1,9 @@
-"""Sums over the planes that rays cross, and their adjoint, on all cores of a CPU, compiled by Numba.
+"""Sums over the planes that rays cross, and the adjoint, on all cores of a CPU, compiled by Numba in double precision.
 
-See kernels_torch.py for the same in plain PyTorch, and planes.py for what a path is. Arithmetic is in double precision.
+kernels_torch.py is the readable twin; planes.py defines a path.
 
-What is known before goes by the length of a tuple, so that no branch is left in the compiled loops: `spline` has a
-number for each neighbour, `part` three for the gradient and one for the value. Indices are unsigned, for signed ones
-are asked each time whether they count from the end.
+Branches are resolved at compile time by the length of a tuple: `spline` has one entry per neighbour, `part` three for
+the gradient and one for the value. Indices are unsigned, since signed ones are tested for counting from the end.
 """
 
 from __future__ import annotations
@@ -13,31 +12,35 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numba import njit, prange
 from numba.extending import overload
+from torch import Tensor
 
 __all__ = ["CUBIC", "FASTMATH", "GRADIENT", "LINEAR", "VALUE", "integrate", "profile_at", "spread", "weights_at"]
 
-FASTMATH = {"reassoc", "contract", "nsz", "arcp"}  # no promise of finite numbers: a NaN stays a NaN
+FASTMATH = {"reassoc", "contract", "nsz", "arcp"}  # without the promise of finite numbers: a NaN stays a NaN
 LINEAR, CUBIC = (0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 VALUE, GRADIENT = (0.0,), (0.0, 0.0, 0.0)
-SLAB = 8  # planes that a thread adds to at a time, which stay in its cache
+SLAB_PLANES = 8  # that a thread adds to at a time, and that stay in its cache
 
 
-def integrate(degree: int, value: np.ndarray, slope: np.ndarray | None, path: Sequence[np.ndarray]) -> np.ndarray:
-    """Return (n, 3), the integrals of the slopes along u, v and the axis, or (n, 1), that of the value, of each ray."""
-    kind = VALUE if slope is None else GRADIENT
-    seen = np.empty((len(path[0]), len(kind)))
-    _integrate(value, value if slope is None else slope, *path, seen, LINEAR if degree == 1 else CUBIC, kind)
-    return seen
+def integrate(degree: int, value: Tensor, slope: Tensor | None, path: Sequence[Tensor]) -> Tensor:
+    """Return per ray the integrals of the slopes along u, v and the axis, (n, 3), or of the value alone, (n, 1)."""
+    part = VALUE if slope is None else GRADIENT
+    sums = np.empty((len(path[0]), len(part)))
+    planes = value.numpy(), (value if slope is None else slope).numpy()
+    _integrate(*planes, *(a.numpy() for a in path), sums, LINEAR if degree == 1 else CUBIC, part)
+    return torch.from_numpy(sums)
 
 
-def spread(degree: int, seen: np.ndarray, path: Sequence[np.ndarray], shape: Sequence[int]) -> list[np.ndarray]:
-    """Return what the adjoint makes of integrals (n, 3) or (n, 1): planes of the value and, of three, of the slope."""
-    kind = VALUE if seen.shape[1] == 1 else GRADIENT
-    planes = [np.zeros(shape) for _ in range(1 if kind == VALUE else 2)]
-    _spread(planes[0], planes[-1], *path, seen, LINEAR if degree == 1 else CUBIC, kind)
-    return planes
+def spread(degree: int, sums: Tensor, path: Sequence[Tensor], shape: Sequence[int]) -> list[Tensor]:
+    """Apply the adjoint to integrals (n, 3) or (n, 1): return planes of the value and, for three, of the slope."""
+    part = VALUE if sums.shape[1] == 1 else GRADIENT
+    planes = [np.zeros(shape) for _ in range(1 if part == VALUE else 2)]
+    arrays = [a.numpy() for a in (*path, sums)]
+    _spread(planes[0], planes[-1], *arrays, LINEAR if degree == 1 else CUBIC, part)
+    return [torch.from_numpy(plane) for plane in planes]
 
 
 def _linear(t: Any, spline: Any) -> Any:
@@ -53,13 +56,13 @@ def _cubic(t: Any, spline: Any) -> Any:
 
 
 def weights_at(t: Any, spline: Any) -> Any:
-    """Weights of the neighbours, and their slopes, as fields.grid.spline_weights has them."""
+    """Weights of the neighbours and their slopes, as in fields.grid.spline_weights."""
     return _linear(t, spline) if len(spline) == 2 else _cubic(t, spline)
 
 
 @overload(weights_at, jit_options={"fastmath": FASTMATH})
 def _compiled_weights(t: Any, spline: Any) -> Any:
-    return _linear if len(spline) == 2 else _cubic  # by the type of `spline`, so that no branch is left
+    return _linear if len(spline) == 2 else _cubic
 
 
 def _even_weight(profile, m):
@@ -71,7 +74,7 @@ def _listed_weight(profile, m):
 
 
 def profile_at(profile, m):
-    """Weight of a sample: the profile of a ray is (2,), first value and increment, or (m, 1), sample by sample."""
+    """Weight of sample m; the profile of a ray is (2,), first value and increment, or (m, 1), one value a sample."""
     raise NotImplementedError("compiled only")
 
 
@@ -82,13 +85,13 @@ def _compiled_profile(profile, m):
 
 @njit(fastmath=FASTMATH)
 def _weight(profile, lost, m, count):
-    # without a branch, which would halve the speed of the loops
+    # a branch would halve the speed of the loops
     return profile_at(profile, m) * (1.0 - (m == 0) * lost[0] - (m == count - 1) * lost[1])
 
 
 @njit(fastmath=FASTMATH)
 def _along(value, slope, start, stride, profile, lost, first, count, spline, part):
-    """Integrals of one ray; of the value alone in the first place."""
+    """Integrals of one ray; of the value: the first of the three."""
     neighbours = len(spline)
     qu = qv = qa = 0.0
     for m in range(count):
@@ -121,16 +124,16 @@ def _along(value, slope, start, stride, profile, lost, first, count, spline, par
 
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _integrate(value, slope, start, stride, profile, lost, first, count, seen, spline, part):
+def _integrate(value, slope, start, stride, profile, lost, first, count, sums, spline, part):
     for r in prange(count.shape[0]):
         q = _along(value, slope, start[r], stride[r], profile[r], lost[r], first[r], count[r], spline, part)
         for i in range(len(part)):
-            seen[r, i] = q[i]
+            sums[r, i] = q[i]
 
 
 @njit(fastmath=FASTMATH)
 def _back(value, slope, start, stride, profile, lost, first, count, low, high, q, spline, part):
-    """Add what one ray says to the planes that it crosses between two of its samples."""
+    """Add one ray to the planes of its samples low to high - 1."""
     neighbours = len(spline)
     for m in range(low, high):
         u, v = start[0] + m * stride[0], start[1] + m * stride[1]
@@ -153,16 +156,15 @@ def _back(value, slope, start, stride, profile, lost, first, count, low, high, q
 
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _spread(value, slope, start, stride, profile, lost, first, count, seen, spline, part):
-    # a slab of planes is one thread's, so that no two write to the same place: the sum is the same however many threads
-    # there are
+def _spread(value, slope, start, stride, profile, lost, first, count, sums, spline, part):
+    # each slab belongs to one thread: no races, and the sum does not depend on the number of threads
     planes = value.shape[0]
-    for slab in prange((planes + SLAB - 1) // SLAB):
-        begin, end = slab * SLAB, min(planes, (slab + 1) * SLAB)
+    for slab in prange((planes + SLAB_PLANES - 1) // SLAB_PLANES):
+        begin, end = slab * SLAB_PLANES, min(planes, (slab + 1) * SLAB_PLANES)
         for r in range(count.shape[0]):
             low, high = max(0, begin - first[r]), min(count[r], end - first[r])
             if low < high:
                 _back(
-                    value, slope, start[r], stride[r], profile[r], lost[r], first[r], count[r], low, high, seen[r],
+                    value, slope, start[r], stride[r], profile[r], lost[r], first[r], count[r], low, high, sums[r],
                     spline, part,
                 )  # fmt: skip

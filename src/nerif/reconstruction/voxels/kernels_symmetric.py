@@ -1,7 +1,7 @@
-"""Sums along rays over a spline of (r, h), and their adjoint, on all cores of a CPU, compiled by Numba.
+"""Sums along rays over a spline of (r, h), and the adjoint, on all cores of a CPU, compiled by Numba.
 
-A ray in the frame of a symmetry (geometry/symmetry.py) is w = start + m stride; its samples stand at (r, h), and what
-is summed is the field, or its gradient along e1, e2, e3. Arithmetic is in double precision.
+In the frame of a symmetry (geometry/symmetry.py) sample m of a ray is at start + m stride, that is at some (r, h). The
+field is summed, or its gradient along e1, e2, e3, in double precision.
 """
 
 from __future__ import annotations
@@ -9,50 +9,47 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from numba import njit, prange
+from torch import Tensor
 
 from nerif.reconstruction.voxels.kernels_numba import CUBIC, FASTMATH, GRADIENT, LINEAR, VALUE, profile_at, weights_at
 
 __all__ = ["integrate", "spread"]
 
-SHARES = 16  # into which rays are divided, each with coefficients of its own: the sum is the same on any machine
+RAY_GROUPS = 16  # each with coefficients of its own, so that the sum does not depend on the number of threads
 
 
-def integrate(
-    degree: int, padded: np.ndarray, path: Sequence[np.ndarray], plane: np.ndarray, gradient: bool
-) -> np.ndarray:
-    """Return (n, 3), the integrals of the gradient along e1, e2, e3, or (n, 1), that of the field, of each ray.
+def integrate(degree: int, padded: Tensor, path: Sequence[Tensor], plane: Tensor, gradient: bool) -> Tensor:
+    """Return per ray the integrals of the gradient along e1, e2, e3, (n, 3), or of the field, (n, 1).
 
     Parameters
     ----------
-    padded : (z, k, x) coefficients that go on beyond the box across z and x
+    padded : (z, k, x) coefficients, extended beyond the box along z and x
     path : start, stride (n, 3), profile (n, 2) or (n, m, 1), count (n)
-    plane : (8) lower r and h, their voxels' edges, voxels along r and h, rounding of the axis (below 0: no axis), and
-        how many layers lie before the first coefficient
+    plane : (8) lower r and h, voxel edges along r and h, voxels along r and h, rounding of the axis (below 0: no axis),
+        layers before the first coefficient
     """
-    kind = GRADIENT if gradient else VALUE
-    seen = np.zeros((len(path[0]), len(kind)))
-    _integrate(padded, *path, plane, seen, LINEAR if degree == 1 else CUBIC, kind)
-    return seen
+    part = GRADIENT if gradient else VALUE
+    sums = np.zeros((len(path[0]), len(part)))
+    arrays = [a.numpy() for a in (padded, *path, plane)]
+    _integrate(*arrays, sums, LINEAR if degree == 1 else CUBIC, part)
+    return torch.from_numpy(sums)
 
 
 def spread(
-    degree: int, seen: np.ndarray, path: Sequence[np.ndarray], plane: np.ndarray, shape: Sequence[int],
-    shares: int = SHARES,
-) -> np.ndarray:  # fmt: skip
-    """Return what the adjoint makes of integrals (n, 3) or (n, 1): coefficients (share, z, k, x) of shares of the rays.
-
-    As many shares as rays make a matrix of it, ray by ray.
-    """
-    kind = VALUE if seen.shape[1] == 1 else GRADIENT
-    each = np.zeros((shares, *shape))
-    _spread(each, *path, plane, seen, LINEAR if degree == 1 else CUBIC, kind)
-    return each
+    degree: int, sums: Tensor, path: Sequence[Tensor], plane: Tensor, shape: Sequence[int], groups: int = RAY_GROUPS
+) -> Tensor:
+    """Apply the adjoint to integrals (n, 3) or (n, 1): return coefficients (group, z, k, x) of each group of rays."""
+    part = VALUE if sums.shape[1] == 1 else GRADIENT
+    each = np.zeros((groups, *shape))
+    _spread(each, *(a.numpy() for a in (*path, plane, sums)), LINEAR if degree == 1 else CUBIC, part)
+    return torch.from_numpy(each)
 
 
 @njit(fastmath=FASTMATH)
 def _sample(start, stride, m, plane, spline):
-    """Whether a sample is on the plane, r and its direction, the first coefficients that count, their weights."""
+    """Whether a sample is on the grid; r and its direction; first coefficients along r and h and their weights."""
     x, y, h = start[0] + m * stride[0], start[1] + m * stride[1], start[2] + m * stride[2]
     if plane[6] >= 0:
         r = np.sqrt(x * x + y * y + plane[6] * plane[6])
@@ -80,7 +77,7 @@ def _phases(angles):
 
 @njit(fastmath=FASTMATH)
 def _angles(r, along, aside, phases, share, rise):
-    """D_k, and its slopes along e1 and e2."""
+    """Set D_k (`share`) and its slopes along e1 and e2 (`rise`)."""
     count = len(share)
     share[:], rise[:] = 1.0 / count, 0.0
     u, power = complex(along, aside), complex(2.0 / count, 0.0)
@@ -94,7 +91,7 @@ def _angles(r, along, aside, phases, share, rise):
 
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _integrate(padded, start, stride, profile, count, plane, seen, spline, part):
+def _integrate(padded, start, stride, profile, count, plane, sums, spline, part):
     neighbours, angles = len(spline), padded.shape[1]
     phases = _phases(angles)
     for n in prange(len(start)):
@@ -125,13 +122,13 @@ def _integrate(padded, start, stride, profile, count, plane, seen, spline, part)
                     q1 += w * (fr * along + rise[k, 0] * f)
                     q2 += w * (fr * aside + rise[k, 1] * f)
                     q3 += w * share[k] * fh / plane[3]
-        seen[n, 0] = q1
+        sums[n, 0] = q1
         if len(part) == 3:
-            seen[n, 1], seen[n, 2] = q2, q3
+            sums[n, 1], sums[n, 2] = q2, q3
 
 
 @njit(parallel=True, fastmath=FASTMATH, cache=True)
-def _spread(each, start, stride, profile, count, plane, seen, spline, part):
+def _spread(each, start, stride, profile, count, plane, sums, spline, part):
     neighbours, angles, rays = len(spline), each.shape[2], len(start)
     phases = _phases(angles)
     for chunk in prange(len(each)):
@@ -147,11 +144,11 @@ def _spread(each, start, stride, profile, count, plane, seen, spline, part):
                 w = profile_at(profile[n], m)
                 for k in range(angles):
                     if len(part) == 1:
-                        f, fr, fh = w * share[k] * seen[n, 0], 0.0, 0.0
+                        f, fr, fh = w * share[k] * sums[n, 0], 0.0, 0.0
                     else:
-                        f = w * (seen[n, 0] * rise[k, 0] + seen[n, 1] * rise[k, 1])
-                        fr = w * share[k] * (seen[n, 0] * along + seen[n, 1] * aside) / plane[2]
-                        fh = w * share[k] * seen[n, 2] / plane[3]
+                        f = w * (sums[n, 0] * rise[k, 0] + sums[n, 1] * rise[k, 1])
+                        fr = w * share[k] * (sums[n, 0] * along + sums[n, 1] * aside) / plane[2]
+                        fh = w * share[k] * sums[n, 2] / plane[3]
                     for j in range(neighbours):
                         line, sideways = f * bh[j] + fh * sh[j], fr * bh[j]
                         for i in range(neighbours):

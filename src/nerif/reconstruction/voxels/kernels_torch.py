@@ -1,6 +1,6 @@
-"""Sums over the planes that rays cross, and their adjoint, in plain PyTorch: for CUDA, and to compare with.
+"""Sums over the planes that rays cross, and the adjoint, in PyTorch: for CUDA, and as the readable twin.
 
-See kernels_numba.py for the same on all cores of a CPU, and planes.py for what a path is.
+kernels_numba.py is the compiled twin for CPUs; planes.py defines a path.
 """
 
 from __future__ import annotations
@@ -15,19 +15,18 @@ from nerif.fields.grid import spline_weights
 
 __all__ = ["integrate", "spread"]
 
-POINTS = {"cpu": 1 << 14, "cuda": 1 << 22}
-"""Samples taken at a time: what stays in the cache of a CPU, and fills a GPU."""
-
-CHUNK_BYTES = 1 << 30  # of the arrays that a chunk on a GPU takes, some 60 numbers a sample
+SAMPLES_AT_A_TIME = {"cpu": 1 << 14, "cuda": 1 << 22}
+"""What stays in the cache of a CPU, and fills a GPU."""
+CHUNK_BYTES = 1 << 30  # of the arrays of a chunk on a GPU, about 60 numbers a sample
 
 
 def integrate(
     degree: int, value: Float[Tensor, "k v u"], slope: Float[Tensor, "k v u"] | None, path: Sequence[Tensor]
 ) -> Float[Tensor, "n q"]:
-    """Return (n, 3), the integrals of the slopes along u, v and the axis, or (n, 1), that of the value, of each ray."""
-    found = []
-    for some in _chunks(path):
-        place, (bu, bv), (su, sv), w = _samples(degree, some, value.shape)
+    """Return per ray the integrals of the slopes along u, v and the axis, (n, 3), or of the value alone, (n, 1)."""
+    integrals = []
+    for chunk in _chunks(path):
+        place, (bu, bv), (su, sv), w = _samples(degree, chunk, value.shape)
         sums = [torch.zeros_like(w) for _ in range(1 if slope is None else 3)]
         for j in range(degree + 1):
             row = _row(place, j, value.shape, degree)
@@ -38,18 +37,18 @@ def integrate(
             sums[0] += (line * su).sum(-1) * bv[..., j]
             sums[1] += (line * bu).sum(-1) * sv[..., j]
             sums[2] += (slope.reshape(-1)[row] * bu).sum(-1) * bv[..., j]
-        found.append(torch.stack([(w * g).sum(-1) for g in sums], dim=-1))
-    return torch.cat(found)
+        integrals.append(torch.stack([(w * g).sum(-1) for g in sums], dim=-1))
+    return torch.cat(integrals)
 
 
-def spread(degree: int, seen: Float[Tensor, "n q"], path: Sequence[Tensor], shape: Sequence[int]) -> list[Tensor]:
-    """Return what the adjoint makes of integrals (n, 3) or (n, 1): planes of the value and, of three, of the slope."""
-    planes = [seen.new_zeros(*shape) for _ in range(1 if seen.shape[1] == 1 else 2)]
-    done = 0
-    for some in _chunks(path):
-        place, (bu, bv), (su, sv), w = _samples(degree, some, planes[0].shape)
-        q = seen[done : done + len(w)]
-        done += len(w)
+def spread(degree: int, sums: Float[Tensor, "n q"], path: Sequence[Tensor], shape: Sequence[int]) -> list[Tensor]:
+    """Apply the adjoint to integrals (n, 3) or (n, 1): return planes of the value and, for three, of the slope."""
+    planes = [sums.new_zeros(*shape) for _ in range(1 if sums.shape[1] == 1 else 2)]
+    first = 0
+    for chunk in _chunks(path):
+        place, (bu, bv), (su, sv), w = _samples(degree, chunk, planes[0].shape)
+        q = sums[first : first + len(w)]
+        first += len(w)
         for j in range(degree + 1):
             row = _row(place, j, planes[0].shape, degree).reshape(-1)
             if len(planes) == 1:
@@ -64,7 +63,7 @@ def spread(degree: int, seen: Float[Tensor, "n q"], path: Sequence[Tensor], shap
 
 def _chunks(path: Sequence[Tensor]) -> Iterator[list[Tensor]]:
     count = path[-1]
-    size = max(1, POINTS.get(count.device.type, 1 << 14) // max(1, int(count.max())))
+    size = max(1, SAMPLES_AT_A_TIME.get(count.device.type, 1 << 14) // max(1, int(count.max())))
     for first in range(0, len(count), size):
         yield [a[first : first + size] for a in path]
 
@@ -78,8 +77,8 @@ def _samples(
     m = torch.arange(int(count.max()), device=start.device)
     step = torch.minimum(m, last)
     position = start[:, None] + step[..., None].to(start) * stride[:, None]
-    most = torch.tensor([shape[2], shape[1]], device=start.device) - (degree + 1)
-    cell = torch.minimum(position.floor().long().clamp_min(0), most)
+    highest = torch.tensor([shape[2], shape[1]], device=start.device) - (degree + 1)
+    cell = torch.minimum(position.floor().long().clamp_min(0), highest)
     weights, slopes = spline_weights(position - cell, degree)
     w = profile[:, :1] + step * profile[:, 1:] if profile.ndim == 2 else profile[..., 0].gather(1, step.long())
     w = w * (1 - (m == 0) * lost[:, :1] - (m == last) * lost[:, 1:]) * (m <= last)
@@ -88,6 +87,6 @@ def _samples(
 
 
 def _row(place: Tensor, j: int, shape: torch.Size, degree: int) -> Tensor:
-    """Flat indices of the neighbours along u, j rows on from the first."""
+    """Flat indices of the neighbours along u, j rows after the first."""
     first = (place[..., 0] * shape[1] + place[..., 1] + j) * shape[2] + place[..., 2]
     return first[..., None] + torch.arange(degree + 1, device=place.device)

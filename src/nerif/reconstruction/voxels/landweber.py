@@ -20,21 +20,21 @@ __all__ = ["Landweber"]
 
 @dataclass(frozen=True)
 class Landweber(VoxelReconstructor):
-    """Voxels by Landweber iteration; the number of iterations is what regularises.
+    """Voxels by Landweber iteration, regularised by the number of iterations.
 
-    It stops at the noise where sigma is known (discrepancy principle), else when an iteration gains less than the
-    tolerance, or after the given iterations.
+    It stops at the noise where sigma is known (discrepancy principle), else when the residual falls by less than the
+    tolerance per iteration, or after the given iterations.
 
     Source: Landweber, Am. J. Math. 73 (1951); momentum: Nesterov, Soviet Math. Dokl. 27 (1983), with the restart of
     O'Donoghue & Candes, Found. Comput. Math. 15 (2015).
     """
 
     momentum: bool = True
-    """Nesterov's momentum: as good in far fewer iterations."""
+    """Nesterov's momentum: the same accuracy in far fewer iterations."""
     relaxation: float = 1.0
     """Step omega in units of 1 / |F|^2; below 2 (1 with momentum)."""
     iterations: int = 200
-    """Most iterations on each grid."""
+    """Maximum iterations on each grid."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -45,7 +45,7 @@ class Landweber(VoxelReconstructor):
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         x = problem.clip(x)
-        # the estimate comes from below, and a step too long diverges
+        # the norm is estimated from below, and too long a step diverges
         norm = operator_norm(problem.forward, problem.adjoint, problem.random(), tolerance=1e-2)
         step = self.relaxation / (1.05 * norm) ** 2
         ahead, k, last = x, 0, float("inf")
@@ -54,7 +54,7 @@ class Landweber(VoxelReconstructor):
             x_last, x, k = x, problem.clip(ahead + step * problem.adjoint(r)), k + 1
             ahead = problem.clip(x + (k / (k + 3)) * (x - x_last)) if self.momentum else x
             r = problem.data - problem.forward(ahead)
-            if self.momentum and float(r.square().sum()) > last:  # it carries uphill: begin anew from here
+            if self.momentum and float(r.square().sum()) > last:  # restart without momentum
                 ahead, k = x, 0
                 r = problem.data - problem.forward(ahead)
             last = float(r.square().sum())

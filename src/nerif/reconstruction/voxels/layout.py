@@ -1,4 +1,4 @@
-"""Where the coefficients of a classical method lie: on voxels in space, or on those of (r, h) of a symmetric flow."""
+"""The positions of coefficients: voxels in space, or the (r, h) plane of a symmetric flow."""
 
 from __future__ import annotations
 
@@ -21,66 +21,55 @@ from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
-__all__ = ["InSpace", "Layout", "Symmetric", "layout_of"]
+__all__ = ["InSpace", "Layout", "Symmetric"]
 
-COARSEST = 12  # voxels along the longest edge of the first grid, at least
-FEWEST = 4  # along an edge that is halved
+MIN_FIRST_VOXELS = 12  # along the longest edge of the first grid
+MIN_HALVED_VOXELS = 4  # along an edge that is halved
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Layout(ABC):
-    """Grids of coefficients, and what they stand for.
+    """Grids of coefficients, and the fields they define."""
 
-    Parameters
-    ----------
-    box : of the measurement, mm
-    faces : of it on which the field is ambient
-    basis : of the spline
-    """
-
-    box: Box
-    faces: tuple[str, ...]
-    basis: str
+    box: Box  # of the measurement, mm
+    faces: tuple[str, ...]  # of it, on which the field is ambient
+    basis: str  # of the spline
+    step: float | None = None  # of operators: distance of planes in voxels
+    device: torch.device | str = "cpu"
+    dtype: torch.dtype = torch.float32
 
     @property
     def degree(self) -> int:
-        """Of the spline."""
         return DEGREES[self.basis]
 
     @property
     @abstractmethod
-    def boundary(self) -> Boundary:
-        """How coefficients go on beyond the grid."""
+    def boundary(self) -> Boundary: ...
 
     @abstractmethod
     def grid(self, voxels: int) -> Grid:
-        """Return the grid with voxels of which so many are as long as the longest edge of the box."""
+        """Return the grid of voxels whose edge is the longest edge of the box over `voxels`."""
 
     @abstractmethod
-    def operator(
-        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
-        dtype: torch.dtype,
-    ) -> VoxelOperator:  # fmt: skip
-        """Return what rays see of coefficients on a grid."""
+    def operator(self, rays: Rays, grid: Grid, model: ForwardModel) -> VoxelOperator: ...
 
     @abstractmethod
-    def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field:
-        """Return the field that coefficients stand for."""
+    def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field: ...
 
     @abstractmethod
-    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z y x"]:
-        """Return a field where the coefficients stand, as they are given at first."""
+    def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z y x"]:
+        """Return a field at the positions of the coefficients, as a first approximation of them."""
 
     @abstractmethod
     def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
-        """Return the coefficients that are not outside the visual hull."""
+        """Return the coefficients within the visual hull."""
 
     def grids(self, voxels: int, coarse_to_fine: bool) -> list[Grid]:
-        """Return grids from coarse to fine, each of voxels twice as small as those before, or the last alone."""
+        """Return grids from coarse to fine, the voxels halved from each to the next, or the last alone."""
         last = self.grid(voxels)
         shape, grids = list(last.shape), [last]
-        while coarse_to_fine and max(shape) >= 2 * COARSEST:
-            shape = [min(n, max(FEWEST, n // 2)) for n in shape]
+        while coarse_to_fine and max(shape) >= 2 * MIN_FIRST_VOXELS:
+            shape = [min(n, max(MIN_HALVED_VOXELS, n // 2)) for n in shape]
             grids.insert(0, Grid(last.box, (shape[0], shape[1], shape[2])))
         return grids
 
@@ -93,34 +82,26 @@ class InSpace(Layout):
         return Boundary(self.faces)
 
     def grid(self, voxels: int) -> Grid:
-        least = (self.degree + 1) // 2  # of a slice too
-        nz, ny, nx = (max(least, n) for n in Grid.of_resolution(self.box, voxels).shape)
+        layers = (self.degree + 1) // 2  # the least along any edge, even of a slice
+        nz, ny, nx = (max(layers, n) for n in Grid.of_resolution(self.box, voxels).shape)
         return Grid(self.box, (nz, ny, nx))
 
-    def operator(
-        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
-        dtype: torch.dtype,
-    ) -> VoxelOperator:  # fmt: skip
-        return VoxelOperator(rays, grid, model, self.basis, self.boundary, step, device, dtype)
+    def operator(self, rays: Rays, grid: Grid, model: ForwardModel) -> VoxelOperator:
+        return VoxelOperator(rays, grid, model, self.basis, self.boundary, self.step, self.device, self.dtype)
 
     def field(self, coefficients: Float[Tensor, "z y x"], grid: Grid) -> Field:
         return VoxelField.of(coefficients, grid, self.degree, self.boundary)
 
-    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z y x"]:
-        return field.sample(grid, device)
+    def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z y x"]:
+        return field.sample(grid, self.device)
 
     def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
         return visual_hull(measurement, grid)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Symmetric(Layout):
-    """Splines of (r, h), one a number that the field has there.
-
-    Parameters
-    ----------
-    symmetry : Symmetry, mm
-    """
+    """Splines of (r, h), one for each azimuth of the symmetry."""
 
     symmetry: Symmetry
 
@@ -129,40 +110,37 @@ class Symmetric(Layout):
         return Boundary(self.symmetry.faces(self.faces), around=True)
 
     def grid(self, voxels: int) -> Grid:
-        least, size = (self.degree + 1) // 2, max(self.box.edges) / voxels
+        layers, size = (self.degree + 1) // 2, max(self.box.edges) / voxels
         box = self.symmetry.reduced_box(self.box, self.faces)
-        if self.symmetry.axial:  # differences from angle to angle are as steep as half way from the axis
-            round_it = math.pi * box.edges[0] / 2
-            box = Box((box.lower[0], -round_it, box.lower[2]), (box.upper[0], round_it, box.upper[2]))
-        nx, nz = (max(least, round(edge / size)) for edge in (box.edges[0], box.edges[2]))
+        if self.symmetry.axial:  # differences between azimuths are taken halfway from the axis
+            half = math.pi * box.edges[0] / 2
+            box = Box((box.lower[0], -half, box.lower[2]), (box.upper[0], half, box.upper[2]))
+        nx, nz = (max(layers, round(edge / size)) for edge in (box.edges[0], box.edges[2]))
         return Grid(box, (nz, self.symmetry.angles, nx))
 
     def grids(self, voxels: int, coarse_to_fine: bool) -> list[Grid]:
         angles, grids = self.symmetry.angles, super().grids(voxels, coarse_to_fine)
         return [Grid(grid.box, (grid.shape[0], angles, grid.shape[2])) for grid in grids]
 
-    def operator(
-        self, rays: Rays, grid: Grid, model: ForwardModel, step: float | None, device: torch.device,
-        dtype: torch.dtype,
-    ) -> VoxelOperator:  # fmt: skip
-        return SymmetricOperator(self.symmetry, rays, grid, model, self.basis, self.boundary, step, dtype)
+    def operator(self, rays: Rays, grid: Grid, model: ForwardModel) -> SymmetricOperator:
+        settings = self.basis, self.boundary, self.step, self.dtype
+        return SymmetricOperator(self.symmetry, rays, grid, model, *settings)
 
     def field(self, coefficients: Float[Tensor, "z k x"], grid: Grid) -> Field:
-        nz, angles, nx = grid.shape
-        layers = (self.degree + 1) // 2
-        flat, parts = Grid(grid.box, (nz, layers, nx)), []
-        for k in range(angles):
-            own = coefficients[:, k : k + 1].expand(nz, layers, nx)
-            parts.append(VoxelField.of(own, flat, self.degree, self.boundary))
+        (nz, angles, nx), layers = grid.shape, (self.degree + 1) // 2
+        flat = Grid(grid.box, (nz, layers, nx))
+        planes = [coefficients[:, k : k + 1].expand(nz, layers, nx) for k in range(angles)]
+        parts = [VoxelField.of(plane, flat, self.degree, self.boundary) for plane in planes]
         return SymmetricVoxels(parts, self.symmetry)
 
-    def sample(self, field: Field, grid: Grid, device: torch.device) -> Float[Tensor, "z k x"]:
+    def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z k x"]:
         angle = 2 * math.pi * torch.arange(self.symmetry.angles, dtype=torch.float64) / self.symmetry.angles
         h, angle, r = torch.meshgrid(grid.axis("z"), angle, grid.axis("x"), indexing="ij")
         points = self.symmetry.places(r, angle, h).float()
         return field.to("cpu")(points.reshape(-1, 3)).detach().reshape(points.shape[:-1])
 
     def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z k x"]:
+        """Return the rings of which most lies within the hull, and those that the grid in space does not sample."""
         space = Grid.of_resolution(self.box, round(max(self.box.edges) / min(grid.spacing)))
         inside = visual_hull(measurement, space).flatten()
         place = self.symmetry.reduced(space.points(torch.float64).reshape(-1, 3))
@@ -171,14 +149,6 @@ class Symmetric(Layout):
         h = ((place[:, 2] - box.lower[2]) / grid.spacing[2]).floor().long().clamp(0, nz - 1)
         on_grid = (r >= 0) & (r < nx)
         cell = (h * nx + r)[on_grid]
-        found = torch.zeros(2, nz * nx, dtype=torch.float64)
-        found[0].index_add_(0, cell, inside[on_grid].double())
-        found[1].index_add_(0, cell, torch.ones_like(cell, dtype=torch.float64))
-        # most of a ring within the masks of all views, where the grid in space has any of it
-        free = (2 * found[0] > found[1]) | (found[1] == 0)
+        total = torch.bincount(cell, minlength=nz * nx)
+        free = (2 * torch.bincount(cell[inside[on_grid]], minlength=nz * nx) > total) | (total == 0)
         return free.reshape(nz, 1, nx).expand(nz, angles, nx).contiguous()
-
-
-def layout_of(symmetry: Symmetry | None, box: Box, faces: tuple[str, ...], basis: str) -> Layout:
-    """Return the layout of a flow with a symmetry, or with none."""
-    return InSpace(box, faces, basis) if symmetry is None else Symmetric(box, faces, basis, symmetry)

@@ -1,4 +1,4 @@
-"""The grids that a classical method solves on, from coarse to fine, and the bins of pixels that each of them needs."""
+"""The grids of a voxel method from coarse to fine, and the bins of pixels on each."""
 
 from __future__ import annotations
 
@@ -13,63 +13,47 @@ from torch import Tensor
 from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
 
-__all__ = ["Level", "bins_at_last", "bins_of", "coarser", "levels", "pixels_in_a_voxel"]
+__all__ = ["FINE_BIN", "Level", "bins_of", "coarser", "levels", "pixels_in_a_voxel"]
 
-WHILE_COARSE = 1.25  # voxels: edge of bins from which a method goes on to finer ones
-AT_LAST = 0.25  # voxels: bins this small change nothing that the grid can hold
+COARSE_BIN = 1.25  # voxels: edge of bins before the last level
+FINE_BIN = 0.25  # voxels: bins this small blur nothing that the grid can resolve
 
 
 @dataclass(frozen=True)
 class Level:
-    """A grid, and the edge of the bins of pixels to solve with on it, px."""
+    """A grid, and the edge of its bins of pixels, px."""
 
     grid: Grid
     edge: int
 
 
 def levels(measurement: Measurement, grids: Sequence[Grid], coarse_to_fine: bool) -> list[Level]:
-    """Return what to solve on.
-
-    Parameters
-    ----------
-    grids : from coarse to fine (layout.py)
-    coarse_to_fine : whether to begin with larger bins of pixels
-    """
-    last = Level(grids[-1], bins_at_last(measurement, grids[-1]))
+    """Return the levels of grids from coarse to fine; unless coarse_to_fine, only the last grid with its fine bins."""
+    last = Level(grids[-1], bins_of(measurement, grids[-1], FINE_BIN))
     if not coarse_to_fine:
         return [last]
-    before = [Level(grid, _bins(measurement, grid, WHILE_COARSE)) for grid in grids]
-    return [*before[:-1], last] if before[-1] == last else [*before, last]
+    coarse = [Level(grid, bins_of(measurement, grid)) for grid in grids]
+    return [*coarse[:-1], last] if coarse[-1] == last else [*coarse, last]
 
 
-def bins_at_last(measurement: Measurement, grid: Grid) -> int:
-    """Return the edge of the bins of pixels that the last iterations on a grid take, px."""
-    return _bins(measurement, grid, AT_LAST)
-
-
-def bins_of(measurement: Measurement, grid: Grid) -> int:
-    """Return the edge of the bins of pixels that go with a grid that stays coarse, px."""
-    return _bins(measurement, grid, WHILE_COARSE)
-
-
-def _bins(measurement: Measurement, grid: Grid, share: float) -> int:
-    """The largest power of two whose bins are no larger than a share of a voxel."""
-    most = share * pixels_in_a_voxel(measurement, grid)
-    return int(1 << max(0, int(most).bit_length() - 1))
+def bins_of(measurement: Measurement, grid: Grid, voxels: float = COARSE_BIN) -> int:
+    """Return the edge of bins of pixels for a grid: the largest power of two within some voxels, px."""
+    largest = voxels * pixels_in_a_voxel(measurement, grid)
+    return int(1 << max(0, int(largest).bit_length() - 1))
 
 
 def pixels_in_a_voxel(measurement: Measurement, grid: Grid) -> float:
-    """Return how many pixels the shortest edge of a voxel in the middle of the box spans, in the view of fewest."""
+    """Return the pixels across the shortest edge of a voxel in the middle of the box, in the view with fewest."""
     middle = torch.tensor(measurement.box.centre, dtype=torch.float64)
     ends = middle + torch.diag(torch.full((3,), min(grid.spacing), dtype=torch.float64))
-    seen = []
+    largest = []
     for camera in measurement.cameras:
         pixels = camera.project(torch.cat([middle[None], ends]).to(camera.intrinsics.dtype))
         spans = (pixels[1:] - pixels[0]).norm(dim=-1).nan_to_num(1.0).clamp(max=min(camera.image_size))
-        seen.append(float(spans.max()))  # of the edge that is seen most from the side
-    return min(seen)
+        largest.append(float(spans.max()))  # of the edge nearest to the image plane
+    return min(largest)
 
 
 def coarser(free: Bool[Tensor, "z y x"], grid: Grid) -> Bool[Tensor, "Z Y X"]:
-    """Return a mask on a coarser grid: a voxel is free where any in its place is."""
+    """Return a mask on a coarser grid: a voxel is free if any part of it is."""
     return functional.adaptive_max_pool3d(free[None, None].float(), grid.shape)[0, 0] > 0

@@ -1,9 +1,9 @@
-"""Multiplicative iterations for fields and line integrals that are not negative: MLEM, and MART view by view.
+"""Multiplicative iterations for non-negative fields and line integrals: MLEM, and MART view by view.
 
-    MLEM    x <- x A^T (y / A x) / A^T 1                       the most likely x of Poisson-distributed y
+    MLEM    x <- x A^T (y / A x) / A^T 1                       the most likely x for Poisson-distributed y
     MART    x <- x exp(mu A_v^T ln (y_v / A_v x) / A_v^T 1),      one view v after the other
 
-Neither can leave x >= 0, and a voxel that any ray finds empty stays empty.
+x >= 0 is preserved, and a voxel on a ray that measured 0 stays 0.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -26,12 +26,12 @@ from nerif.reconstruction.voxels.settings import VoxelReconstructor
 
 __all__ = ["MART", "MLEM"]
 
-FLOOR = 1e-6  # of the mean: what a start may be no smaller than, and a prediction that is divided by
+FLOOR = 1e-6  # of the mean: lower limit of the start, and of a prediction that is a divisor
 
 
 @dataclass(frozen=True)
 class Multiplicative(VoxelReconstructor):
-    """What both have in common: where they begin, and what they refuse."""
+    """The shared loop and start of both methods."""
 
     coarse_to_fine: bool = False
     """Start on a coarse grid and halve the voxels from solution to solution."""
@@ -41,41 +41,49 @@ class Multiplicative(VoxelReconstructor):
         while True:
             for block in blocks:
                 x = problem.clip(self.update(block, x))
-            residual = float((problem.data - problem.forward(x)).square().sum())
-            yield Iterate(x, residual, 0.0)
+            yield Iterate(x, problem.residual(x), 0.0)
 
     def begin(self, problem: Problem, x: Tensor) -> Tensor:
-        check_positive(problem)
-        return start(problem, x)
+        """Return x, above 0 everywhere; for x <= 0 the uniform field whose projections have the sum of the data."""
+        for part in problem.target.parts:
+            if not part.model.additive:
+                raise InputError(
+                    f"mlem and mart need line integrals of a non-negative field, got {part.model.name}; "
+                    "use --method tikhonov, tv or nerif",
+                    field="method",
+                )
+        mean = float(x.clamp_min(0).mean())
+        if mean > 0:
+            return problem.clip(x.clamp_min(FLOOR * mean))
+        block, uniform = Block.of(problem, None), problem.clip(torch.ones_like(x))
+        return uniform * (float(block.data.sum()) / max(float(block.project(uniform).sum()), block.floor) or 1.0)
 
     @abstractmethod
-    def blocks(self, problem: Problem) -> list[Block]:
-        """Return the rays that each update of an iteration sees."""
+    def blocks(self, problem: Problem) -> list[Block]: ...
 
     @abstractmethod
-    def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """Return the next x by some rays."""
+    def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]: ...
 
 
 @dataclass(frozen=True)
 class MLEM(Multiplicative):
     """Voxels by maximum likelihood and expectation maximisation, for absorption, emission and particle images.
 
-    It stops at the noise where sigma is known (discrepancy principle), else when an iteration gains less than the
-    tolerance, or after the given iterations.
+    It stops at the noise where sigma is known (discrepancy principle), else when the residual falls by less than the
+    tolerance per iteration, or after the given iterations.
 
     Source: Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113; for transmission as line integrals see Lange & Carson,
     J. Comput. Assist. Tomogr. 8 (1984) 306.
     """
 
     iterations: int = 100
-    """Most iterations."""
+    """Maximum iterations."""
 
     def blocks(self, problem: Problem) -> list[Block]:
         return [Block.of(problem, None)]
 
     def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        return x * block.back(block.measured / block.see(x)) / block.reach
+        return x * block.back_project(block.data / block.project(x)) / block.reach
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class MART(Multiplicative):
     relaxation: float = 1.0
     """Exponent mu; above 0, at most 1."""
     iterations: int = 10
-    """Most iterations, each of which sees every view once."""
+    """Maximum iterations, each with one update per view."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,7 +105,7 @@ class MART(Multiplicative):
             raise InputError(f"expected above 0 and at most 1, got {self.relaxation}", field="relaxation")
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
-        """Return what a run will need at most: of every view its own operator, and where its rays pass, as well."""
+        """Return the memory of a run, with an operator and a reach for every view."""
         reach = len(measurement.cameras) * math.prod(grid.shape) * self.itemsize
         return super().memory_bytes(measurement, grid, device) + self.operator_bytes(measurement, grid) + reach
 
@@ -106,81 +114,46 @@ class MART(Multiplicative):
         return [Block.of(problem, view) for view in views]
 
     def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        ratio = (block.measured.clamp_min(block.floor) / block.see(x)).log()
-        return x * torch.exp(self.relaxation * block.back(ratio) / block.reach)
+        ratio = (block.data.clamp_min(block.floor) / block.project(x)).log()
+        return x * torch.exp(self.relaxation * block.back_project(ratio) / block.reach)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Rays of one technique, of all views or of one.
+    """The rays of one view or of all."""
 
-    Parameters
-    ----------
-    operators : VoxelOperator of each technique
-    measured : (n,) what they measured, 0 where noise made it less
-    reach : (z, y, x) A^T 1; 1 where no ray passes
-    scale : field of one unit of x
-    floor : of predictions
-    """
-
-    operators: tuple[VoxelOperator, ...]
-    measured: Float[Tensor, " n"]
-    reach: Float[Tensor, "z y x"]
-    scale: float
-    floor: float
+    operators: tuple[VoxelOperator, ...]  # one for each technique
+    data: Float[Tensor, " n"]  # measured values, 0 where noise made them negative
+    reach: Float[Tensor, "z y x"]  # A^T 1; 1 where no ray passes
+    scale: float  # field of one unit of x
+    floor: float  # of predictions
 
     @classmethod
     def of(cls, problem: Problem, view: int | None) -> Block:
-        """Take the rays of a view, or all."""
-        operators, measured = [], []
+        """Return the block of a view, or of all."""
+        operators, values = [], []
         for operator, part in zip(problem.operators, problem.target.parts, strict=True):
             if view is not None:
-                mine = (part.rays.view == view).nonzero()[:, 0]
-                if not len(mine):
+                rays = (part.rays.view == view).nonzero()[:, 0]
+                if not len(rays):
                     continue
-                part = part[mine]
+                part = part[rays]
                 operator = operator.for_rays(part.rays, part.model)
             operators.append(operator)
-            measured.append(part.measured.reshape(-1).to(operator.device, operator.dtype))
-        values = torch.cat(measured).clamp_min(0)
-        floor = FLOOR * float(values.mean()) or FLOOR
-        block = cls(tuple(operators), values, torch.ones_like(problem.zero()), problem.scale, floor)
-        reach = block.back(torch.ones_like(values))
-        return cls(block.operators, values, torch.where(reach > 0, reach, torch.ones_like(reach)), problem.scale, floor)
+            values.append(part.measured.reshape(-1).to(operator.device, operator.dtype))
+        data = torch.cat(values).clamp_min(0)
+        floor = FLOOR * float(data.mean()) or FLOOR
+        block = cls(tuple(operators), data, torch.ones_like(problem.zero()), problem.scale, floor)
+        reach = block.back_project(torch.ones_like(data))
+        return replace(block, reach=torch.where(reach > 0, reach, torch.ones_like(reach)))
 
-    def see(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, " n"]:
+    def project(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, " n"]:
         """Return A x, no smaller than the floor."""
-        seen = [operator(x * self.scale).reshape(-1) for operator in self.operators]
-        return torch.cat(seen).clamp_min(self.floor)
+        projections = [operator(x * self.scale).reshape(-1) for operator in self.operators]
+        return torch.cat(projections).clamp_min(self.floor)
 
-    def back(self, y: Float[Tensor, " n"]) -> Float[Tensor, "z y x"]:
+    def back_project(self, y: Float[Tensor, " n"]) -> Float[Tensor, "z y x"]:
         """Return A^T y."""
         parts = y.split([operator.range_shape[0] for operator in self.operators])
         images = [a.T(part[:, None]) * self.scale for a, part in zip(self.operators, parts, strict=True)]
         return torch.stack(images).sum(dim=0)
-
-
-def check_positive(problem: Problem) -> None:
-    """Refuse techniques that do not see sums of what is there.
-
-    Raises
-    ------
-    InputError
-        Naming the methods that serve.
-    """
-    for part in problem.target.parts:
-        if not part.model.additive:
-            raise InputError(
-                f"mlem and mart take line integrals of what is never negative, not {part.model.name}; "
-                "give --method tikhonov, tv or nerif",
-                field="method",
-            )
-
-
-def start(problem: Problem, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-    """Return where to begin: x, above 0 everywhere, or the even field that makes the sum of what was measured."""
-    mean = float(x.clamp_min(0).mean())
-    if mean > 0:
-        return problem.clip(x.clamp_min(FLOOR * mean))
-    block, even = Block.of(problem, None), problem.clip(torch.ones_like(x))
-    return even * (float(block.measured.sum()) / max(float(block.see(even).sum()), block.floor) or 1.0)

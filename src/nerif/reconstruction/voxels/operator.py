@@ -1,9 +1,9 @@
-"""The linear map from voxels to what rays see of them, never formed as a matrix, and its adjoint."""
+"""The forward projector of a voxel field and its adjoint, never formed as a matrix."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import ModuleType
 
 import torch
@@ -17,192 +17,162 @@ from nerif.geometry import Grid, Rays
 from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.voxels.planes import Bundle
 
-__all__ = ["STEPS", "VoxelOperator", "check_step", "made_of", "operator_norm", "rays_through"]
+__all__ = ["VoxelOperator", "apply_rows", "check_step", "operator_norm", "rays_through"]
 
-STEPS = {"linear": 0.5, "cubic": 1.0}
-"""Voxels between planes, at most: the gradient of the linear basis jumps from voxel to voxel (benchmarks/README.md)."""
-
-PAIRS, MOST_PAIRS = 2.0, 8
-"""Of rays through a lens, for each voxel that the cone's radius is wide in the middle of the box, and at most."""
+# distance of planes in voxels: the gradient of the linear basis jumps from voxel to voxel (docs/decisions/011)
+MAX_STEP = {"linear": 0.5, "cubic": 1.0}
+# of rays through a lens, per voxel of the cone's radius in the middle of the box; of a pixel
+PAIRS_PER_VOXEL, MAX_PAIRS = 2.0, 8
 
 
 class VoxelOperator:
-    """What rays see of a B-spline on a voxel grid by a linear forward model; c are the spline's coefficients.
+    """The projections of a B-spline on a voxel grid by a linear forward model; c are the spline's coefficients.
 
         (A c)_r = sum_m w_rm [A_r f(x_rm) + B_r grad f(x_rm)],    f(x) = sum_ijk c_ijk b_ijk(x)
 
-    Profile w, A and B are the model's (forward/base.py); samples stand where rays cross evenly spaced planes
-    (planes.py). `A(c)` applies the operator, `A.T(y)` its exact adjoint. On a CPU it runs on all cores (Numba), on CUDA
-    in PyTorch. What a ray with a lens sees is the mean over thin rays through it, the more the wider they spread.
+    Profile w, A and B are the model's (forward/base.py); samples lie where rays cross evenly spaced planes (planes.py).
+    `A(c)` applies the operator, `A.T(y)` its exact adjoint: on a CPU by Numba on all cores, on CUDA in PyTorch. A pixel
+    with a lens is the mean over thin rays, the more the wider its cone.
 
     Parameters
     ----------
-    rays : Rays clipped to the box of the grid
-    grid : Grid
-    model : linear ForwardModel
+    rays : clipped to the box of the grid; at least one crosses it
+    model : a linear one
     basis : "linear" (coefficients are the values at voxel centres) or "cubic"
-    boundary : how the coefficients go on beyond the box
-    step : longest distance between planes, in edges of a voxel, at most that of STEPS; None for that
-    device, dtype : where and in which precision c and y are
-
-    Raises
-    ------
-    InputError
-        If no ray crosses the box, one is not clipped to it, the model is not linear, or a setting is not one of those
-        named.
+    boundary : how the coefficients are extended beyond the box
+    step : largest distance of planes in voxel edges, up to MAX_STEP; None for that
+    device, dtype : of c and y
 
     Source: docs/conventions.md (forward model); Joseph, IEEE Trans. Med. Imaging 1 (1982), for projection by
     interpolation in planes; Lacroute & Levoy, SIGGRAPH (1994), for the resampling along the axis.
     """
 
-    padded_axes: tuple[int, ...] = (0, 1, 2)
-    """Of z, y, x, across which coefficients go on beyond the box."""
+    padded_axes: tuple[int, ...] = (0, 1, 2)  # of z, y, x: along them coefficients are extended beyond the box
 
     def __init__(
-        self,
-        rays: Rays,
-        grid: Grid,
-        model: ForwardModel,
-        basis: str = "linear",
-        boundary: Boundary | None = None,
-        step: float | None = None,
-        device: torch.device | str = "cpu",
-        dtype: torch.dtype = torch.float32,
-    ) -> None:
+        self, rays: Rays, grid: Grid, model: ForwardModel, basis: str = "linear", boundary: Boundary | None = None,
+        step: float | None = None, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32,
+    ) -> None:  # fmt: skip
         if not model.linear:
             raise InputError(f"expected a linear one, got {type(model).__name__}", field="model")
         if basis not in DEGREES:
             raise InputError(f"expected {' or '.join(DEGREES)}, got '{basis}'", field="basis")
-        step = STEPS[basis] if step is None else step
-        check_step(step, basis)
+        self.step = MAX_STEP[basis] if step is None else step
+        check_step(self.step, basis)
         if not bool(rays.crosses.any()):
             raise InputError("expected rays that cross the box, got none; check box, cameras and masks", field="rays")
         self.grid, self.basis, self.boundary = grid, basis, boundary or Boundary()
         self.degree = DEGREES[basis]
         self.layers = (self.degree + 1) // 2
-        self.device, self.dtype = torch.device(device), dtype
-        self.compiled = self.device.type == "cpu"  # or False: in plain PyTorch, to compare with
-        self.inner = torch.float64 if self.compiled else dtype
-        self.domain_shape = grid.shape
-        self.range_shape = (len(rays), len(model.channels))
-        self.shares: Tensor | None = None  # of rays through a lens, in what a pixel sees
-        if rays.lens is not None:
-            each = rays_through(rays, min(grid.spacing))
-            rays = rays.spread(each)
-            self.shares = rays.shares(each).reshape(-1, each, 1).to(self.device, dtype)
         if min(grid.shape[axis] for axis in self.padded_axes) < self.layers:
             raise InputError(
                 f"expected at least {self.layers} along each edge for basis {basis}, got {grid.shape}", field="voxels"
             )
-        self.step = step
-        self._follow(rays, model)
+        self.device, self.dtype = torch.device(device), dtype
+        self.compiled = self.device.type == "cpu"  # or False: in PyTorch, to compare with
+        self.inner = torch.float64 if self.compiled else dtype
+        self.domain_shape = grid.shape
+        self.range_shape = (len(rays), len(model.channels))
+        self.padded_shape = [n + 2 * self.layers * (axis in self.padded_axes) for axis, n in enumerate(grid.shape)]
+        self.shares: Tensor | None = None  # (pixel, ray, 1) weights of rays through a lens
+        if rays.lens is not None:
+            each = rays_through(rays, min(grid.spacing))
+            rays = rays.spread(each)
+            self.shares = rays.shares(each).reshape(-1, each, 1).to(self.device, dtype)
+        self._place_samples(rays, model)
 
-    def _follow(self, rays: Rays, model: ForwardModel) -> None:
-        """Find where rays are sampled."""
+    def _place_samples(self, rays: Rays, model: ForwardModel) -> None:
         bundles = Bundle.all_of(rays, self.grid, self.degree, math.ceil(1 / self.step), model)
         self.bundles = [bundle.to(self.device, self.inner, self.dtype) for bundle in bundles]
 
     @property
     def samples(self) -> int:
-        """How many samples all rays have."""
+        """Number of samples of all rays."""
         return sum(int(bundle.count.sum()) for bundle in self.bundles)
 
     def for_rays(self, rays: Rays, model: ForwardModel) -> VoxelOperator:
         """Return the operator of other rays on the same grid."""
-        return VoxelOperator(
-            rays, self.grid, model, self.basis, self.boundary, self.step, self.device, self.dtype
-        )  # fmt: skip
+        settings = self.basis, self.boundary, self.step, self.device, self.dtype
+        return VoxelOperator(rays, self.grid, model, *settings)
 
     def __call__(self, coefficients: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
-        """Return what every ray sees."""
+        """Return the projections of all rays."""
         if tuple(coefficients.shape) != self.domain_shape:
             raise InputError(f"expected {self.domain_shape}, got {tuple(coefficients.shape)}", field="coefficients")
-        return self.through(
-            self.boundary.extend(coefficients.to(self.device, self.dtype), self.layers, self.padded_axes)
-        )
+        coefficients = coefficients.to(self.device, self.dtype)
+        return self.of_padded(self.boundary.extend(coefficients, self.layers, self.padded_axes))
 
-    def through(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n c"]:
-        """Return what every ray sees of coefficients that go on beyond the box already."""
-        padded = padded.to(self.device, self.dtype)
-        seen = self._of_rays(None)
-        self._integrate(padded, seen)
-        return seen if self.shares is None else (seen.reshape(*self.shares.shape[:2], -1) * self.shares).sum(dim=1)
+    def of_padded(self, padded: Float[Tensor, "zp yp xp"]) -> Float[Tensor, "n c"]:
+        """Return the projections of coefficients that are already extended beyond the box."""
+        rays = self.range_shape[0] if self.shares is None else self.shares.numel()
+        result = torch.zeros(rays, self.range_shape[1], dtype=self.dtype, device=self.device)
+        self._integrate(padded.to(self.device, self.dtype), result)
+        if self.shares is None:
+            return result
+        return (result.reshape(*self.shares.shape[:2], -1) * self.shares).sum(dim=1)
 
-    def T(self, seen: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
-        """Return the adjoint of the operator, applied to what rays see."""
-        if tuple(seen.shape) != self.range_shape:
-            raise InputError(f"expected {self.range_shape}, got {tuple(seen.shape)}", field="seen")
-        shape = [n + 2 * self.layers * (axis in self.padded_axes) for axis, n in enumerate(self.domain_shape)]
-        padded = torch.zeros(shape, dtype=self.dtype, device=self.device)
-        self._spread(self._of_rays(seen.to(self.device, self.dtype)), padded)
+    def T(self, projections: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
+        """Apply the adjoint."""
+        if tuple(projections.shape) != self.range_shape:
+            raise InputError(f"expected {self.range_shape}, got {tuple(projections.shape)}", field="projections")
+        projections = projections.to(self.device, self.dtype)
+        if self.shares is not None:
+            projections = (projections[:, None] * self.shares).flatten(0, 1)
+        padded = torch.zeros(self.padded_shape, dtype=self.dtype, device=self.device)
+        self._spread(projections, padded)
         return self.boundary.fold(padded, self.layers, self.padded_axes)
 
-    def _integrate(self, padded: Float[Tensor, "zp yp xp"], seen: Float[Tensor, "m c"]) -> None:
-        """Set what thin rays see."""
-        integrate, _ = self._kernels()
+    def _integrate(self, padded: Float[Tensor, "zp yp xp"], result: Float[Tensor, "m c"]) -> None:
+        """Add the projections of thin rays to `result`."""
+        kernels = self._kernels()
         for bundle in self.bundles:
             value, slope = bundle.planes.cut(padded, self.inner)
-            own = torch.zeros_like(seen[: len(bundle.index)])
-            if bundle.gradient is not None:
-                own += made_of(bundle.gradient, integrate(self.degree, value, slope, bundle.path))
-            if bundle.value is not None:
-                own += made_of(bundle.value, integrate(self.degree, value, None, bundle.path))
-            seen[bundle.index] = own
+            for matrix, along in ((bundle.gradient, slope), (bundle.value, None)):
+                if matrix is not None:
+                    integrals = kernels.integrate(self.degree, value, along, bundle.path)
+                    result[bundle.index] += apply_rows(matrix, integrals)
 
-    def _spread(self, seen: Float[Tensor, "m c"], padded: Float[Tensor, "zp yp xp"]) -> None:
-        """Add what the adjoint makes of what thin rays see."""
-        _, spread = self._kernels()
+    def _spread(self, projections: Float[Tensor, "m c"], padded: Float[Tensor, "zp yp xp"]) -> None:
+        """Add the adjoint of thin rays' projections to `padded`."""
+        kernels = self._kernels()
         for bundle in self.bundles:
             for matrix in (bundle.gradient, bundle.value):
                 if matrix is not None:
-                    q = torch.einsum("nij,ni->nj", matrix, seen[bundle.index]).to(self.inner).contiguous()
-                    value, *slope = spread(self.degree, q, bundle.path, bundle.planes.shape(padded.shape))
-                    bundle.planes.mend(value, slope[0] if slope else None, padded)
+                    q = torch.einsum("nij,ni->nj", matrix, projections[bundle.index]).to(self.inner).contiguous()
+                    value, *slope = kernels.spread(self.degree, q, bundle.path, bundle.planes.shape(padded.shape))
+                    bundle.planes.add_cut_adjoint(value, slope[0] if slope else None, padded)
 
-    def _of_rays(self, seen: Float[Tensor, "n c"] | None) -> Float[Tensor, "m c"]:
-        """Of what pixels see the part of each of their rays; 0 where nothing is given."""
-        pixels, channels = self.range_shape
-        if seen is None:
-            rays = pixels if self.shares is None else self.shares.numel()
-            return torch.zeros(rays, channels, dtype=self.dtype, device=self.device)
-        return seen if self.shares is None else (seen[:, None] * self.shares).flatten(0, 1)
+    def _kernels(self) -> ModuleType:
+        if not self.compiled:
+            from nerif.reconstruction.voxels import kernels_torch
 
-    def _kernels(self) -> tuple[Callable[..., Tensor], Callable[..., list[Tensor]]]:
-        """The kernels to run."""
-        if self.compiled:
-            return _compiled_integrate, _compiled_spread
-        from nerif.reconstruction.voxels import kernels_torch
+            return kernels_torch
+        from nerif.reconstruction.voxels import kernels_numba
 
-        return kernels_torch.integrate, kernels_torch.spread
+        share_threads()
+        return kernels_numba
 
     def field(self, coefficients: Float[Tensor, "z y x"]) -> VoxelField:
-        """Return the field that coefficients stand for."""
+        """Return the field of coefficients."""
         return VoxelField.of(coefficients, self.grid, self.degree, self.boundary)
-
-    def norm(self, iterations: int = 30) -> float:
-        """Return an estimate of the largest singular value, from below."""
-        start = torch.rand(self.domain_shape, generator=torch.Generator().manual_seed(0), dtype=self.dtype)
-        return operator_norm(self, self.T, start.to(self.device), iterations)
 
     @staticmethod
     def memory_bytes(
         rays: int, grid: Grid, basis: str = "linear", dtype: torch.dtype = torch.float32, channels: int = 2,
         step: float | None = None,
     ) -> int:  # fmt: skip
-        """Return what an operator holds while it is applied: rays, B in so many channels, the padded grid and planes.
-
-        Paths and planes count in double precision, as on a CPU; planes are those of value and slope, cut and mended,
-        and what they are made of.
-        """
-        inner = 8
-        layers, each = (DEGREES[basis] + 1) // 2, math.ceil(1 / (step or STEPS[basis]))
+        """Estimate the memory of an operator while it is applied: rays, B, the padded grid and its planes."""
+        inner = 8  # bytes of paths and planes on a CPU
+        layers, each = (DEGREES[basis] + 1) // 2, math.ceil(1 / (step or MAX_STEP[basis]))
         padded = math.prod(n + 2 * layers for n in grid.shape)
-        held = 8 * inner + 3 * channels * dtype.itemsize + 16  # numbers of a path, B, whole numbers
-        return rays * held + padded * (2 * dtype.itemsize + each * (4 * inner + 6 * dtype.itemsize))
+        per_ray = 8 * inner + 3 * channels * dtype.itemsize + 16  # path, B, integers
+        return rays * per_ray + padded * (
+            2 * dtype.itemsize + each * (4 * inner + 6 * dtype.itemsize)
+        )  # value and slope
 
 
 def rays_through(rays: Rays, length: float) -> int:
-    """Return how many rays through the lens of a pixel tell what it sees of a field that changes over a length, mm."""
+    """Return how many rays through the lens of a pixel average a field that varies over a length (mm); 1 if thin."""
     if rays.lens is None:
         return 1
     rays = rays[rays.crosses]
@@ -211,34 +181,29 @@ def rays_through(rays: Rays, length: float) -> int:
         return 2
     middle = 0.5 * (rays.near + rays.far)
     spread = float(rays.half_width(middle).max())
-    return 2 * min(MOST_PAIRS, max(1, math.ceil(PAIRS * spread / length)))
+    return 2 * min(MAX_PAIRS, max(1, math.ceil(PAIRS_PER_VOXEL * spread / length)))
 
 
 def check_step(step: float, basis: str) -> None:
-    """Refuse a distance of planes that no operator has."""
-    if not 0 < step <= STEPS[basis]:
+    """Raise InputError unless the distance of planes is in the range of the basis."""
+    if not 0 < step <= MAX_STEP[basis]:
         raise InputError(
-            f"expected above 0 and at most {STEPS[basis]:g} voxels (basis {basis}), got {step}", field="step"
+            f"expected above 0 and at most {MAX_STEP[basis]:g} voxels (basis {basis}), got {step}", field="step"
         )
 
 
-def made_of(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:
-    """What the matrices make of integrals."""
+def apply_rows(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:
+    """Return each ray's matrix times its integrals."""
     return torch.einsum("nij,nj->ni", matrix, integrals.to(matrix.dtype))
 
 
 def operator_norm(
-    forward: Callable[[Tensor], Tensor],
-    adjoint: Callable[[Tensor], Tensor],
-    start: Tensor,
-    iterations: int = 30,
+    forward: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], start: Tensor, iterations: int = 30,
     tolerance: float = 1e-3,
-) -> float:
-    """Return the largest singular value by the power method on the normal operator, from below.
+) -> float:  # fmt: skip
+    """Estimate the largest singular value from below, until it grows by less than `tolerance` per iteration.
 
-        x <- A^T A x / |A^T A x|,     |A| = sqrt(|A^T A x|)
-
-    It stops when the estimate grows by less than `tolerance` in an iteration.
+    Power method on the normal operator: x <- A^T A x / |A^T A x|,     |A| = sqrt(|A^T A x|)
     """
     x, estimate = start, 0.0
     for _ in range(iterations):
@@ -248,22 +213,3 @@ def operator_norm(
         if estimate <= last * (1 + tolerance):
             break
     return estimate
-
-
-def _compiled_integrate(degree: int, value: Tensor, slope: Tensor | None, path: Sequence[Tensor]) -> Tensor:
-    arrays = [a.numpy() for a in path]
-    found = _compiled().integrate(degree, value.numpy(), None if slope is None else slope.numpy(), arrays)
-    return torch.from_numpy(found)
-
-
-def _compiled_spread(degree: int, seen: Tensor, path: Sequence[Tensor], shape: Sequence[int]) -> list[Tensor]:
-    planes = _compiled().spread(degree, seen.numpy(), [a.numpy() for a in path], shape)
-    return [torch.from_numpy(plane) for plane in planes]
-
-
-def _compiled() -> ModuleType:
-    """The compiled kernels, with as many threads as torch uses."""
-    from nerif.reconstruction.voxels import kernels_numba
-
-    share_threads()
-    return kernels_numba

@@ -1,10 +1,10 @@
-"""What few views leave open, a minimiser finds last: steps scaled in Fourier space to find it early.
+"""A preconditioner in Fourier space, which finds early the components that few views leave nearly undetermined.
 
     z = (S + weight T)^-1 s,      S = spectrum of F^T F,   T = spectrum of L^T L
 
-F^T F is no convolution, but near one: S is the spectrum of its answer to a single voxel in the middle of the box. Views
-see nothing of a wave that runs along none of their images, and S is small there; averaged over directions it is of no
-use. For the method of conjugate gradients only the way depends on it, not where it leads.
+F^T F is nearly a convolution: S is the spectrum of its response to a single voxel in the middle of the box. S is small
+for waves whose wave vector lies in none of the image planes, so it must not be averaged over directions. The
+preconditioner changes the path of conjugate gradients, not their limit.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from torch import Tensor
 
 __all__ = ["filtered", "response", "spectrum_of_differences"]
 
-LEAST = 1e-2  # of the largest value of S: what is taken where there is less
+MIN_RESPONSE = 1e-2  # of the largest value of S
 
 
 def response(
     normal: Callable[[Tensor], Tensor], empty: Float[Tensor, "z y x"], free: Bool[Tensor, "z y x"] | None
 ) -> Float[Tensor, "z y k"]:
-    """Return S, by the answer of F^T F to one voxel: the free one that is nearest to the middle.
+    """Return S, from the response of F^T F to the free voxel nearest to the middle.
 
     Parameters
     ----------
@@ -42,11 +42,11 @@ def response(
     point[at] = 1
     spectrum = torch.fft.rfftn(normal(point).roll([-int(i) for i in at], (0, 1, 2))).real
     largest = float(spectrum.max())
-    return spectrum.clamp_min(LEAST * largest) if largest > 0 else torch.ones_like(spectrum)
+    return spectrum.clamp_min(MIN_RESPONSE * largest) if largest > 0 else torch.ones_like(spectrum)
 
 
 def spectrum_of_differences(x: Float[Tensor, "z y x"], inverse: Sequence[float]) -> Float[Tensor, "z y k"]:
-    """Return that of the squared differences between neighbours, sum_axis (2 - 2 cos k) inverse^2.
+    """Return the spectrum of squared differences between neighbours, sum_axis (2 - 2 cos k) inverse^2.
 
     Parameters
     ----------

@@ -1,51 +1,45 @@
-"""The linear least-squares problem that the classical methods share, on one grid and in numbers of order one.
+"""The linear least-squares problem of the voxel methods on one grid, in numbers of order one.
 
     min_x  |F x - b|^2 + weight R(x),     F = (1/sigma) A scale / sqrt(N),   b = (1/sigma) y / sqrt(N), |b| = 1
 
-x is the field over its scale, one coefficient a voxel; y is what was measured, all techniques one after the other, and
-N counts its numbers; lengths in the penalties are in units of the box (cube root of its volume), and sums over voxels
-are means, so that a weight means the same on every grid. Voxels that are not free are ambient: x = 0.
+x is the field over its scale, one coefficient per voxel; y holds the N measured values of all techniques. In the
+penalties lengths are in units of the box (cube root of its volume) and sums over voxels are means, so that a weight
+means the same on every grid. Voxels that are not free are ambient: x = 0.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.fields.grid import Boundary
-from nerif.geometry import Grid
-from nerif.reconstruction.target import Target
+from nerif.geometry import Grid, Rays
+from nerif.reconstruction.target import Part, Target
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.preconditioner import filtered, response, spectrum_of_differences
 
-__all__ = ["Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients", "minimise"]
+__all__ = [
+    "Differences", "Iterate", "Penalty", "Problem", "conjugate_gradients", "filtered", "minimise", "response",
+    "spectrum_of_differences",
+]  # fmt: skip
 
-ROUND = 10  # iterations between looks at which bounds are met
-HALVINGS = 20  # of a step, after which it is no more than rounding
-
-Bounds = tuple[float, float]
+ROUND_ITERATIONS = 10  # before the set of voxels at their bounds is updated
+MAX_HALVINGS = 20  # of a step, beyond which it is below rounding
+MIN_RESPONSE = 1e-2  # of the largest value of S, the spectrum of F^T F
 
 
 @dataclass(frozen=True)
 class Iterate:
-    """Where a method stands after an iteration.
+    """The state after an iteration."""
 
-    Parameters
-    ----------
-    x : (z, y, x) scaled coefficients
-    residual : |F x - b|^2; 1 for the zero field
-    penalty : R(x)
-    """
-
-    x: Tensor
-    residual: float
-    penalty: float
+    x: Tensor  # (z, y, x) scaled coefficients
+    residual: float  # |F x - b|^2; 1 for the zero field
+    penalty: float  # R(x)
 
     def objective(self, weight: float) -> float:
         """Return |F x - b|^2 + weight R(x)."""
@@ -55,12 +49,7 @@ class Iterate:
 class Differences:
     """The gradient of a voxel field in units of the box edge: differences between neighbours, and their adjoint.
 
-        (D_x c)_i = (edge / h_x) (c_i - c_{i-1}),     at the n + 1 faces of the n voxels along x
-
-    Parameters
-    ----------
-    grid : Grid
-    boundary : what lies beyond the faces of the box
+    (D_x c)_i = (edge / h_x) (c_i - c_{i-1}),     at the n + 1 faces of the n voxels along x
     """
 
     def __init__(self, grid: Grid, boundary: Boundary) -> None:
@@ -85,7 +74,7 @@ class Differences:
         return self.boundary.fold(padded, 1)
 
     def _line(self, padded: Tensor, axis: int) -> Tensor:
-        """The part of a padded field that goes beyond the box along one axis only."""
+        """The part of a padded field that extends beyond the box along one axis only."""
         for other in range(3):
             if other != axis:
                 padded = padded.narrow(other, 1, self.shape[other])
@@ -93,23 +82,20 @@ class Differences:
 
 
 class Problem:
-    """The data and the operators on one grid; see the head of this file.
+    """The data and the operators on one grid.
 
     Parameters
     ----------
-    operators : VoxelOperator of each part of the target
-    target : Target, on the operators' device
-    free : (z, y, x) voxels that are not pinned to the ambient, or None for all
+    operators : one for each part of the target
+    target : on the operators' device
+    free : (z, y, x) voxels that are not ambient, or None for all
     bounds : lowest and highest value of the field, or None
     """
 
     def __init__(
-        self,
-        operators: Sequence[VoxelOperator],
-        target: Target,
-        free: Bool[Tensor, "z y x"] | None = None,
-        bounds: Bounds | None = None,
-    ) -> None:
+        self, operators: Sequence[VoxelOperator], target: Target, free: Bool[Tensor, "z y x"] | None = None,
+        bounds: tuple[float, float] | None = None,
+    ) -> None:  # fmt: skip
         self.operators, self.target, self.scale = tuple(operators), target, target.scale
         self.operator = operator = self.operators[0]
         self.differences = Differences(operator.grid, operator.boundary)
@@ -117,7 +103,7 @@ class Problem:
         self._free = None if free is None else free.to(operator.device, operator.dtype)
         root = math.sqrt(target.numbers)
         self._inverse = [(part.inverse_scale / root).to(operator.device, operator.dtype) for part in target.parts]
-        self.data = self._joined(
+        self.data = _concatenated(
             [inverse * part.of_field.to(inverse) for inverse, part in zip(self._inverse, target.parts, strict=True)]
         )
         self.bounds = None if bounds is None else (bounds[0] / self.scale, bounds[1] / self.scale)
@@ -125,24 +111,26 @@ class Problem:
     def forward(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, " n"]:
         """Return F x."""
         x = self.pin(x) * self.scale
-        return self._joined([a(x) * inverse for a, inverse in zip(self.operators, self._inverse, strict=True)])
+        return _concatenated([a(x) * inverse for a, inverse in zip(self.operators, self._inverse, strict=True)])
 
     def adjoint(self, y: Float[Tensor, " n"]) -> Float[Tensor, "z y x"]:
         """Return F^T y."""
-        parts = y.split([inverse.numel() for inverse in self._inverse])
-        total: Tensor | None = None
-        for operator, inverse, part in zip(self.operators, self._inverse, parts, strict=True):
-            own = operator.T(part.reshape(inverse.shape) * inverse)
-            total = own if total is None else total + own
-        assert total is not None
+        parts = zip(self.operators, self._inverse, y.split([inverse.numel() for inverse in self._inverse]), strict=True)
+        total = reduce(torch.add, (a.T(part.reshape(inverse.shape) * inverse) for a, inverse, part in parts))
         return self.pin(total * self.scale)
 
-    @staticmethod
-    def _joined(parts: list[Tensor]) -> Float[Tensor, " n"]:
-        return parts[0].reshape(-1) if len(parts) == 1 else torch.cat([part.reshape(-1) for part in parts])
+    def residual(self, x: Float[Tensor, "z y x"]) -> float:
+        """Return |F x - b|^2."""
+        return _square(self.data - self.forward(x))
+
+    def predict(self, part: Part, rays: Rays, x: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
+        """Return the projections of x along other rays of the technique of a part."""
+        parts = zip(self.operators, self.target.parts, strict=True)
+        operator = next(operator for operator, p in parts if p.model.name == part.model.name)
+        return operator.for_rays(rays, part.model)(x * self.scale)
 
     def pin(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """Return x with 0, the ambient index, where it is not free."""
+        """Return x with 0, the ambient index, in voxels that are not free."""
         return x if self._free is None else x * self._free
 
     def clip(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
@@ -151,12 +139,12 @@ class Problem:
 
     @cached_property
     def response(self) -> Float[Tensor, "z y k"]:
-        """The spectrum of F^T F, about (preconditioner.py)."""
+        """The approximate spectrum of F^T F."""
         free = None if self._free is None else self._free > 0
         return response(lambda x: self.adjoint(self.forward(x)), self.zero(), free)
 
     def random(self) -> Float[Tensor, "z y x"]:
-        """Return a random field, the same every time: where the power method starts."""
+        """Return a reproducible random field, the start of the power method."""
         x = torch.rand(self.operator.domain_shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         return self.pin(x.to(self.operator.device, self.operator.dtype))
 
@@ -168,11 +156,8 @@ class Problem:
 class Penalty:
     """A quadratic penalty R(x) = |L x|^2, a mean over voxels.
 
-    Parameters
-    ----------
-    problem : Problem
-    kind : "identity" (L = 1), "gradient" (L = edge grad) or "laplacian" (L = edge^2 div grad)
-    face_weights : for "gradient": weights of the squares at the faces along z, y, x; None for 1
+    L = 1 ("identity"), edge grad ("gradient") or edge^2 div grad ("laplacian"); the squares of the gradient may have
+    weights at the faces along z, y, x.
     """
 
     KINDS = ("identity", "gradient", "laplacian")
@@ -180,18 +165,21 @@ class Penalty:
     def __init__(self, problem: Problem, kind: str, face_weights: tuple[Tensor, Tensor, Tensor] | None = None) -> None:
         self.problem, self.kind = problem, kind
         self.root = 1 / math.sqrt(problem.voxels)
-        self.roots = None if face_weights is None else tuple(w.sqrt() for w in face_weights)
+        self.mean_weight, self.factors = 1.0, tuple[float | Tensor, ...]([self.root] * 3)
+        if face_weights is not None:
+            roots = [w.sqrt() for w in face_weights]
+            self.mean_weight = float(torch.stack([r.square().mean() for r in roots]).mean())
+            self.factors = tuple(r * self.root for r in roots)
 
     @cached_property
     def spectrum(self) -> Float[Tensor, "z y k"]:
-        """The spectrum of L^T L; of the mean of weights that differ from face to face."""
-        of = spectrum_of_differences(self.problem.zero(), self.problem.differences.inverse)
+        """The spectrum of L^T L; for face weights, that of their mean."""
+        spectrum = spectrum_of_differences(self.problem.zero(), self.problem.differences.inverse)
         if self.kind == "identity":
-            return torch.ones_like(of) * self.root**2
+            return torch.ones_like(spectrum) * self.root**2
         if self.kind == "laplacian":
-            return (of * self.root) ** 2
-        mean = 1.0 if self.roots is None else float(torch.stack([r.square().mean() for r in self.roots]).mean())
-        return mean * of * self.root**2
+            return (spectrum * self.root) ** 2
+        return self.mean_weight * spectrum * self.root**2
 
     def __call__(self, x: Float[Tensor, "z y x"]) -> tuple[Tensor, ...]:
         """Return L x."""
@@ -200,9 +188,7 @@ class Penalty:
         along = self.problem.differences(x)
         if self.kind == "laplacian":
             return (self.problem.differences.adjoint(along) * self.root,)
-        if self.roots is None:
-            return tuple(a * self.root for a in along)
-        return tuple(a * (w * self.root) for a, w in zip(along, self.roots, strict=True))
+        return tuple(a * factor for a, factor in zip(along, self.factors, strict=True))
 
     def adjoint(self, y: tuple[Tensor, ...]) -> Float[Tensor, "z y x"]:
         """Return L^T y."""
@@ -210,47 +196,41 @@ class Penalty:
             return y[0] * self.root
         if self.kind == "laplacian":
             return self.problem.differences.adjoint(self.problem.differences(y[0] * self.root))
-        if self.roots is None:
-            y = tuple(a * self.root for a in y)
-        else:
-            y = tuple(a * (w * self.root) for a, w in zip(y, self.roots, strict=True))
-        return self.problem.differences.adjoint((y[0], y[1], y[2]))
+        along = tuple(a * factor for a, factor in zip(y, self.factors, strict=True))
+        return self.problem.differences.adjoint((along[0], along[1], along[2]))
 
 
 def minimise(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
     """Minimise |F x - b|^2 + weight |L x|^2 within the bounds, without end; no iterate is worse than the one before.
 
-    A round takes conjugate gradients with the voxels at their bounds held, brings what passes a bound back to it, and
-    ends after ROUND iterations or where that makes the objective rise; a first step that does is halved until it falls.
+    Each round runs conjugate gradients with the voxels at their bounds fixed and projects the result onto the bounds.
+    It ends after ROUND_ITERATIONS, or when the projection raises the objective; if the first step does, it is halved
+    until the objective falls.
 
-    Source: More & Toraldo, SIAM J. Optim. 1 (1991) 93, with a search along the path in place of one along a line.
+    Source: More & Toraldo, SIAM J. Optim. 1 (1991) 93, with a search along the path instead of one along a line.
     """
     x = problem.clip(x)
     if problem.bounds is None:
         yield from conjugate_gradients(problem, penalty, weight, x)
-    best = _within(problem, penalty, x)
+    best = _iterate_at(problem, penalty, x)
     while True:
-        begun = best
-        for _, beyond in zip(range(ROUND), conjugate_gradients(problem, penalty, weight, best.x), strict=False):
-            there = problem.clip(beyond.x)
-            found = beyond if torch.equal(there, beyond.x) else _within(problem, penalty, there)
-            if found.objective(weight) >= best.objective(weight):
+        start = best
+        solver = conjugate_gradients(problem, penalty, weight, best.x)
+        for _, unbounded in zip(range(ROUND_ITERATIONS), solver, strict=False):
+            x = problem.clip(unbounded.x)
+            iterate = unbounded if torch.equal(x, unbounded.x) else _iterate_at(problem, penalty, x)
+            if iterate.objective(weight) >= best.objective(weight):
                 break
-            best = found
+            best = iterate
             yield best
-        step, halvings = beyond.x - begun.x, 0
-        while best is begun:
+        step, halvings = unbounded.x - start.x, 0
+        while best is start:
             step, halvings = step / 2, halvings + 1
-            found = _within(problem, penalty, problem.clip(begun.x + step))
-            if found.objective(weight) < begun.objective(weight):
-                best = found
-            if best is found or halvings > HALVINGS:  # there is but rounding left
+            iterate = _iterate_at(problem, penalty, problem.clip(start.x + step))
+            if iterate.objective(weight) < start.objective(weight):
+                best = iterate
+            if best is iterate or halvings > MAX_HALVINGS:
                 yield best
-
-
-def _within(problem: Problem, penalty: Penalty, x: Tensor) -> Iterate:
-    """The iterate at x."""
-    return Iterate(x, _square(problem.data - problem.forward(x)), sum(_square(a) for a in penalty(x)))
 
 
 def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
@@ -259,10 +239,10 @@ def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Te
         alpha = s.z / (|F p|^2 + weight |L p|^2),         x <- x + alpha p,    r <- r - alpha F p
         s = F^T r - weight L^T L x,    z = M^-1 s,        p <- z + (s.z / s_last.z_last) p
 
-    Where bounds are given, voxels at a bound towards which the objective falls are held there; the others may pass
-    theirs.
-
-    M is that of preconditioner.py.
+    Voxels at a bound towards which the objective falls are fixed; the others are not clipped. M = S + weight T is the
+    preconditioner, with T the spectrum of L^T L and S that of F^T F, which is nearly a convolution. It finds early the
+    components that few views leave nearly undetermined: S is small for waves whose wave vector lies in none of the
+    image planes, so it must not be averaged over directions.
 
     Source: Bjorck, Numerical Methods for Least Squares Problems (SIAM, 1996), Sec. 7.4; with circulant M: Chan & Ng,
     SIAM Review 38 (1996) 427.
@@ -270,29 +250,67 @@ def conjugate_gradients(problem: Problem, penalty: Penalty, weight: float, x: Te
     r = problem.data - problem.forward(x)
     q = tuple(-a for a in penalty(x))
     s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q))
-    hold = torch.ones_like(x)
+    movable = torch.ones_like(x)
     if problem.bounds is not None:
         low, high = problem.bounds
-        hold = (~((x <= low) & (s < 0)) & ~((x >= high) & (s > 0))).to(x)
-    s = s * hold
+        movable = (~((x <= low) & (s < 0)) & ~((x >= high) & (s > 0))).to(x)
+    s = s * movable
     spectrum = problem.response + weight * penalty.spectrum
-    p = problem.pin(filtered(s, spectrum)) * hold
+    p = problem.pin(filtered(s, spectrum)) * movable
     gamma = float((s * p).sum())
-    done = gamma * (100 * torch.finfo(x.dtype).eps) ** 2  # from here on there is but rounding to follow
+    rounding = gamma * (100 * torch.finfo(x.dtype).eps) ** 2
     while True:
-        if gamma > done:
+        if gamma > rounding:
             fp, lp = problem.forward(p), penalty(p)
             alpha = gamma / (_square(fp) + weight * sum(_square(a) for a in lp))
             x = x + alpha * p
             r = r - alpha * fp
             q = tuple(a - alpha * b for a, b in zip(q, lp, strict=True))
         yield Iterate(x, _square(r), sum(_square(a) for a in q))
-        if gamma > done:
-            s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q)) * hold
-            z = problem.pin(filtered(s, spectrum)) * hold
+        if gamma > rounding:
+            s = problem.pin(problem.adjoint(r) + weight * penalty.adjoint(q)) * movable
+            z = problem.pin(filtered(s, spectrum)) * movable
             last, gamma = gamma, float((s * z).sum())
             p = z + (gamma / last) * p
 
 
+def _iterate_at(problem: Problem, penalty: Penalty, x: Tensor) -> Iterate:
+    return Iterate(x, problem.residual(x), sum(_square(a) for a in penalty(x)))
+
+
 def _square(x: Tensor) -> float:
     return float(x.square().sum())
+
+
+def _concatenated(parts: list[Tensor]) -> Float[Tensor, " n"]:
+    return parts[0].reshape(-1) if len(parts) == 1 else torch.cat([part.reshape(-1) for part in parts])
+
+
+def response(
+    normal: Callable[[Tensor], Tensor], empty: Float[Tensor, "z y x"], free: Bool[Tensor, "z y x"] | None
+) -> Float[Tensor, "z y k"]:
+    """Return S, from the response of F^T F (`normal`) to the free voxel nearest to the middle."""
+    lines = [torch.arange(n, device=empty.device) - n // 2 for n in empty.shape]
+    distance = sum(a**2 for a in torch.meshgrid(*lines, indexing="ij"))
+    assert isinstance(distance, Tensor)
+    if free is not None:
+        distance = torch.where(free.to(distance.device), distance, distance.max() + 1)
+    at = torch.unravel_index(distance.argmin(), empty.shape)
+    point = empty.clone()
+    point[at] = 1
+    spectrum = torch.fft.rfftn(normal(point).roll([-int(i) for i in at], (0, 1, 2))).real
+    largest = float(spectrum.max())
+    return spectrum.clamp_min(MIN_RESPONSE * largest) if largest > 0 else torch.ones_like(spectrum)
+
+
+def spectrum_of_differences(x: Float[Tensor, "z y x"], inverse: Sequence[float]) -> Float[Tensor, "z y k"]:
+    """Return the spectrum of squared differences between neighbours of x, sum_axis (2 - 2 cos k) inverse^2."""
+    last = torch.fft.rfftfreq(x.shape[2], dtype=torch.float64)
+    waves = [*(torch.fft.fftfreq(n, dtype=torch.float64) for n in x.shape[:2]), last]
+    along = [i**2 * (2 - 2 * torch.cos(2 * math.pi * k)) for i, k in zip(inverse, waves, strict=True)]
+    return (along[0][:, None, None] + along[1][:, None] + along[2]).to(x)
+
+
+def filtered(x: Float[Tensor, "z y x"], spectrum: Float[Tensor, "z y k"]) -> Float[Tensor, "z y x"]:
+    """Return x with its spectrum divided by another."""
+    return torch.fft.irfftn(torch.fft.rfftn(x) / spectrum, s=x.shape)

@@ -1,6 +1,6 @@
-"""The settings that the classical methods share; a method is a generator of iterates (tikhonov.py, landweber.py, ...).
+"""Settings of the voxel methods; each method is a generator of iterates (tikhonov.py, landweber.py, ...).
 
-The way from coarse to fine, and the loop that watches over the iterations, are in descent.py.
+descent.py has the loop over grids and iterations.
 """
 
 from __future__ import annotations
@@ -9,96 +9,85 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Lt
 from torch import Tensor
 
-from nerif.common.conventions import InputError
+from nerif.common.settings import Count, NonNegative
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.fields.grid import DEGREES
 from nerif.forward.registry import AUTO, check_model
 from nerif.geometry import Grid
 from nerif.reconstruction.base import OnStep, Reconstruction, State
-from nerif.reconstruction.shared_settings import SharedSettings
-from nerif.reconstruction.sources import check_source
+from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 from nerif.reconstruction.voxels import kernels_torch
 from nerif.reconstruction.voxels.descent import Descent
-from nerif.reconstruction.voxels.levels import bins_at_last
+from nerif.reconstruction.voxels.levels import FINE_BIN, bins_of
 from nerif.reconstruction.voxels.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 
-VOLUMES = 22  # arrays the size of the grid that the hungriest method holds at once (tests/reconstruction)
-FIRST, COARSEST = 0.2, 8  # of a first run of two: the share of the time limit, and the fewest voxels
-DATA = 8  # arrays the size of the data
-COMPILER_BYTES = 1 << 28  # of Numba, whatever the grid (benchmarks/results/voxel-cost-cpu.md)
+VOLUME_ARRAYS = 22  # arrays of the size of the grid held by the most demanding method (tests/reconstruction)
+DATA_ARRAYS = 8  # arrays of the size of the data
+COMPILER_BYTES = 1 << 28  # of Numba, for any grid (benchmarks/results/voxel-cost-cpu.md)
+MIN_VOXELS = 8  # along the longest edge in the cross-validation run
 
 
 @dataclass(frozen=True)
 class VoxelReconstructor(SharedSettings):
-    """Settings of every classical method."""
+    """Settings of every voxel method."""
 
-    voxels: int = 64
-    """Voxels along the longest edge of the box, of the reconstruction and of the written volume."""
+    voxels: Count = 64
+    """Voxels along the longest edge of the box, in the reconstruction and in the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
-    """Between voxel centres: cubic B-splines, or trilinear (less accurate, little faster)."""
+    """Interpolation between voxel centres: cubic B-splines, or trilinear (less accurate, slightly faster)."""
     model: str = AUTO
-    """Forward model, a linear one: of displacements lever_arm (auto) or paraxial."""
-    source: str = "auto"
-    """What to go by (also --from): displacements, images (each pixel, linear around the displacements), both, or
-    auto: displacements where there are some."""
+    """Linear forward model of displacements: lever_arm (auto) or paraxial."""
+    source: Source = "auto"
+    """Data to fit (also --from): displacements, images (pixel by pixel, linearised about the displacements), both, or
+    auto (displacements where available)."""
     step: float | None = None
-    """Longest distance between the planes on which rays are sampled, in voxels: at most, and by default, 1 (cubic) or
-    0.5 (linear)."""
+    """Largest distance between sampling planes along a ray, in voxels (default: 1 for cubic, 0.5 for linear)."""
     coarse_to_fine: bool = True
-    """Start on a coarse grid and halve the voxels from solution to solution."""
-    tolerance: float = 1e-4
-    """Converged when the objective falls by less than this share an iteration, on the mean of a few."""
+    """Start on a coarse grid and halve the voxel size from solution to solution."""
+    tolerance: NonNegative = 1e-4
+    """Convergence criterion: relative decrease of the objective per iteration, averaged over several."""
     hull: bool = True
-    """Pin voxels outside the visual hull to the ambient index, where the measurement has flow masks."""
+    """Fix voxels outside the visual hull of the flow masks at the ambient index."""
     precision: Literal["float32", "float64"] = "float32"
-    """Of voxels and data."""
-    iterations: int = 50
-    """Most iterations on each grid and with each weight."""
+    """Floating-point precision of voxels and data."""
+    iterations: Count = 50
+    """Maximum number of iterations per grid and regularisation weight."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, allowed in (("basis", tuple(DEGREES)), ("precision", ("float32", "float64"))):
-            if getattr(self, name) not in allowed:
-                raise InputError(f"expected one of {', '.join(allowed)}, got '{getattr(self, name)}'", field=name)
-        for name in ("voxels", "iterations"):
-            if getattr(self, name) < 1:
-                raise InputError(f"expected at least 1, got {getattr(self, name)}", field=name)
         if self.step is not None:
             check_step(self.step, self.basis)
-        if not self.tolerance >= 0:
-            raise InputError(f"expected 0 or more, got {self.tolerance}", field="tolerance")
         check_model(self.model)
-        check_source(self.source)
 
     def in_two(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
-        voxels = max(min(COARSEST, self.voxels), self.voxels // 2)
-        return replace(self, voxels=voxels, time_limit=FIRST * self.time_limit), self
+        voxels = max(min(MIN_VOXELS, self.voxels), self.voxels // 2)
+        return replace(self, voxels=voxels, time_limit=SHORT_RUN * self.time_limit), self
 
     @property
     def weight(self) -> float | None:
-        """Weight of the penalty, or None where it is to be chosen."""
+        """Regularisation weight; None: to be determined."""
         return 0.0
 
     @property
     def patience(self) -> int:
-        """Iterations over which the fall of the objective is averaged."""
+        """Iterations over which the decrease of the objective is averaged."""
         return 3
 
     @abstractmethod
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
-        """Yield one iterate after another, from x, without end."""
+        """Yield iterates from x on, without end."""
 
     def begin(self, problem: Problem, x: Tensor) -> Tensor:
-        """Return what to iterate from, given a field to start from: that field within the bounds."""
+        """Return the first iterate of an initial field: the field clipped to its bounds."""
         return problem.clip(x)
 
     @property
@@ -107,22 +96,22 @@ class VoxelReconstructor(SharedSettings):
         return 4 if self.precision == "float32" else 8
 
     def operator_bytes(self, measurement: Measurement, grid: Grid) -> int:
-        """Return what the operators of all techniques hold."""
-        dtype, each = getattr(torch, self.precision), _lens_rays(measurement, grid)
+        """Return the memory of the operators of all techniques."""
+        dtype, per_pixel = getattr(torch, self.precision), _lens_rays(measurement, grid)
         return sum(
-            VoxelOperator.memory_bytes(each * rays, grid, self.basis, dtype, channels, self.step)
-            for rays, channels in _seen(measurement, grid)
+            VoxelOperator.memory_bytes(per_pixel * rays, grid, self.basis, dtype, channels, self.step)
+            for rays, channels in _ray_counts(measurement, grid)
         )
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
-        """Return what a run will need at most, beside what the process holds already."""
-        seen = _seen(measurement, grid)
-        rays, numbers = sum(n for n, _ in seen), sum(n * channels for n, channels in seen)
-        volumes, data = VOLUMES * math.prod(grid.shape) * self.itemsize, DATA * numbers * self.itemsize
-        each = _lens_rays(measurement, grid)
-        preparing = 40 * 8 * rays * each  # rays in double precision, while the operator is made
-        around = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
-        return self.operator_bytes(measurement, grid) + volumes + data + preparing + around
+        """Return the peak memory of a run, in addition to that of the process."""
+        counts = _ray_counts(measurement, grid)
+        rays, numbers = sum(n for n, _ in counts), sum(n * channels for n, channels in counts)
+        volumes, data = VOLUME_ARRAYS * math.prod(grid.shape) * self.itemsize, DATA_ARRAYS * numbers * self.itemsize
+        per_pixel = _lens_rays(measurement, grid)
+        preparing = 40 * 8 * rays * per_pixel  # rays in double precision, while the operator is set up
+        overhead = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
+        return self.operator_bytes(measurement, grid) + volumes + data + preparing + overhead
 
     def __call__(
         self,
@@ -136,39 +125,30 @@ class VoxelReconstructor(SharedSettings):
 
 @dataclass(frozen=True)
 class WeightedVoxelReconstructor(VoxelReconstructor):
-    """Settings of a method with a penalty."""
+    """Settings of the methods with a penalty."""
 
-    regularisation: Literal["auto"] | float = "auto"
-    """Weight of the penalty, or auto: by the discrepancy principle where sigma is known, else by the L-curve."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.regularisation != "auto" and not (
-            isinstance(self.regularisation, int | float) and 0 <= self.regularisation < math.inf
-        ):
-            raise InputError(
-                f"expected auto or a weight of 0 or more, got {self.regularisation}", field="regularisation"
-            )
+    regularisation: Literal["auto"] | Annotated[float, Ge(0), Lt(math.inf)] = "auto"
+    """Regularisation weight, or auto (discrepancy principle where sigma is known, else L-curve)."""
 
     @property
     def weight(self) -> float | None:
         return None if self.regularisation == "auto" else float(self.regularisation)
 
 
-def _seen(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
-    """Rays, those of bins, and channels of each technique."""
-    pixels, seen = bins_at_last(measurement, grid) ** 2, []
+def _ray_counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
+    """Return the numbers of rays, of bins where pixels are averaged, and of channels of each technique."""
+    pixels, counts = bins_of(measurement, grid, FINE_BIN) ** 2, []
     for o in measurement.observations:
-        count = int(measurement.usable_for(o).sum()) // (pixels if o.technique.averaged else 1)
-        seen.append((count + 1, len(o.technique.channels)))
-    return seen
+        rays = int(measurement.usable_for(o).sum()) // (pixels if o.technique.averaged else 1)
+        counts.append((rays + 1, len(o.technique.channels)))
+    return counts
 
 
 def _lens_rays(measurement: Measurement, grid: Grid) -> int:
-    """The most rays that a pixel has, as some pixels of each image tell."""
+    """Return the largest number of rays per pixel, from a lattice of pixels of each image."""
     most = 1
     for camera in measurement.cameras:
-        some = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
-        rays = camera.rays(torch.cartesian_prod(*some).reshape(-1, 2)).clip(measurement.box)
+        lattice = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
+        rays = camera.rays(torch.cartesian_prod(*lattice).reshape(-1, 2)).clip(measurement.box)
         most = max(most, rays_through(rays, min(grid.spacing)))
     return most

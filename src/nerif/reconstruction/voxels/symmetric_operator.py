@@ -1,11 +1,11 @@
-"""The linear map from a spline of (r, h) to what rays see of its symmetric field, and the adjoint."""
+"""The forward projector of a symmetric field, a spline of (r, h), and its adjoint."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import ModuleType
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,36 +16,31 @@ from nerif.forward.base import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.device import share_threads
-from nerif.reconstruction.voxels.operator import VoxelOperator, made_of
-from nerif.reconstruction.voxels.planes import is_even, tabulated
+from nerif.reconstruction.voxels.operator import VoxelOperator, apply_rows
+from nerif.reconstruction.voxels.planes import profiles
 
-__all__ = ["SymmetricOperator", "seen_of"]
+__all__ = ["SymmetricOperator", "project_spline"]
 
-SAMPLES = 2  # in a voxel, at least
+SAMPLES_PER_VOXEL = 2
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Rays as they run through (r, h), and what is made of their integrals; for the kernels."""
+    """Rays in (r, h) as kernels_symmetric.py takes them, and the matrices applied to their integrals."""
 
     index: Tensor
-    path: tuple[np.ndarray, ...]
-    plane: np.ndarray
-    gradient: Float[Tensor, "n c 3"] | None
-    value: Float[Tensor, "n c 1"] | None
+    path: tuple[Tensor, ...]
+    plane: Tensor
+    matrices: list[Tensor]
 
 
 class SymmetricOperator(VoxelOperator):
-    """What rays see of a field with a symmetry by a linear forward model; c are coefficients (h, k, r) of its splines.
+    """The projections of a symmetric field by a linear forward model; c are coefficients (h, k, r) of its splines.
 
         (A c)_p = sum_m w_pm [A_p f(x_pm) + B_p grad f(x_pm)],    f(x) = sum_k D_k(x) sum_ij c_jki b_i(r) b_j(h)
 
-    Samples are evenly spaced along each ray, two or more in a voxel. It runs on the CPU.
-
-    Parameters
-    ----------
-    symmetry : Symmetry, mm
-    rays, grid, model, basis, boundary, step, dtype : as of a VoxelOperator; the grid is of (r, k, h)
+    Samples are evenly spaced along each ray, at least two in a voxel. It runs on the CPU. The grid is that of
+    (r, k, h); other parameters are those of VoxelOperator.
     """
 
     padded_axes = (0, 2)
@@ -58,88 +53,75 @@ class SymmetricOperator(VoxelOperator):
         super().__init__(rays, grid, model, basis, boundary, step, "cpu", dtype)
 
     def for_rays(self, rays: Rays, model: ForwardModel) -> SymmetricOperator:
-        return SymmetricOperator(
-            self.symmetry, rays, self.grid, model, self.basis, self.boundary, self.step, self.dtype
-        )
+        settings = self.basis, self.boundary, self.step, self.dtype
+        return SymmetricOperator(self.symmetry, rays, self.grid, model, *settings)
 
     @property
     def samples(self) -> int:
         return int(self.curves.path[3].sum())
 
-    def _follow(self, rays: Rays, model: ForwardModel) -> None:
+    def _place_samples(self, rays: Rays, model: ForwardModel) -> None:
         index = rays.crosses.nonzero()[:, 0]
         rays = rays[index].to("cpu", torch.float64)
         hx, _, hz = self.grid.spacing
         length = rays.far - rays.near
-        count = (length * SAMPLES / (self.step * min(hx, hz))).ceil().clamp(min=1)
+        count = (length * SAMPLES_PER_VOXEL / (self.step * min(hx, hz))).ceil().clamp(min=1)
         apart = length / count
         first = rays.near + 0.5 * apart
-        at = torch.stack([first, first + (count - 1) * apart], dim=1)
-        weights = model.weights(rays, at, apart[:, None].expand_as(at))
-        begin, final = weights.profile.unbind(1)
-        profile = torch.stack([begin, (final - begin) / (count - 1).clamp(min=1)], dim=1)
-        if not is_even(model, rays, first, apart, count - 1):
-            profile = tabulated(model, rays, first, apart, int(count.max()))
+        weights, profile = profiles(model, rays, first, apart, count - 1)
         symmetry, frame = self.symmetry, self.symmetry.matrix
         start = symmetry.local(rays.origin + first[:, None] * rays.direction)
         stride = rays.direction @ frame.T * apart[:, None]
-        path = tuple(a.contiguous().numpy() for a in (start, stride, profile, count.to(torch.int32)))
+        path = tuple(a.contiguous() for a in (start, stride, profile, count.to(torch.int32)))
         box, (nz, _, nx) = self.grid.box, self.grid.shape
         rounding = symmetry.rounding if symmetry.axial else -1.0
-        plane = np.array([box.lower[0], box.lower[2], hx, hz, nx, nz, rounding, self.layers])
-        gradient = None if weights.slope is None else (weights.slope @ frame.T).to(self.dtype)
-        value = None if weights.value is None else weights.value[..., None].to(self.dtype)
-        self.curves = Curves(index.cpu(), path, plane, gradient, value)
+        numbers = [box.lower[0], box.lower[2], hx, hz, nx, nz, rounding, self.layers]
+        matrices = [] if weights.slope is None else [(weights.slope @ frame.T).to(self.dtype)]
+        matrices += [] if weights.value is None else [weights.value[..., None].to(self.dtype)]
+        self.curves = Curves(index.cpu(), path, torch.tensor(numbers, dtype=torch.float64), matrices)
 
-    def _integrate(self, padded: Float[Tensor, "zp k xp"], seen: Float[Tensor, "m c"]) -> None:
+    def _integrate(self, padded: Float[Tensor, "zp k xp"], result: Float[Tensor, "m c"]) -> None:
+        kernels, curves, values = self._kernels(), self.curves, padded.double().contiguous()
+        for matrix in curves.matrices:
+            integrals = kernels.integrate(self.degree, values, curves.path, curves.plane, matrix.shape[2] == 3)
+            result[curves.index] += apply_rows(matrix, integrals)
+
+    def _spread(self, projections: Float[Tensor, "m c"], padded: Float[Tensor, "zp k xp"]) -> None:
+        kernels, curves = self._kernels(), self.curves
+        for matrix in curves.matrices:
+            q = torch.einsum("nij,ni->nj", matrix, projections[curves.index]).double().contiguous()
+            groups = kernels.spread(self.degree, q, curves.path, curves.plane, padded.shape)
+            padded += torch.from_numpy(groups.numpy().sum(axis=0)).to(padded)  # NumPy's order of summation
+
+    def _kernels(self) -> ModuleType:
         from nerif.reconstruction.voxels import kernels_symmetric
 
         share_threads()
-        curves, array = self.curves, padded.double().contiguous().numpy()
-        for matrix in (curves.gradient, curves.value):
-            if matrix is not None:
-                found = kernels_symmetric.integrate(self.degree, array, curves.path, curves.plane, matrix.shape[2] == 3)
-                seen[curves.index] += made_of(matrix, torch.from_numpy(found))
-
-    def _spread(self, seen: Float[Tensor, "m c"], padded: Float[Tensor, "zp k xp"]) -> None:
-        from nerif.reconstruction.voxels import kernels_symmetric
-
-        share_threads()
-        curves = self.curves
-        for matrix in (curves.gradient, curves.value):
-            if matrix is not None:
-                q = torch.einsum("nij,ni->nj", matrix, seen[curves.index]).double().contiguous().numpy()
-                found = kernels_symmetric.spread(self.degree, q, curves.path, curves.plane, padded.shape)
-                padded += torch.from_numpy(found.sum(axis=0)).to(padded)
+        return kernels_symmetric
 
     def matrix(self) -> Float[Tensor, "n c m"]:
-        """Return the operator as numbers, (ray, channel, coefficient), of grids that are small."""
-        from nerif.reconstruction.voxels import kernels_symmetric
-
-        share_threads()
-        curves, rays, channels = self.curves, len(self.curves.index), self.range_shape[1]
-        shape = [n + 2 * self.layers * (axis in self.padded_axes) for axis, n in enumerate(self.domain_shape)]
-        whole = self._of_rays(None).shape[0]
-        rows = torch.zeros(whole, channels, math.prod(self.domain_shape), dtype=self.dtype)
-        for matrix in (curves.gradient, curves.value):
-            for c in range(channels if matrix is not None else 0):
-                assert matrix is not None
-                q = matrix[:, c].double().contiguous().numpy()
-                found = kernels_symmetric.spread(self.degree, q, curves.path, curves.plane, shape, rays)
-                for i, own in zip(curves.index.tolist(), torch.from_numpy(found), strict=True):
-                    rows[i, c] += self.boundary.fold(own, self.layers, self.padded_axes).flatten().to(self.dtype)
+        """Return the operator as a matrix (ray, channel, coefficient), for small grids."""
+        kernels, curves, channels = self._kernels(), self.curves, self.range_shape[1]
+        rays = self.range_shape[0] if self.shares is None else self.shares.numel()
+        rows = torch.zeros(rays, channels, math.prod(self.domain_shape), dtype=self.dtype)
+        for matrix in curves.matrices:
+            for c in range(channels):
+                q = matrix[:, c].double().contiguous()
+                each = kernels.spread(self.degree, q, curves.path, curves.plane, self.padded_shape, len(curves.index))
+                for i, padded in zip(curves.index.tolist(), each, strict=True):
+                    rows[i, c] += self.boundary.fold(padded, self.layers, self.padded_axes).flatten().to(self.dtype)
         if self.shares is None:
             return rows
         return (rows.reshape(*self.shares.shape[:2], channels, -1) * self.shares[..., None]).sum(dim=1)
 
 
-def seen_of(
+def project_spline(
     field: VoxelField | SymmetricVoxels, rays: Rays, model: ForwardModel, step: float | None = None,
     device: torch.device | str = "cpu",
 ) -> Float[Tensor, "n c"]:  # fmt: skip
-    """Return what rays that are clipped to the box see of splines, by the operator that goes with them."""
+    """Return the projections of a spline along rays that are clipped to the box."""
     degree = field.degree if isinstance(field, VoxelField) else field.parts[0].degree
     basis = next(name for name, d in DEGREES.items() if d == degree)
     if isinstance(field, VoxelField):
-        return VoxelOperator(rays, field.grid, model, basis, step=step, device=device).through(field.coefficients)
-    return SymmetricOperator(field.symmetry, rays, field.grid, model, basis, step=step).through(field.padded)
+        return VoxelOperator(rays, field.grid, model, basis, step=step, device=device).of_padded(field.coefficients)
+    return SymmetricOperator(field.symmetry, rays, field.grid, model, basis, step=step).of_padded(field.padded)

@@ -1,4 +1,4 @@
-"""Tikhonov regularisation: the smoothest field, or the smallest, that fits the data as well as it should.
+"""Tikhonov regularisation: the smoothest, or smallest, field that fits the data to within the noise.
 
 min_x  |F x - b|^2 + weight |L x|^2,      L = 1, edge grad, or edge^2 div grad
 """
@@ -26,7 +26,7 @@ class Tikhonov(WeightedVoxelReconstructor):
     """
 
     penalty: Literal["identity", "gradient", "laplacian"] = "gradient"
-    """What is kept small: the field, its gradient, or its Laplacian."""
+    """Quantity that is penalised: the field, its gradient, or its Laplacian."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

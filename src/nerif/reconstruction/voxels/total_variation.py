@@ -1,4 +1,4 @@
-"""Total variation: the field of least summed gradient that fits; smooth regions stay smooth, fronts stay sharp.
+"""Total variation: smooth regions stay smooth and fronts stay sharp.
 
 min_x  |F x - b|^2 + weight mean sqrt(|edge grad x|^2 + softness^2)
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from jaxtyping import Float
@@ -23,9 +24,8 @@ __all__ = ["TotalVariation", "at_faces", "gradient_square"]
 class TotalVariation(WeightedVoxelReconstructor):
     """Voxels with an isotropic total-variation penalty, by iteratively reweighted least squares.
 
-    Each round weights the squared gradient by 1 / |grad x| of the round before and takes a few conjugate-gradient
-    iterations. A primal-dual method (Chambolle & Pock) was tried beside it and came down more slowly
-    (docs/decisions/011).
+    Each round weights the squared gradient by 1 / |grad x| of the round before and takes a few iterations of conjugate
+    gradients (docs/decisions/011).
 
     Source: Rudin, Osher & Fatemi, Physica D 60 (1992); Rodriguez & Wohlberg, IEEE Trans. Image Process. 18 (2009).
     """
@@ -35,7 +35,7 @@ class TotalVariation(WeightedVoxelReconstructor):
     round: int = 10
     """Conjugate-gradient iterations between new weights."""
     iterations: int = 60
-    """Most iterations on each grid and with each weight."""
+    """Maximum iterations on each grid and with each weight."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -52,27 +52,26 @@ class TotalVariation(WeightedVoxelReconstructor):
         x = problem.clip(x)
         while True:
             # sqrt(g^2 + e^2) <= (g^2 + e^2) / (2 m) + m / 2 with equality at m = sqrt(g^2 + e^2) of this round
-            magnitude = (gradient_square(problem.differences(x)) + self.softness**2).sqrt()
-            penalty = Penalty(problem, "gradient", at_faces(0.5 / magnitude))
+            penalty = Penalty(problem, "gradient", at_faces(0.5 / self._magnitude(problem, x)))
             for _, iterate in zip(range(self.round), minimise(problem, penalty, weight, x), strict=False):
                 x = iterate.x
-                magnitude = (gradient_square(problem.differences(x)) + self.softness**2).sqrt()
-                yield Iterate(x, iterate.residual, float(magnitude.mean()))
+                yield Iterate(x, iterate.residual, float(self._magnitude(problem, x).mean()))
+
+    def _magnitude(self, problem: Problem, x: Tensor) -> Float[Tensor, "z y x"]:
+        return (gradient_square(problem.differences(x)) + self.softness**2).sqrt()
 
 
 def gradient_square(along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y x"]:
     """|grad|^2 at voxel centres: the mean of the squares at the two faces, summed over the axes."""
-    total = None
+    means = []
     for axis, difference in enumerate(along):
         square, n = difference.square(), difference.shape[axis] - 1
-        mean = 0.5 * (square.narrow(axis, 0, n) + square.narrow(axis, 1, n))
-        total = mean if total is None else total + mean
-    assert total is not None
-    return total
+        means.append(0.5 * (square.narrow(axis, 0, n) + square.narrow(axis, 1, n)))
+    return reduce(torch.add, means)
 
 
 def at_faces(weight: Float[Tensor, "z y x"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights of the squares at the faces that make sum_voxels weight |grad|^2 = sum_faces weight difference^2."""
+    """Weights of the squares at the faces such that sum_voxels weight |grad|^2 = sum_faces weight difference^2."""
     faces = []
     for axis in range(3):
         edge = torch.zeros_like(weight.narrow(axis, 0, 1))

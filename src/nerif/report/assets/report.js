@@ -1,5 +1,5 @@
 "use strict";
-// Puts the page together: reads the packed arrays, and keeps switches, slices, colour bar and the 3-D view in step.
+// The page: unpacks the arrays, and updates slices, colour bar and the 3-D view by the switches.
 
 const MASKED = 65535;
 
@@ -26,12 +26,12 @@ function quantityOf(relation, x) {
   return q;
 }
 
-// between the lowest and the highest thousandth of the voxels: a few outliers must not take all the colours
+// the 0.1 and 99.9 % quantiles: a few outliers must not take all the colours
 function limits(values, low, high) {
   const bins = new Uint32Array(4096), scale = 4095 / (high - low || 1);
-  let known = 0;
-  for (let i = 0; i < values.length; i++) if (!Number.isNaN(values[i])) { bins[Math.floor((values[i] - low) * scale)]++; known++; }
-  const edge = known / 1000;
+  let count = 0;
+  for (let i = 0; i < values.length; i++) if (!Number.isNaN(values[i])) { bins[Math.floor((values[i] - low) * scale)]++; count++; }
+  const edge = count / 1000;
   let first = 0, last = 4095;
   for (let sum = bins[0]; sum < edge && first < 4095; sum += bins[++first]);
   for (let sum = bins[4095]; sum < edge && last > 0; sum += bins[--last]);
@@ -56,17 +56,16 @@ async function main() {
   const switches = { quantity: Object.keys(scene.quantities)[0], variant: "value" };
   const cache = {};
 
-  function display(wanted) {
-    const chosen = wanted || switches;
-    const key = chosen.quantity + " " + chosen.variant;
+  function display(choice = switches) {
+    const key = choice.quantity + " " + choice.variant;
     if (cache[key]) return cache[key];
-    const q = scene.quantities[chosen.quantity], r = q.relation, v = arrays.value, e = arrays.error;
+    const q = scene.quantities[choice.quantity], r = q.relation, v = arrays.value, e = arrays.error;
     const values = new Float32Array(count);
-    const own = arrays[chosen.quantity + "_" + chosen.variant];  // no linear function of the excess, or masked somewhere
-    if (own) values.set(own);
-    else if (chosen.variant === "std") for (let i = 0; i < count; i++) values[i] = arrays.std[i] * r.factor;
-    else if (chosen.variant === "truth") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i] - e[i]);
-    else if (chosen.variant === "error") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i]) - quantityOf(r, v[i] - e[i]);
+    const packed = arrays[choice.quantity + "_" + choice.variant];  // not a linear function of the excess, or masked
+    if (packed) values.set(packed);
+    else if (choice.variant === "std") for (let i = 0; i < count; i++) values[i] = arrays.std[i] * r.factor;
+    else if (choice.variant === "truth") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i] - e[i]);
+    else if (choice.variant === "error") for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i]) - quantityOf(r, v[i] - e[i]);
     else for (let i = 0; i < count; i++) values[i] = quantityOf(r, v[i]);
     let low = Infinity, high = -Infinity;
     for (let i = 0; i < count; i++) { if (values[i] < low) low = values[i]; if (values[i] > high) high = values[i]; }
@@ -75,16 +74,16 @@ async function main() {
     if (q.range) [low, high] = q.range;  // the same colours at all times
     const robust = limits(values, low, high);
     if (!q.range && high - low > 1.25 * (robust[1] - robust[0]) && robust[1] > robust[0]) [low, high] = robust;
-    const spread = chosen.variant === "std" || chosen.variant === "error";
+    const spread = choice.variant === "std" || choice.variant === "error";
     let colours = q.colours, ambient = quantityOf(r, 0), level = q.level;
-    if (chosen.variant === "error") { high = Math.max(-low, high); low = -high; colours = scene.diverging; }
-    if (chosen.variant === "std") { low = 0; colours = "cividis"; }
+    if (choice.variant === "error") { high = Math.max(-low, high); low = -high; colours = scene.diverging; }
+    if (choice.variant === "std") { low = 0; colours = "cividis"; }
     // the truth in the colours of the field, so that they can be compared
-    if (chosen.variant === "truth") ({ low, high } = display({ quantity: chosen.quantity, variant: "value" }));
+    if (choice.variant === "truth") ({ low, high } = display({ quantity: choice.quantity, variant: "value" }));
     if (spread) { ambient = 0; level = high / 2; }
     if (high === low) high = low + (Math.abs(low) || 1);
-    const what = { std: "standard deviation of ", truth: "true ", error: "error of " }[chosen.variant] || "";
-    const borrowed = chosen.variant === "truth";
+    const what = { std: "standard deviation of ", truth: "true ", error: "error of " }[choice.variant] || "";
+    const borrowed = choice.variant === "truth";
     cache[key] = { borrowed, values, low, high, lowest, highest, ambient, level, table: scene.tables[colours], label: what + q.label, unit: q.unit };
     return cache[key];
   }
@@ -111,7 +110,7 @@ async function main() {
     const e = exponentOf(shown), unit = [e ? "10" + superscript(e) : "", shown.unit].filter(Boolean).join(" ");
     document.getElementById("bar-label").textContent = shown.label + (unit ? " [" + unit + "]" : " [1]");
     const beyond = shown.lowest < shown.low || shown.highest > shown.high;
-    document.getElementById("bar-note").textContent = beyond ? (shown.borrowed ? "Colours are those of the reconstruction" : "Colours end where a thousandth of the voxels is left") + "; values go from " + say(shown.lowest, shown) + " to " + say(shown.highest, shown) + "." : "";
+    document.getElementById("bar-note").textContent = beyond ? (shown.borrowed ? "Colour range: that of the reconstruction" : "Colour range: 0.1 to 99.9 %") + "; values from " + say(shown.lowest, shown) + " to " + say(shown.highest, shown) + "." : "";
     const ticks = document.getElementById("bar-ticks");
     ticks.textContent = "";
     for (const t of ticksBetween(shown.low / 10 ** e, shown.high / 10 ** e, 5)) {
@@ -156,27 +155,27 @@ async function main() {
   update();
   if (scene.frames) await makeTime();
 
-  // frames are unpacked when they are first asked for
+  // frames are unpacked when first shown
   async function makeTime() {
     const slider = document.getElementById("time"), text = document.getElementById("time-text"), play = document.getElementById("play");
-    const known = [];
-    let wanted = 0, timer = null;
+    const frames = [];
+    let current = 0, timer = null;
     async function go(k) {
-      wanted = k;
+      current = k;
       slider.value = k;
       const frame = scene.frames[k];
       text.textContent = plain(Number((1e3 * frame.time).toPrecision(6))) + " ms, frame " + frame.index;
       slider.setAttribute("aria-valuetext", text.textContent);
-      if (!known[k]) known[k] = unpack("frame-" + k, frame, count);
-      const values = await known[k];
-      if (wanted !== k) return;  // another has been asked for meanwhile
+      if (!frames[k]) frames[k] = unpack("frame-" + k, frame, count);
+      const values = await frames[k];
+      if (current !== k) return;  // the slider has moved on
       arrays.value = values;
       for (const key in cache) delete cache[key];
       update(true);
     }
     slider.addEventListener("input", () => go(Number(slider.value)));
     play.addEventListener("click", () => {
-      if (timer) { clearInterval(timer); timer = null; } else timer = setInterval(() => go((wanted + 1) % scene.frames.length), 120);
+      if (timer) { clearInterval(timer); timer = null; } else timer = setInterval(() => go((current + 1) % scene.frames.length), 120);
       play.textContent = timer ? "Stop" : "Play";
       play.setAttribute("aria-pressed", String(Boolean(timer)));
     });

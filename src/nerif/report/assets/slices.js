@@ -40,10 +40,10 @@ function makeSlices(scene, onMove) {
       const [across, up] = PLANES[normal];
       const step = event.shiftKey ? 10 : 1;
       const moves = { ArrowLeft: [across, -step], ArrowRight: [across, step], ArrowDown: [up, -step], ArrowUp: [up, step], PageUp: [normal, step], PageDown: [normal, -step] };
-      const found = moves[event.key];
-      if (!found) return;
+      const change = moves[event.key];
+      if (!change) return;
       event.preventDefault();
-      move({ [found[0]]: at[found[0]] + found[1] });
+      move({ [change[0]]: at[change[0]] + change[1] });
     });
   }
 
@@ -149,12 +149,12 @@ function makeSlices(scene, onMove) {
   };
 }
 
-function ticksBetween(low, high, wanted) {
-  const raw = (high - low) / wanted, power = Math.pow(10, Math.floor(Math.log10(raw)));
+function ticksBetween(low, high, count) {
+  const raw = (high - low) / count, power = Math.pow(10, Math.floor(Math.log10(raw)));
   const step = power * ([1, 2, 5, 10].find((m) => m * power >= raw * 0.999) || 10);
-  const found = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step);
-  return found;
+  const ticks = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) ticks.push(k * step);
+  return ticks;
 }
 
 function plain(value) { return String(Number(value.toPrecision(6))).replace("-", "−"); }

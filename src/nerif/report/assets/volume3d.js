@@ -109,10 +109,10 @@ function makeSpace(scene, canvas) {
     geometry.setAttribute("position", new THREE.Float32BufferAttribute(points.flat(), 3));
     const look = { color: colour, transparent: true, opacity };
     const material = dashed ? new THREE.LineDashedMaterial({ ...look, dashSize: reach / 12, gapSize: reach / 20 }) : new THREE.LineBasicMaterial(look);
-    const found = new THREE.LineSegments(geometry, material);
-    if (dashed) found.computeLineDistances();
-    found.renderOrder = 1;
-    return found;
+    const segments = new THREE.LineSegments(geometry, material);
+    if (dashed) segments.computeLineDistances();
+    segments.renderOrder = 1;
+    return segments;
   }
   const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => [0, 1, 2].map((a) => ((i >> a) & 1 ? upper : lower).getComponent(a)));
   const edges = [];
@@ -197,7 +197,7 @@ function makeSpace(scene, canvas) {
     eye.updateProjectionMatrix();
   }
   function draw() {
-    pending = 0; wanted = false;
+    pending = 0; dirty = false;
     uniforms.steps.value = Math.min(240, 40 + 2.2 * Math.max(nx, ny, nz)) / (coarse && slow > 25 ? 2 : 1);
     names.visible = eye.position.distanceTo(middle) < 9 * reach;
     eye.updateMatrixWorld();
@@ -209,15 +209,15 @@ function makeSpace(scene, canvas) {
     slow = performance.now() - start;
     if (slow > 700 && full > 0.5) full = Math.max(0.5, full * 0.7);  // no GPU: a softer image rather than a wait
   }
-  // drawn only while it can be seen: without a GPU every image costs the slices their time
-  let seen = false, wanted = false;
+  // drawn only while visible: without a GPU every image costs the slices their time
+  let visible = false, dirty = false;
   function request() {
-    wanted = true;
-    if (seen && !pending) pending = requestAnimationFrame(draw);
+    dirty = true;
+    if (visible && !pending) pending = requestAnimationFrame(draw);
   }
   new IntersectionObserver((entries) => {
-    seen = entries[entries.length - 1].isIntersecting;
-    if (seen && wanted) request();
+    visible = entries[entries.length - 1].isIntersecting;
+    if (visible && dirty) request();
   }, { rootMargin: "80px" }).observe(canvas);
   // while something moves, fewer pixels on slow machines; sharp again once it rests
   function moving() {

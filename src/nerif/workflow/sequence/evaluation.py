@@ -1,4 +1,4 @@
-"""How good the frames of a sequence are, each against its truth."""
+"""Errors of the frames of a sequence against their true fields."""
 
 from __future__ import annotations
 
@@ -24,36 +24,31 @@ def evaluate_sequence(
     truth: str | os.PathLike[str],
     on_frame: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Compare every frame of a sequence with its truth; return the metrics, and keep them in RESULT.metrics.json.
+    """Compare every frame of a sequence with its true field; write the metrics to RESULT.metrics.json and return them.
 
     Parameters
     ----------
     result : store of nerif sequence
-    truth : volumes of the field at the same instants, an index excess over any ambient
-    on_frame : told how many frames are compared, out of how many
-
-    Raises
-    ------
-    InputError
-        If the instants differ, or no frame is done.
+    truth : store of the true fields at the same instants, index excess over any ambient
+    on_frame : called with the numbers of frames compared and to compare
     """
     store, true = SequenceStore(Path(result)), VolumeSequence(truth)
     if len(store) != len(true) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, true.times, strict=True)):
         raise InputError(f"expected the instants of {result}, {len(store)} frames, got others", field=truth)
     check_inside(Path(truth), true.grid.box, store.grid.box)
     quantity = technique(store.attributes.get("techniques", [ASSUMED.name])[0]).quantity
+    reference = store.n_ambient if quantity == INDEX else 1.0
     frames: list[dict[str, Any]] = []
-    done = [i for i, status in enumerate(store.status) if status == DONE]
-    for i in done:
+    complete = [i for i, status in enumerate(store.status) if status == DONE]
+    for i in complete:
         expected = true.volume(i, quantity)
         if quantity == INDEX:
             expected = expected.relative_to(store.n_ambient)
-        found = store.field(i).sample(true.grid).numpy()
-        errors = volume_errors(expected.values.numpy(), found, store.n_ambient if quantity == INDEX else 1.0)
+        errors = volume_errors(expected.values.numpy(), store.field(i).sample(true.grid).numpy(), reference)
         frames.append({"frame": i, "time_s": store.times[i], **errors})
-        on_frame(len(frames), len(done))
+        on_frame(len(frames), len(complete))
     if not frames:
-        raise InputError("no frame of it is done yet; run nerif sequence again", field=result)
+        raise InputError("no frame is complete yet; run nerif sequence again", field=result)
     mean = {name: sum(f[name] for f in frames) / len(frames) for name in ("l2", "l2_variation", "cc")}
     metrics = {"truth": str(Path(truth).resolve()), "frames": frames, "mean": mean}
     write_json(Path(result).with_suffix(".metrics.json"), metrics)

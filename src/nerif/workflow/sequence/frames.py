@@ -1,10 +1,10 @@
-"""The frames of one chunk of time, one after the other, each from the one before. Runs in a worker.
+"""The frames of one chunk of time, each started from the previous one, in a worker.
 
-    frame 0: from nothing  ->  frame 1: from the weights of 0, in fewer steps  ->  frame 2: from those of 1  ->  ...
+    frame 0: no initial field  ->  frame 1: from the weights of 0, in fewer steps  ->  frame 2: from those of 1  ->  ...
 
-A frame that fails is tried again from nothing, then with half the learning rate, then recorded; the next one starts
-from the last that is done. The weights are read back from the store, so a chunk that goes on elsewhere, after a death,
-gives what it would have given undisturbed.
+A failed frame is repeated without an initial field, then with half the learning rate, then recorded as failed; the next
+one starts from the last complete one. Weights are read from the store, so that a chunk continued by another worker
+gives the same result.
 """
 
 from __future__ import annotations
@@ -35,20 +35,19 @@ from nerif.workflow.sequence.store import DONE, MISSING, Frame, SequenceStore
 
 __all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame", "reconstruct_frames"]
 
-ATTEMPTS = 3  # at a frame
-PIXELS = 256  # of each view, evenly over it, in which a frame is compared with what was measured
-SAMPLES = 60  # a ray, for that
+ATTEMPTS = 3
+SCORE_PIXELS, SCORE_SAMPLES = 256, 60  # pixels per view, and samples per ray, of the scores of a frame
 
 FAILURES = (InputError, ArithmeticError, RuntimeError, MemoryError, OSError)
-"""What fails a frame, and is worth another attempt; anything else fails the chunk (run.py)."""
+"""Errors of a frame that justify another attempt; any other fails the chunk (run.py)."""
 
 
 class FrameError(Exception):
-    """A frame could not be reconstructed in as many attempts as there are."""
+    """All attempts at a frame failed."""
 
 
 def end_without(parent: int) -> OnStep:
-    """Return a callback that ends this process when its parent is gone: the command was killed, and may run again."""
+    """Return a callback that ends this process if its parent process has ended: the command may be run again."""
 
     def watch(_: Step) -> None:
         if os.getppid() != parent:
@@ -57,17 +56,17 @@ def end_without(parent: int) -> OnStep:
     return watch
 
 
-def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event = lambda told: None) -> None:
+def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event = lambda entries: None) -> None:
     """Reconstruct the frames first to last - 1 that the store lacks."""
     sequence, store = MeasurementSequence.read(plan.measurement), SequenceStore(plan.out)
     watch = end_without(os.getppid())
-    before: NeuralField | None = None
+    previous: NeuralField | None = None
     for index in range(first, last):
         status = store.status[index]
         if status == MISSING:
             event({"frame": index, "what": "begun"})
             try:
-                frame = _attempts(plan, sequence, index, before, watch)
+                frame = _attempts(plan, sequence, index, previous, watch)
             except FrameError as error:
                 store.fail(index, str(error), ATTEMPTS)
                 event({"frame": index, "what": "failed", "reason": str(error)})
@@ -76,18 +75,17 @@ def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event =
             event({"frame": index, "what": "done", "seconds": frame.seconds})
             status = DONE
         if status == DONE:
-            before = store.field(index)
+            previous = store.field(index)
 
 
 def _attempts(
-    plan: SequencePlan, sequence: MeasurementSequence, index: int, before: NeuralField | None, watch: OnStep
+    plan: SequencePlan, sequence: MeasurementSequence, index: int, previous: NeuralField | None, watch: OnStep
 ) -> Frame:
-    """One frame: as planned, then from nothing, then more cautiously."""
     first = plan.first
-    careful = replace(first, learning_rate=first.learning_rate / 2)
-    tries = [(first, None) if before is None else (plan.warm, before), (first, None), (careful, None)]
+    cautious = replace(first, learning_rate=first.learning_rate / 2)
+    attempts = [(first, None) if previous is None else (plan.warm, previous), (first, None), (cautious, None)]
     reason = ""
-    for number, (settings, start) in enumerate(tries, start=1):
+    for number, (settings, start) in enumerate(attempts, start=1):
         try:
             return replace(_frame(plan, settings, sequence.frame(index), start, watch), attempts=number)
         except FAILURES as error:
@@ -98,7 +96,7 @@ def _attempts(
 def _frame(
     plan: SequencePlan, settings: NeRIF, measurement: Measurement, start: NeuralField | None, watch: OnStep
 ) -> Frame:
-    begun = time.perf_counter()
+    begin = time.perf_counter()
     training = measurement.select([name for name in measurement.names if name not in plan.settings.withhold])
     result = settings(training, watch, None, start)
     if result.outcome.failed:
@@ -106,34 +104,32 @@ def _frame(
     assert isinstance(result.field, NeuralField)
     frame = finished_frame(plan, result.field, measurement, result.device)
     steps = int(result.history[-1]["step"]) if result.history else 0
-    return replace(frame, seconds=time.perf_counter() - begun, steps=steps)
+    return replace(frame, seconds=time.perf_counter() - begin, steps=steps)
 
 
 def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
-    """Return what is written of a field: its volumes, and how it compares with what was measured."""
+    """Return the volumes of a field, and its scores in the views."""
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
-    found = Volume.of(field.sample(grid, device), grid, measurement.quantity, measurement.n_ambient)
-    volumes = [derive(found, wanted, plan.settings.gas) for wanted in plan.settings.quantities]
-    seen = seen_through(measurement, plan.cold.aperture)
-    scores = _against_measured(plan.cold.model, field, seen, device)
+    volume = Volume.of(field.sample(grid, device), grid, measurement.quantity, measurement.n_ambient)
+    volumes = [derive(volume, quantity, plan.settings.gas) for quantity in plan.settings.quantities]
+    scores = _scores(plan.cold.model, field, seen_through(measurement, plan.cold.aperture), device)
     return Frame(field, volumes, scores, seconds=0.0, steps=0)
 
 
-def _against_measured(model: str, field: Field, measurement: Measurement, device: str) -> list[dict[str, Any]]:
-    """Correlation and rms difference in every view, held-out ones included, by every technique, over some pixels."""
+def _scores(model: str, field: Field, measurement: Measurement, device: str) -> list[dict[str, Any]]:
+    """Return correlation and rms difference on some pixels of every view, withheld ones included, by technique."""
     scores = []
     for observation in measurement.observations:
         kind = observation.technique
-        projector = PathIntegral(forward_model(kind, measurement, model), SAMPLES)
-        rays, measured, _ = measurement.rays(observation)
+        projector = PathIntegral(forward_model(kind, measurement, model), SCORE_SAMPLES)
+        rays, values, _ = measurement.rays(observation)
         for i, name in enumerate(measurement.names):
-            own = (rays.view == i).nonzero()[:, 0]
-            if not len(own):
+            index = (rays.view == i).nonzero()[:, 0]
+            if not len(index):
                 continue
-            own = own[:: max(1, len(own) // PIXELS)]
-            predicted = project(projector, field, rays[own], device).numpy()
-            seen = measured[own].numpy()
-            rms = float(np.sqrt(np.mean((seen - predicted) ** 2)))
-            found = {"name": name, "measured": kind.measured, "cc": correlation(seen, predicted), "rms": rms}
-            scores.append(found)
+            index = index[:: max(1, len(index) // SCORE_PIXELS)]
+            predicted = project(projector, field, rays[index], device).numpy()
+            view = values[index].numpy()
+            rms = float(np.sqrt(np.mean((view - predicted) ** 2)))
+            scores.append({"name": name, "measured": kind.measured, "cc": correlation(view, predicted), "rms": rms})
     return scores

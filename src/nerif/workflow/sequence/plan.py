@@ -1,4 +1,4 @@
-"""How the frames of a sequence are reconstructed, and what every worker has to know, wherever it runs."""
+"""Settings of a sequence, and what every worker needs to reconstruct its frames."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
+from nerif.common.settings import Count, Positive, check_settings
 from nerif.data.measurement import Measurement
 from nerif.data.volume import QUANTITIES, quantities_of
 from nerif.physics.quantities import GasSettings
@@ -16,75 +17,60 @@ from nerif.reconstruction.neural.neural import NeRIF
 
 __all__ = ["Event", "SequencePlan", "SequenceSettings"]
 
-WARM_UP = 10  # steps over which the learning rate rises from weights that are good already
+MAX_WARM_UP = 10  # steps over which the learning rate rises in a warm start
 
 Event = Callable[[dict[str, object]], None]
-"""Told {"frame", "what": "begun" | "done" | "failed", ...} as a frame goes along."""
-
-LEAST = {"chunk": 1, "warm_steps": 1, "voxels": 1}
+"""Called with {"frame", "what": "begun" | "done" | "failed", ...}."""
 
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """How the frames of a sequence are reconstructed, beside the settings of the network; kept in the store."""
+    """Settings of a sequence in addition to those of the network; stored with the result."""
 
-    chunk: int = 32
-    """Frames of a chunk of time; the first of each starts from nothing."""
-    warm_steps: int = 300
-    """Steps of a frame that starts from the one before."""
-    warm_rate: float = 0.7
-    """Share of the learning rate such a frame begins with."""
+    chunk: Count = 32
+    """Frames per chunk of time; the first frame of each starts without an initial field."""
+    warm_steps: Count = 300
+    """Steps of a frame that starts from the previous one."""
+    warm_rate: Positive = 0.7
+    """Initial learning rate of such a frame, relative to the full one."""
     withhold: tuple[str, ...] = ()
-    """Views kept out of the reconstruction, and compared with it."""
-    voxels: int = 100
+    """Withheld views, compared with the reconstruction."""
+    voxels: Count = 100
     """Voxels of the volumes along the longest edge of the box."""
     quantities: tuple[str, ...] = ()
-    """Written of every frame: of an index index_excess, n, density, temperature; none for the field, and density."""
+    """Volumes to write; of an index index_excess, n, density, temperature (default: the field, and density)."""
     gas: GasSettings = field(default_factory=GasSettings)
-    """What density and temperature are computed for."""
-
-    def for_measurement(self, measurement: Measurement) -> SequenceSettings:
-        """Return the settings with what follows from a measurement: quantities that are not given, and the gas.
-
-        Raises
-        ------
-        InputError
-            If a quantity does not follow from what was measured.
-        """
-        known = quantities_of(measurement.quantity)
-        for quantity in self.quantities:
-            if quantity not in known:
-                names = " and ".join(kind.name for kind in measurement.techniques)
-                raise InputError(
-                    f"expected some of {', '.join(known)} for {names}, got '{quantity}'", field="quantities"
-                )
-        written = self.quantities or tuple(q for q in known if q in (measurement.quantity, "density"))
-        return replace(self, quantities=written, gas=self.gas.for_measurement(measurement))
+    """Gas for density and temperature."""
 
     def __post_init__(self) -> None:
-        for name in ("withhold", "quantities"):
-            if isinstance(getattr(self, name), str):
-                raise InputError(f"expected a tuple of names, got the text '{getattr(self, name)}'", field=name)
-        if not self.warm_rate > 0:
-            raise InputError(f"expected a share above 0, got {self.warm_rate}", field="warm_rate")
-        for name, least in LEAST.items():
-            if getattr(self, name) < least:
-                raise InputError(f"expected {least} or more, got {getattr(self, name)}", field=name)
+        check_settings(self)
         for quantity in self.quantities:
             if quantity not in QUANTITIES:
                 raise InputError(f"expected some of {', '.join(QUANTITIES)}, got '{quantity}'", field="quantities")
 
+    def for_measurement(self, measurement: Measurement) -> SequenceSettings:
+        """Return the settings with the quantities and the gas of a measurement."""
+        available = quantities_of(measurement.quantity)
+        for quantity in self.quantities:
+            if quantity not in available:
+                names = " and ".join(kind.name for kind in measurement.techniques)
+                raise InputError(
+                    f"expected some of {', '.join(available)} for {names}, got '{quantity}'", field="quantities"
+                )
+        quantities = self.quantities or tuple(q for q in available if q in (measurement.quantity, "density"))
+        return replace(self, quantities=quantities, gas=self.gas.for_measurement(measurement))
+
 
 @dataclass(frozen=True)
 class SequencePlan:
-    """Which recording is reconstructed into which store, and how.
+    """The reconstruction of a recording into a store.
 
     Parameters
     ----------
     measurement, out : stores
-    cold : settings of the method as they were asked
+    cold : settings of the method
     settings : of the sequence
-    threads : of a worker on a CPU; 0 for its share of the cores
+    threads : of a worker on a CPU; 0: its share of the cores
     """
 
     measurement: Path
@@ -95,16 +81,16 @@ class SequencePlan:
 
     @property
     def first(self) -> NeRIF:
-        """Settings of a frame that starts from nothing, repeatable: no clock ends it."""
+        """Settings of a frame without an initial field; without a time limit, so that it is reproducible."""
         return replace(self.cold, longest=math.inf)
 
     @property
     def warm(self) -> NeRIF:
-        """Settings of a frame that starts from the one before: fewer steps, at a share of the learning rate."""
-        asked, warm_up = self.settings, min(self.cold.warm_up, WARM_UP)
-        return replace(self.cold, max_steps=asked.warm_steps, rate_after_fit=asked.warm_rate, warm_up=warm_up)
+        """Settings of a frame that starts from the previous one."""
+        steps, rate, warm_up = self.settings.warm_steps, self.settings.warm_rate, min(self.cold.warm_up, MAX_WARM_UP)
+        return replace(self.cold, max_steps=steps, rate_after_fit=rate, warm_up=warm_up)
 
     @property
-    def kept(self) -> dict[str, Any]:
-        """What the store keeps of it, JSON; none of it may change before the store is complete."""
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of the store, JSON; they must not change before the store is complete."""
         return {"measurement": str(self.measurement), **asdict(self.settings), "settings": asdict(self.cold)}

@@ -1,4 +1,4 @@
-"""From a film to a store of volumes: all that `nerif sequence` does, as a Python call."""
+"""From a measurement sequence to a store of volumes: nerif sequence as a Python call."""
 
 from __future__ import annotations
 
@@ -42,64 +42,53 @@ def reconstruct_sequence(
 ) -> SequenceStore:
     """Reconstruct every frame of a measurement sequence that a store lacks.
 
-    A script that calls it has to have an `if __name__ == "__main__":` around the call, since workers of this machine
-    are processes that import the script.
+    Scripts must call it under `if __name__ == "__main__":`, since local workers are processes that import the script.
+    The store is left as it is if any input is invalid, or differs from that of an earlier run.
 
     Parameters
     ----------
-    out : store to make (.zarr), or to go on with
+    out : store (.zarr) to make or to continue
     measurement : store of the measurement sequence
     reconstructor : settings of the method
     settings : of the sequence
     cluster : "local", tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md)
-    workers : of a local cluster; 0 for one for each GPU, or for each two cores
-    threads : of each worker on a CPU; 0 for its share of the cores
-    dashboard : serve Dask's dashboard on 127.0.0.1, where every user of this machine can look at it
-    retry : try again frames that failed in an earlier run
-    force : begin anew, whatever `out` holds
-    on_progress : told as frames are settled
-    say : told lines about how the work goes
-
-    Raises
-    ------
-    InputError
-        If anything asked cannot be, or `out` was begun with other settings; what is there stays as it is.
+    workers : of a local cluster; 0: one per GPU, or per two cores
+    threads : of each worker on a CPU; 0: its share of the cores
+    dashboard : serve the Dask dashboard on 127.0.0.1, visible to all users of this machine
+    retry : retry the failed frames of an earlier run
+    force : start again, discarding the content of `out`
+    on_progress : called when frames are complete or failed
+    say : called with lines of text
     """
     out, measurement, settings = Path(out), Path(measurement), settings or SequenceSettings()
-    for name, value in (("workers", workers), ("threads", threads)):
-        if value < 0:
-            raise InputError(f"expected 0 or more, got {value}", field=name)
     if out.suffix != ".zarr":
         raise InputError(f"expected a name ending in .zarr, got '{out.name}'", field="out")
     if not isinstance(reconstructor, NeRIF):
         raise InputError(f"expected NeRIF for a sequence, got {type(reconstructor).__name__}", field="reconstructor")
     if reconstructor.time_limit:
-        raise InputError(
-            "expected none in a sequence, whose frames are to be repeatable; give --max-steps", field="time_limit"
-        )
+        raise InputError("expected 0 for a sequence, which must be reproducible; give --max-steps", field="time_limit")
     if reconstructor.source in ("images", "both"):
         raise InputError(f"expected auto or displacements for a sequence, got '{reconstructor.source}'", field="from")
     if reconstructor.refine:
         raise InputError(
-            "expected nothing to refine in a sequence; refine one frame with nerif reconstruct, and give its "
-            "calibration.toml to the measurement",
+            "expected none for a sequence; refine one frame with nerif reconstruct, and use its calibration.toml for "
+            "the measurement",
             field="refine",
         )
     sequence = MeasurementSequence.read(measurement)
     like = seen_through(sequence.fullest(), reconstructor.aperture)
     like.without(settings.withhold)
     settings = settings.for_measurement(like)
-    shape = reconstructor.resolved_by(like).network
-    reconstructor = replace(reconstructor, network=shape, wave_pixels=0, source="displacements")
+    network = reconstructor.resolved_by(like).network
+    reconstructor = replace(reconstructor, network=network, wave_pixels=0, source="displacements")
     plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)
     store = _store(plan, sequence, like, force, say)
     if store.symmetry is not None:
         plan = replace(plan, cold=with_axis(plan.cold, store.symmetry))
     if retry:
         say(f"{store.forget_failures()} failed frames are tried again")
-    missing = int((store.status == MISSING).sum())
-    if missing:
-        say(f"{out}: {missing} of {len(sequence)} frames to do, in chunks of {settings.chunk}")
+    if pending := int((store.status == MISSING).sum()):
+        say(f"{out}: {pending} of {len(sequence)} frames to reconstruct, in chunks of {settings.chunk}")
         try:
             with open_cluster(cluster, workers, out.parent.resolve(), dashboard) as (client, share):
                 if dashboard and client.dashboard_link:
@@ -109,8 +98,7 @@ def reconstruct_sequence(
                 run_sequence(client, replace(plan, threads=threads or share), on_progress)
         except KeyboardInterrupt:
             say(outcome_table(store))
-            kept = f"frames that are done are kept in {out}; the same command goes on with the others"
-            raise Interrupted(kept) from None
+            raise Interrupted(f"complete frames are kept in {out}; run the same command again to continue") from None
     say(outcome_table(store))
     return store
 
@@ -118,20 +106,20 @@ def reconstruct_sequence(
 def _store(
     plan: SequencePlan, sequence: MeasurementSequence, like: Measurement, force: bool, say: Callable[[str], None]
 ) -> SequenceStore:
-    """The store that is there if it was begun with the same settings, else a new one, which has one axis for all."""
+    """Return the existing store if its settings are the same, else a new one, with one axis of symmetry."""
     bounds = field_bounds(like, plan.cold.lower, plan.cold.upper)
-    limits = [bound if math.isfinite(bound) else None for bound in bounds]  # JSON knows no infinity
-    kept = {"frames": len(sequence), "bounds": limits, **plan.kept}
+    limits = [bound if math.isfinite(bound) else None for bound in bounds]  # no infinity in JSON
+    attributes = {"frames": len(sequence), "bounds": limits, **plan.attributes}
     if plan.out.exists() and not force:
         store = SequenceStore(plan.out)
-        store.check_same(kept)
+        store.check_same(attributes)
         return store
     axis = axis_of(plan.cold, like.without(plan.settings.withhold))
     if axis is not None:
         for line in axis.sentences:
             say(line)
-        asked = symmetry_asked(with_axis(plan.cold, axis.symmetry), like)
-        assert asked is not None
-        kept["symmetry"] = asdict(asked)
+        symmetry = symmetry_asked(with_axis(plan.cold, axis.symmetry), like)
+        assert symmetry is not None
+        attributes["symmetry"] = asdict(symmetry)
     grid = Grid.of_resolution(like.box, plan.settings.voxels)
-    return SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, plan.cold.network, kept)
+    return SequenceStore.begin(plan.out, sequence, grid, plan.settings.quantities, plan.cold.network, attributes)

@@ -1,9 +1,10 @@
-"""A whole sequence: chunks of time handed to the workers, deaths counted, progress told, and a table at the end."""
+"""A sequence on a cluster: chunks of time for the workers, repeated after the death of a worker."""
 
 from __future__ import annotations
 
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -25,46 +26,46 @@ __all__ = ["Progress", "chunks_of", "outcome_table", "run_sequence"]
 
 @dataclass
 class Progress:
-    """How far a run is.
+    """Progress of a run.
 
     Parameters
     ----------
-    total : frames to be done in this run
-    done, failed : of them, so far
-    seconds : since the run began
+    total : frames to reconstruct in this run
+    done, failed : numbers of them
+    begin : monotonic clock, s
     """
 
     total: int
     done: int = 0
     failed: int = 0
-    begun: float = field(default_factory=time.monotonic)
+    begin: float = field(default_factory=time.monotonic)
 
     @property
     def seconds(self) -> float:
-        """Since the run began."""
-        return time.monotonic() - self.begun
+        """Duration of the run so far."""
+        return time.monotonic() - self.begin
 
     @property
     def settled(self) -> int:
-        """Frames done or failed."""
+        """Number of frames complete or failed."""
         return self.done + self.failed
 
     @property
     def frames_per_minute(self) -> float:
-        """Frames settled a minute, in the mean."""
+        """Mean rate."""
         return 60 * self.settled / max(self.seconds, 1e-9)
 
     @property
     def seconds_left(self) -> float:
-        """What is missing at that rate."""
+        """Remaining time at that rate; NaN if unknown."""
         rate = self.frames_per_minute / 60
         return (self.total - self.settled) / rate if rate else float("nan")
 
 
 def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[int, int]]:
-    """Return first and last + 1 of the chunks of time that have a missing frame.
+    """Return first and last + 1 of the chunks of time with a missing frame.
 
-    Chunks begin at multiples of `length`, however many workers there are: a frame always starts from the same one.
+    Chunks begin at multiples of `length`: the start of a frame does not depend on the workers.
     """
     return [(a, min(a + length, frames)) for a in sorted({i // length * length for i in missing})]
 
@@ -72,29 +73,22 @@ def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[in
 def run_sequence(
     client: Client, plan: SequencePlan, on_progress: Callable[[Progress], None] = lambda progress: None
 ) -> Progress:
-    """Reconstruct every missing frame of a store; whatever happens to workers, the rest goes on.
-
-    Parameters
-    ----------
-    client : of a Dask cluster
-    on_progress : told as frames are settled
-    """
+    """Reconstruct every missing frame of a store, also if workers die or chunks fail."""
     from distributed import KilledWorker, as_completed
 
-    store, length = SequenceStore(plan.out), plan.settings.chunk
-    status = store.status
+    store, status = SequenceStore(plan.out), SequenceStore(plan.out).status
     missing = np.flatnonzero(status == MISSING).tolist()
     progress, topic = Progress(len(missing)), f"nerif-{uuid.uuid4()}"
-    begun: dict[int, int] = {}  # how often a frame was begun
-    deaths: dict[int, int] = {}
+    starts, deaths = Counter[int](), Counter[int]()  # by frame
+    chunks: dict[str, tuple[int, int]] = {}  # by the key of their task
 
-    def hear(event: tuple[float, dict[str, Any]]) -> None:
-        told = event[1]
-        if told["what"] == "begun":
-            begun[told["frame"]] = begun.get(told["frame"], 0) + 1
+    def on_event(event: tuple[float, dict[str, Any]]) -> None:
+        entries = event[1]
+        if entries["what"] == "begun":
+            starts[entries["frame"]] += 1
             return
-        progress.done += told["what"] == "done"
-        progress.failed += told["what"] == "failed"
+        progress.done += entries["what"] == "done"
+        progress.failed += entries["what"] == "failed"
         on_progress(progress)
 
     def fail(frames: list[int], reason: str, attempts: int) -> None:
@@ -105,30 +99,28 @@ def run_sequence(
 
     def submit(first: int, last: int) -> Future:
         key = f"frames-{first}-{last}-{uuid.uuid4()}"
-        future = client.submit(_in_worker, plan, first, last, topic, key=key, pure=False, priority=-first)
-        chunk[key] = (first, last)
-        return future
+        chunks[key] = (first, last)
+        return client.submit(_in_worker, plan, first, last, topic, key=key, pure=False, priority=-first)
 
-    chunk: dict[str, tuple[int, int]] = {}
-    client.subscribe_topic(topic, hear)
+    client.subscribe_topic(topic, on_event)
     on_progress(progress)
     try:
-        queue = as_completed([submit(*c) for c in chunks_of(missing, length, len(status))])
+        queue = as_completed([submit(*chunk) for chunk in chunks_of(missing, plan.settings.chunk, len(status))])
         for future in queue:
-            first, last = chunk.pop(str(future.key))
+            first, last = chunks.pop(str(future.key))
             if future.status != "error":
-                future.result()  # raises where the cluster was lost, not the work
+                future.result()  # raises if the cluster was lost
                 continue
-            left, error = [i for i in range(first, last) if store.status[i] == MISSING], future.exception()
+            rest, error = [i for i in range(first, last) if store.status[i] == MISSING], future.exception()
             if not isinstance(error, KilledWorker):
-                fail(left, f"{type(error).__name__}: {error}", 1)
+                fail(rest, f"{type(error).__name__}: {error}", 1)
                 continue
-            if left and begun.get(left[0], 0) > deaths.get(left[0], 0):
-                deaths[left[0]] = deaths.get(left[0], 0) + 1
-                if deaths[left[0]] >= ATTEMPTS:
-                    reason = f"its worker died {ATTEMPTS} times; out of memory? see the worker's log"
-                    fail([left.pop(0)], reason, ATTEMPTS)
-            if left:
+            if rest and starts[rest[0]] > deaths[rest[0]]:
+                deaths[rest[0]] += 1
+                if deaths[rest[0]] >= ATTEMPTS:
+                    reason = f"its worker died {ATTEMPTS} times; out of memory? See the log of the worker"
+                    fail([rest.pop(0)], reason, ATTEMPTS)
+            if rest:
                 queue.add(submit(first, last))
     finally:
         client.unsubscribe_topic(topic)
@@ -136,32 +128,33 @@ def run_sequence(
 
 
 def _in_worker(plan: SequencePlan, first: int, last: int, topic: str) -> None:
-    from dask.system import CPU_COUNT  # what a job or container leaves of the machine
+    from dask.system import CPU_COUNT  # available to the job or container
     from distributed import get_worker
 
     worker = get_worker()
     torch.set_num_threads(plan.threads or max(1, CPU_COUNT // worker.state.nthreads))
     keep_freed_memory()
-    reconstruct_frames(plan, first, last, lambda told: worker.log_event(topic, told))
+    reconstruct_frames(plan, first, last, lambda entries: worker.log_event(topic, entries))
 
 
 def outcome_table(store: SequenceStore) -> str:
-    """Return what was done, what failed and why, as lines of text."""
+    """Return a table of complete, failed and missing frames as lines of text."""
     status, reasons = store.status, store.reasons
     seconds = np.asarray(store.array("seconds")[:])
-    done = status == DONE
-    lines = [f"{int(done.sum())} of {len(status)} frames done"]
-    if done.any():
+    complete, failed, missing = status == DONE, status == FAILED, status == MISSING
+    lines = [f"{int(complete.sum())} of {len(status)} frames done"]
+    if complete.any():
         sizes = []
-        for of in (scores := store.view_scores):
-            rms = np.asarray(of.rms[:])[done]
+        for scores in (views := store.view_scores):
+            rms = np.asarray(scores.rms[:])[complete]
             size = f"{float(rms[np.isfinite(rms)].mean()):.4g}" if np.isfinite(rms).any() else "unknown"
-            sizes.append(f"{of.technique.measured} " * (len(scores) > 1) + with_unit(size, of.technique.unit))
-        lines[0] += f", {float(np.median(seconds[done])):.1f} s a frame (median), "
-        lines[0] += f"rms difference to the measured {' and '.join(sizes)}"
-    if (status == FAILED).any():
-        lines.append(f"{int((status == FAILED).sum())} failed:")
-        lines += [f"  frame {i}: {reasons[i]}" for i in np.flatnonzero(status == FAILED)]
-    if (status == MISSING).any():
-        lines.append(f"{int((status == MISSING).sum())} missing; the same command again does them")
+            name = f"{scores.technique.measured} " * (len(views) > 1)
+            sizes.append(name + with_unit(size, scores.technique.unit))
+        lines[0] += f", {float(np.median(seconds[complete])):.1f} s per frame (median), "
+        lines[0] += f"rms residual {' and '.join(sizes)}"
+    if failed.any():
+        lines.append(f"{int(failed.sum())} failed:")
+        lines += [f"  frame {i}: {reasons[i]}" for i in np.flatnonzero(failed)]
+    if missing.any():
+        lines.append(f"{int(missing.sum())} missing; run the same command again to continue")
     return "\n".join(lines)

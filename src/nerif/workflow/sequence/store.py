@@ -1,7 +1,6 @@
-"""The result of a sequence: a Zarr store with a chunk for each frame, which xarray opens at any time.
+"""The result of a sequence: a Zarr store with a chunk per frame, which xarray can open at any time.
 
-Volumes and the weights of the network are written first and `status` last, so that what a killed run leaves
-half-written counts as missing and is done again.
+`status` is written last: a frame that is incomplete when a run is killed counts as missing.
 """
 
 from __future__ import annotations
@@ -37,16 +36,16 @@ MISSING, DONE, FAILED = 0, 1, 2
 
 @dataclass(frozen=True)
 class Frame:
-    """What came of one frame.
+    """The result of one frame.
 
     Parameters
     ----------
     field : with its weights
-    volumes : what is written of it
-    scores : `name` of the view, `measured`, `cc` and `rms`: what it measured against what is re-projected
-    seconds : spent on the frame
+    volumes : to write
+    scores : by view and technique: `name`, `measured`, `cc` and `rms` of re-projection and measurement
+    seconds : duration
     steps : of training
-    attempts : how many it took
+    attempts : number
     """
 
     field: NeuralField
@@ -58,17 +57,7 @@ class Frame:
 
 
 class SequenceStore(VolumeSequence):
-    """A result on disc: volumes, the weights they come from, and how each frame went.
-
-    Parameters
-    ----------
-    path : of the Zarr store
-
-    Raises
-    ------
-    InputError
-        If there is no such store, or it is none of ours.
-    """
+    """A result on disk: volumes, the weights of their networks, and the outcome of each frame."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
@@ -87,18 +76,13 @@ class SequenceStore(VolumeSequence):
         network: NetworkShape,
         attributes: dict[str, Any],
     ) -> SequenceStore:
-        """Make a store in which every frame is missing; one that is there is replaced, checkpoints included.
+        """Make a store without frames, in place of an earlier one.
 
         Parameters
         ----------
-        sequence : whose instants and views it has
+        sequence : with its instants and views
         grid, quantities : of the volumes
-        attributes : settings and whatever else is to be kept, JSON
-
-        Raises
-        ------
-        InputError
-            If anything but a store of fields is there.
+        attributes : settings and others, JSON
         """
         like, frames = sequence.fullest(), len(sequence)
         check_store(path, FIELDS)
@@ -111,18 +95,18 @@ class SequenceStore(VolumeSequence):
             def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
                 add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
 
-            nan, seen = float("nan"), ((views,), ("view",), "float64")
+            nan, per_view = float("nan"), ((views,), ("view",), "float64")
             for kind, (cc, rms) in score_names(like.techniques).items():
-                what = f"the {kind.measured} that the view measured"
-                add_frames(group, cc, frames, *seen, units="1", long_name=f"correlation with {what}")
-                add_frames(group, rms, frames, *seen, units=kind.unit, long_name=f"rms difference to {what}")
+                of = f"re-projection and measured {kind.measured}"
+                add_frames(group, cc, frames, *per_view, units="1", long_name=f"correlation of {of}")
+                add_frames(group, rms, frames, *per_view, units=kind.unit, long_name=f"rms difference of {of}")
             add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
             add("index_scale", "float64", nan, "field of one unit of network output")
-            add("offset", "float64", nan, "network output that counts as ambient")
-            add("seconds", "float64", nan, "spent on the frame, s")  # as units they would be read as a time span
+            add("offset", "float64", nan, "network output of the ambient field")
+            add("seconds", "float64", nan, "duration of the frame, s")  # as units: xarray would read a time span
             add("steps", "int32", 0, "steps of training")
             add("attempts", "int8", 0, "attempts at the frame")
-            add("reason", "str", "", "why the frame failed")
+            add("reason", "str", "", "reason of failure")
             flags = {"flag_values": [MISSING, DONE, FAILED], "flag_meanings": "missing done failed"}
             add("status", "int8", MISSING, "written last: the frame is complete", **flags)
         return cls(path)
@@ -131,99 +115,90 @@ class SequenceStore(VolumeSequence):
 
     @property
     def symmetry(self) -> Symmetry | None:
-        """Of the fields of all frames, mm, if they have one."""
-        kept = self.attributes.get("symmetry")
-        return Symmetry.kept(kept) if kept else None
+        """Symmetry of the fields of all frames, mm, if any."""
+        entries = self.attributes.get("symmetry")
+        return Symmetry.kept(entries) if entries else None
 
     @property
     def status(self) -> np.ndarray:
-        """(time,) MISSING, DONE or FAILED, as it is on disc now."""
+        """(time,) MISSING, DONE or FAILED, as on disk now."""
         return self.read("status", slice(None))
 
     @property
     def reasons(self) -> list[str]:
-        """(time,) why a frame failed, or nothing."""
+        """(time,) reason of failure, or an empty text."""
         return [str(r) for r in self.read("reason", slice(None))]
 
     def write_frame(self, index: int, frame: Frame) -> None:
-        """Write a frame; it counts as done when the last of it is written."""
+        """Write a frame, its status last."""
         self.write(index, frame.volumes)
         weights = [p.detach().cpu().float().reshape(-1) for p in frame.field.network.parameters()]
         self.array("weights")[index] = torch.cat(weights).numpy()
         self.array("index_scale")[index] = frame.field.scale
         self.array("offset")[index] = frame.field.offset
-        for of in self.view_scores:
-            own = {s["name"]: s for s in frame.scores if s["measured"] == of.technique.measured}
-            for name, array in (("cc", of.cc), ("rms", of.rms)):
-                array[index] = np.array([own.get(view, {}).get(name, np.nan) for view in self.attributes["views"]])
+        for arrays in self.view_scores:
+            scores = {s["name"]: s for s in frame.scores if s["measured"] == arrays.technique.measured}
+            for name, array in (("cc", arrays.cc), ("rms", arrays.rms)):
+                array[index] = np.array([scores.get(view, {}).get(name, np.nan) for view in self.attributes["views"]])
         for name in ("seconds", "steps", "attempts"):
             self.array(name)[index] = getattr(frame, name)
         self.array("reason")[index] = ""
         self.array("status")[index] = DONE
 
     def fail(self, index: int, reason: str, attempts: int) -> None:
-        """Record that a frame failed, and why."""
+        """Record a failed frame."""
         self.array("attempts")[index] = attempts
         self.array("reason")[index] = " ".join(reason.split())
         self.array("status")[index] = FAILED
 
     def forget_failures(self) -> int:
-        """Count failed frames as missing again, and return how many there were."""
+        """Mark failed frames as missing, and return their number."""
         failed = np.flatnonzero(self.status == FAILED)
         for index in failed:
             self.array("status")[int(index)] = MISSING
         return len(failed)
 
     def field(self, index: int) -> NeuralField:
-        """Return the field of a frame that is done."""
+        """Return the field of a complete frame."""
         if int(self.read("status", index)) != DONE:
-            raise InputError(
-                f"frame {index} is not done; run nerif sequence again for what is missing", field=self.path
-            )
+            raise InputError(f"frame {index} is not done; run nerif sequence again for missing frames", field=self.path)
         with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
             network = _network(self.attributes, self.grid.box, float(self.read("index_scale", index)))
-        weights, at = torch.from_numpy(self.read("weights", index)), 0
+        weights = torch.from_numpy(self.read("weights", index))
         scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
-        parameters = list(network.parameters())
-        if len(weights) != sum(p.numel() for p in parameters) or not bool(torch.isfinite(weights).all()):
+        if len(weights) != sum(p.numel() for p in network.parameters()) or not bool(torch.isfinite(weights).all()):
             raise InputError(f"frame {index}: expected finite weights of its network; is it damaged?", field=self.path)
         if not math.isfinite(scale + offset):
             raise InputError(f"frame {index}: expected finite index_scale and offset; is it damaged?", field=self.path)
+        at = 0
         with torch.no_grad():
-            for parameter in parameters:
+            for parameter in network.parameters():
                 parameter.copy_(weights[at : at + parameter.numel()].reshape(parameter.shape))
                 at += parameter.numel()
         network.eval().requires_grad_(False)
         return NeuralField(network, self.grid.box, scale, offset)
 
     def check_same(self, attributes: dict[str, Any]) -> None:
-        """Refuse to go on with other settings than the store was begun with.
-
-        Raises
-        ------
-        InputError
-            Naming the first that differs.
-        """
-        for name, asked in json.loads(json.dumps(attributes)).items():
-            kept = self.attributes.get(name)
-            if isinstance(asked, dict) and isinstance(kept, dict):
-                changed = [k for k in asked if asked[k] != kept.get(k)]
-                if changed:
-                    name, kept, asked = changed[0], kept.get(changed[0]), asked[changed[0]]
-            if kept != asked:
+        """Check that attributes are those the store was begun with; the InputError names the first other one."""
+        for name, new in json.loads(json.dumps(attributes)).items():
+            old = self.attributes.get(name)
+            if isinstance(new, dict) and isinstance(old, dict):
+                key = next((key for key in new if new[key] != old.get(key)), None)
+                name, old, new = (name, None, None) if key is None else (key, old.get(key), new[key])
+            if old != new:
                 raise InputError(
-                    f"{name}: expected {kept!r}, with which it was begun, got {asked!r}; "
-                    "give another --out, or --force to begin anew",
+                    f"{name}: expected {old!r}, with which it was begun, got {new!r}; "
+                    "give another --out, or --force to start again",
                     field=self.path,
                 )
 
 
 def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0) -> Network:
-    """An empty network of the kind that a store was made with, for a field in a box in units of `scale`."""
+    """Return a network of the shape, symmetry and bounds of a store, for a field in units of `scale`."""
     shape = NetworkShape.of(attributes["network"])
-    low, high = attributes.get("bounds", (None, None))  # JSON knows no infinity
+    low, high = attributes.get("bounds", (None, None))  # no infinity in JSON
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
     if attributes.get("symmetry"):
-        own = Symmetry.kept(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
-        return SymmetricNetwork(shape, own, bounds)
+        symmetry = Symmetry.kept(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
+        return SymmetricNetwork(shape, symmetry, bounds)
     return Network(shape, bounds=bounds)

@@ -1,7 +1,7 @@
 """Calibrations of any program, by the ending of the file.
 
-Everything ends as CalibratedCamera in the conventions of docs/conventions.md: OpenCV cameras, pixel (0, 0) the centre
-of the first pixel, world to camera, mm.
+All are converted to CalibratedCamera in the conventions of docs/conventions.md: OpenCV's camera axes, pixel (0, 0) the
+centre of the first pixel, world to camera, mm.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.camera import POWERS
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_names, checked, read_box
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
 from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.calibration.importers.nerfstudio import read_transforms
 from nerif.imaging.calibration.importers.opencv import ENDINGS as OPENCV
@@ -31,34 +31,33 @@ ENDINGS = (*READERS, ".mat")
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """What the file of another program does not say."""
+    """Properties of the cameras that the file of another program may lack."""
 
     scale_mm: float = 1.0
-    """Millimetres in a unit of length of the file that is taken over."""
+    """Unit of length of the imported file, mm."""
     pose: int = 1
-    """Number of the target image that is the world frame, where a file of MATLAB's keeps a pose for each image."""
+    """Number of the target image that defines the world frame, for MATLAB files with one pose per image."""
     background_distance: float | None = None
-    """Where planes are not known: background across the optical axis, this far behind the origin, mm; from target
-    images too, and with --simple, of which the origin is on the axis of the flow."""
+    """Distance from the origin to backgrounds whose planes are not in the file, across the optical axis, mm; also for
+    target images, and for --simple, where the origin is on the axis of the flow."""
     image_size: tuple[int, int] | None = None
-    """Height and width of the images where the file does not say, px."""
+    """Height and width of the images where the file lacks them, px."""
     aperture_diameter: float | None = None
-    """Of the entrance pupils (focal length over f-number), mm, through all of which a pixel then sees; 0 for thin rays,
-    whatever the file says; of telecentric lenses of the cone where it passes z_cam = 0, which calibration has at the
-    origin. From target images too."""
+    """Diameter of the entrance pupils (focal length / f-number), mm; overrides the file; 0: thin rays. Of telecentric
+    lenses: of the cone of rays at z_cam = 0, which calibration places at the origin. Also for target images."""
     focus_distance: float | None = None
-    """Where the lenses are focused, mm along the optical axis; default: as the file says, or on the background."""
+    """Distance of the plane in focus along the optical axis, mm; default: that of the file, or the background."""
     pose_sigma_mm: float | None = None
-    """How far a camera may stand from where its calibration has it, mm (standard deviation; reconstruct --refine goes
-    by it); of target images beside their noise, 0.05 by default; 1 with --simple."""
+    """Standard deviation of the camera positions, mm, the prior of reconstruct --refine; default with target images:
+    0.05 in addition to their noise; with --simple: 1."""
     pose_sigma_deg: float | None = None
-    """How far a camera may be turned from how its calibration has it, degrees; of target images 0.005 by default;
-    0.5 with --simple."""
+    """Standard deviation of the camera rotations, degrees; default with target images: 0.005 in addition to their
+    noise; with --simple: 0.5."""
 
     def __post_init__(self) -> None:
         if self.focus_distance is not None and self.aperture_diameter is None:
             raise InputError("expected together with aperture_diameter, got it alone", field="focus_distance")
-        _ = self.lens
+        _ = self.lens  # validates its numbers
         for name in ("pose_sigma_mm", "pose_sigma_deg"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
@@ -70,20 +69,20 @@ class ImportSettings:
 
     @property
     def pose_sigma(self) -> tuple[float, float] | None:
-        """The standard deviations of where cameras stand and how they are turned, mm and degrees; None if not said."""
+        """Standard deviations of the position (mm) and rotation (degrees) of cameras."""
         if self.pose_sigma_mm is None or self.pose_sigma_deg is None:
             return None
         return self.pose_sigma_mm, self.pose_sigma_deg
 
     @property
     def lens(self) -> Lens | None:
-        """The lens that is given, of every camera; None for none, or thin rays."""
+        """Lens of every camera, or None for thin rays or that of the file."""
         lens = Lens(self.aperture_diameter or 0.0, self.focus_distance)
         return lens if lens.diameter else None
 
 
 def is_calibration(path: Path) -> bool:
-    """Tell a calibration, in a file or a folder of OpenCV files, from a folder with the images of an experiment."""
+    """Distinguish a calibration, a file or a folder of OpenCV files, from a folder with images of an experiment."""
     if not path.is_dir():
         return True
     entries = list(path.iterdir())
@@ -94,19 +93,12 @@ def is_calibration(path: Path) -> bool:
 def import_cameras(
     path: Path, settings: ImportSettings = ImportSettings(), only: Sequence[str] = ()
 ) -> tuple[CalibratedCamera, ...]:
-    """Read the cameras of a file, or of a folder with one OpenCV file a camera.
+    """Read the cameras of a file, or of a folder with one OpenCV file per camera; errors name the file.
 
     Parameters
     ----------
     path : .toml, .csv, .yml, .yaml, .xml (OpenCV), .json (NeRF), .mat (MATLAB)
-    settings : what the file does not say
-    only : names of the cameras wanted; all if empty
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, two cameras have one name, or `only` names a camera that is not there; names the file,
-        what was expected and what came.
+    only : names of the cameras to read; all if empty
     """
     path = Path(path)
     if not path.exists():
@@ -122,20 +114,15 @@ def import_cameras(
     if not cameras:
         raise InputError("holds no camera", field=path)
     check_names(cameras, str(path))
+    names = [c.name for c in cameras]
     for name in only:
-        if name not in [c.name for c in cameras]:
-            raise InputError(f"expected some of {', '.join(c.name for c in cameras)}, got '{name}'", field="views")
-    return tuple(checked(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
+        if name not in names:
+            raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
+    return tuple(check_camera(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
 
 
 def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box | None:
-    """Read the box of a calibration, mm; None if it holds none.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
+    """Read the box of a calibration, mm; None if it has none."""
     box = read_box(path) if Path(path).suffix == ".toml" else None
     if box is None or settings.scale_mm == 1:
         return box
@@ -144,25 +131,25 @@ def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box |
 
 
 def _lens(lens: Lens | None, settings: ImportSettings) -> Lens | None:
-    """The lens of a file in mm; what is given wins, the rest stays."""
-    given, scale = settings.lens, settings.scale_mm
+    """Lens of a file in mm, overridden by the settings."""
+    override, scale = settings.lens, settings.scale_mm
     if lens is None or settings.aperture_diameter == 0:
-        return given
-    own = replace(lens, diameter=scale * lens.diameter, focus=None if lens.focus is None else scale * lens.focus)
-    if given is None:
-        return own
-    return replace(own, diameter=given.diameter, focus=own.focus if given.focus is None else given.focus)
+        return override
+    scaled = replace(lens, diameter=scale * lens.diameter, focus=None if lens.focus is None else scale * lens.focus)
+    if override is None:
+        return scaled
+    return replace(scaled, diameter=override.diameter, focus=override.focus or scaled.focus)
 
 
 def _completed(camera: CalibratedCamera, settings: ImportSettings) -> CalibratedCamera:
-    """The camera in mm, with what the file does not say."""
+    """The camera in mm, completed from the settings."""
     plane, scale = camera.background, settings.scale_mm
     if plane is not None:
         plane = Plane(plane.normal, scale * plane.offset)
     elif settings.background_distance is not None:
         plane = Plane(-camera.rotation[2], -settings.background_distance)  # its normal points to the camera
     intrinsics, distortion = camera.intrinsics.clone(), camera.distortion
-    if not camera.projection.shows_depth:  # (x, y) are lengths of the file's unit
+    if not camera.projection.shows_depth:  # (x, y) are lengths in the unit of the file
         intrinsics[:2, :2] /= scale
         distortion = distortion / scale ** torch.tensor(POWERS)
     sigma = camera.pose_sigma

@@ -1,0 +1,244 @@
+"""A reconstruction into a result directory: its settings, its inputs, and what its steps have produced so far."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from nerif.analysis.asymmetry import halved
+from nerif.analysis.gains import fit_gains, with_gains
+from nerif.analysis.prediction import check_sees
+from nerif.common.conventions import InputError
+from nerif.common.settings import check_settings
+from nerif.data.measurement import Measurement
+from nerif.data.volume import quantities_of
+from nerif.fields.base import Field
+from nerif.physics.quantities import GasSettings
+from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State, Step
+from nerif.reconstruction.files import CHECKPOINT, FIELD
+from nerif.reconstruction.methods import method_name
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.parallel import Ranks
+from nerif.reconstruction.neural.schedule import SlowRun
+from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.shared_settings import SharedSettings
+from nerif.reconstruction.sources import check_source
+from nerif.reconstruction.symmetry import axis_of, with_axis
+from nerif.reconstruction.uncertainty.bootstrap import Trials
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
+from nerif.results.directory import ResultDirectory
+from nerif.results.live import Live
+from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
+
+__all__ = ["Inputs", "Job", "Run", "remedy"]
+
+VOXELS = 100  # of the written volume along the longest edge, for methods without voxels
+
+
+@dataclass(frozen=True)
+class Run:
+    """Settings of a reconstruction into a directory, in addition to those of the method."""
+
+    withhold: tuple[str, ...] = AUTO
+    """Withheld views for cross-validation: names; left or right (half of each image of an axisymmetric flow); auto (one
+    view, in a short run from which the run with all views starts); or none."""
+    start_from: Path | None = None
+    """Result directory with the initial field: a reconstruction by any method in the same box."""
+    fit_gains: bool = False
+    """For emission: fit the intensity gain of each camera (not of withheld views)."""
+    uncertainty: Literal["off", "fast", "full"] = "off"
+    """Standard deviations of every quantity by bootstrap: off, fast (2 trials) or full (8 trials)."""
+    report: bool = True
+    """Write report.html at the end."""
+    checkpoint_every: float = 60.0
+    """Interval between checkpoints in seconds."""
+    gas: GasSettings = field(default_factory=GasSettings)
+    """Gas for density and temperature."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+def remedy(out: ResultDirectory, own: bool) -> str:
+    """Return what an interrupted run has saved, and how to continue; `own`: the directory holds files of this run."""
+    resume = f"nerif reconstruct --resume --out {out.path}"
+    if own and out.has(FIELD):
+        return f"{out.path} holds the field, but not all other files; complete it with {resume}"
+    if own and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):
+        return f"{out.path} holds the last checkpoint; continue with {resume}"
+    return "nothing was saved yet; run the same command again"
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Data of a reconstruction.
+
+    Parameters
+    ----------
+    all_views : as measured, through the lenses that the settings ask for
+    measurement : split into halves of images if one is withheld, divided by the intensity gains
+    training : the part that is fitted
+    withheld : names of the other views
+    gains : intensity gains by view
+    path : of the measurement; None for one in memory
+    """
+
+    all_views: Measurement
+    measurement: Measurement
+    training: Measurement
+    withheld: tuple[str, ...]
+    gains: dict[str, float]
+    path: Path | None
+
+    @classmethod
+    def of(
+        cls, measurement: Measurement | str | os.PathLike[str], reconstructor: Reconstructor, run: Run
+    ) -> tuple[Inputs, Reconstructor]:
+        """Read and split the data; return them with the settings, to which a symmetric flow adds its axis."""
+        path = None if isinstance(measurement, Measurement) else Path(measurement)
+        if not isinstance(measurement, Measurement):
+            measurement = Measurement.read(measurement)
+        all_views = seen_through(measurement, reconstructor.aperture)
+        check_source(reconstructor.source, all_views)  # before any view is withheld
+        measurement, reconstructor, withheld = with_halves(run.withhold, all_views, reconstructor)
+        training = measurement.without(withheld)
+        gains = fit_gains(training) if run.fit_gains else {}
+        if gains:
+            measurement, training = with_gains(measurement, gains), with_gains(training, gains)
+        return cls(all_views, measurement, training, withheld, gains, path), reconstructor
+
+    @property
+    def remarks(self) -> list[str]:
+        """Lines on intensity gains and on pixels that are left out."""
+        lines = []
+        if self.gains:
+            lines.append("intensity gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in self.gains.items()))
+        if self.measurement.bad_pixels:
+            names = " or ".join(kind.measured for kind in self.measurement.techniques)
+            reason = f"pixels left out: {names} or sigma is NaN, infinite or impossible"
+            lines.append(f"{self.path or 'the measurement'}: {self.measurement.bad_pixels} {reason}")
+        for camera in self.measurement.cameras:
+            if camera.unseen:
+                lines.append(
+                    f"view '{camera.name}': {camera.unseen:.1%} of the pixels left out, where its distortion is not "
+                    "invertible; calibrate it with target images that cover its corners"
+                )
+        return lines
+
+
+class Job:
+    """A reconstruction under way. All input is checked when it is made; nothing is written before the first step.
+
+    Attributes
+    ----------
+    measurement, withheld : that predictions are compared with; those of the cross-validation if it was interrupted
+    validation : the cross-validation, or None
+    method, initial, state : settings of the main run, and the field or state it starts from
+    result : of the main run, once there is one
+    """
+
+    result: Reconstruction | None = None
+
+    def __init__(
+        self, out: ResultDirectory, measurement: Measurement | str | os.PathLike[str], reconstructor: Reconstructor,
+        run: Run, *, voxels: int | None = None, resume: bool = False, force: bool = False,
+        keep: Mapping[str, Any] | None = None, on_step: OnStep | None = None, monitor: Monitor = QUIET,
+        live: bool = False,
+    ) -> None:  # fmt: skip
+        self.out, self.resume, self.on_step = out, resume, on_step
+        self.inputs, self.reconstructor = Inputs.of(measurement, reconstructor, run)
+        if voxels is None:
+            voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else VOXELS
+        if voxels < 1:
+            raise InputError(f"expected 1 or more, got {voxels}", field="voxels")
+        self.voxels, self.trials = voxels, Trials(run.uncertainty)
+        self.run = replace(run, gas=run.gas.for_measurement(self.inputs.measurement))
+        for line in self.inputs.remarks:
+            monitor.say(line)
+        slow = SlowRun(self.reconstructor, monitor.say)
+        self.monitor = monitor.telling(slow)
+        self.validation = self._cross_validation()
+        continued = self.validation is None or out.has(CHECKPOINT) or not self.validation.resumable
+        self.state: State | None = out.state() if resume and continued else None
+        self.start = self._start() if self.trials.members or not resume else None
+        if not resume:
+            out.check_free(force)
+        self.ranks = Ranks.from_environment()
+        if self.ranks.size > 1:
+            self._check_parallel()
+        self.method, self.initial = self.reconstructor, self.start
+        self.measurement, self.withheld = self.inputs.measurement, self.inputs.withheld
+        self.settings = self._settings(keep or {})
+        self.begun = False
+        self.view: Live | None = None
+        if live and self.ranks.is_first:
+            data = self.measurement if self.validation is None else self.validation.data
+            self.view = Live(out.path, data, self.reconstructor, next(iter(self.withheld), ""), lambda: slow.line)
+        if self.validation is not None:
+            self.validation = replace(self.validation, monitor=self.watching(withheld=True))
+
+    def watching(self, withheld: bool, looks: bool = True) -> Monitor:
+        """Return the monitor, with the live view if there is one."""
+        return self.monitor if self.view is None else self.view.watching(self.monitor, withheld=withheld, looks=looks)
+
+    def begin(self, step: Step | None = None) -> None:
+        """Prepare the directory at the first step: input that is refused before leaves an older result alone."""
+        if not self.begun:
+            self.out.begin(self.settings, self.resume)
+            self.begun = True
+
+    def _cross_validation(self) -> CrossValidation | None:
+        """Return the cross-validation, if possible: not with an initial field, which may depend on all views."""
+        run, reconstructor, training = self.run, self.reconstructor, self.inputs.training
+        if run.withhold != AUTO or AUTO[0] in training.names or run.start_from is not None:
+            return None
+        if Ranks.from_environment().size > 1:
+            return None
+        if len(training.cameras) < MIN_VIEWS:
+            axis = axis_of(reconstructor, training) if isinstance(reconstructor, SharedSettings) else None
+            if axis is None or not axis.symmetry.axial:
+                return None
+            assert isinstance(reconstructor, SharedSettings)
+            reconstructor, training = with_axis(reconstructor, axis.symmetry), halved(training, axis.symmetry)
+        return CrossValidation(
+            self.out, reconstructor, training, run.checkpoint_every, self.monitor, restart=not self.resume
+        )
+
+    def _check_parallel(self) -> None:
+        """Check that the run can be distributed by torchrun."""
+        if not isinstance(self.reconstructor, NeRIF):
+            name = method_name(self.reconstructor)
+            raise InputError(f"expected nerif under torchrun, got '{name}', which runs in one process", field="method")
+        if self.run.uncertainty != "off":
+            raise InputError("expected off under torchrun; run it in one process", field="uncertainty")
+
+    def _start(self) -> Field | None:
+        """Return the initial field, if any."""
+        path, measurement = self.run.start_from, self.inputs.measurement
+        if path is None:
+            return None
+        directory = ResultDirectory(path)
+        start, box, _ = directory.field()
+        check_sees(measurement.techniques, directory.quantity(), f"start_from {path}")
+        if box != measurement.box:
+            raise InputError(
+                f"expected a reconstruction in the box of the measurement, "
+                f"{measurement.box.lower} to {measurement.box.upper} mm, got {box.lower} to {box.upper}",
+                field=path,
+            )
+        return start
+
+    def _settings(self, keep: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings that repeat the run, by the names of the options."""
+        run, reconstructor, path = self.run, self.reconstructor, self.inputs.path
+        settings: dict[str, Any] = {**keep, **asdict(run), **asdict(reconstructor)}  # type: ignore[call-overload]
+        if run.start_from is not None:
+            settings["start_from"] = run.start_from.resolve()
+        if "density" not in quantities_of(self.measurement.quantity):
+            del settings["gas"]
+        file = None if path is None else str(path.resolve())
+        return {"measurement": file, "method": method_name(reconstructor), "voxels": self.voxels, **settings}

@@ -1,0 +1,45 @@
+"""Write the report of a result or of a sequence."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from nerif.data.volume_sequence import VolumeSequence
+from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.report import html
+from nerif.report.sequence_page import render_sequence
+from nerif.results.directory import REPORT, ResultDirectory
+
+__all__ = ["write_report", "write_sequence_report"]
+
+
+def write_report(directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
+    """Write the report of a result directory, and return its path."""
+    out = ResultDirectory(directory, monitor.say)
+    path = path or out / REPORT
+    with monitor.counting("writing the report"):
+        result = out.read()
+        page = html.render(result)
+    if path == out / REPORT:
+        with out.writing(REPORT):
+            html.write(page, path)
+    else:
+        html.write(page, path)
+    for gap in result.missing:
+        monitor.say(f"missing: {gap.sentence}")
+    _say_size(path, monitor)
+    return path
+
+
+def write_sequence_report(store: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
+    """Write the report of a store of nerif sequence, complete or not, and return its path."""
+    path = path or Path(store).with_suffix(".html")
+    html.write(render_sequence(VolumeSequence(store)), path)
+    _say_size(path, monitor)
+    return path
+
+
+def _say_size(path: Path, monitor: Monitor) -> None:
+    size = path.stat().st_size
+    monitor.say(f"{path}: {f'{size / 1e6:.1f} MB' if size > 1e6 else f'{size / 1e3:.0f} kB'}; open it in a browser")

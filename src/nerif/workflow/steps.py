@@ -1,0 +1,263 @@
+"""The steps of a reconstruction into a result directory.
+
+Each says whether it is wanted, and writes its own files and its own section of metrics.json. A run that is resumed
+passes through all of them again: what is expensive (cross-validation, fit, trials) continues from its own checkpoint or
+is read, the rest is written again.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import asdict, replace
+from typing import Any, ClassVar
+
+from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence
+from nerif.analysis.evaluation import evaluate_views, score_lines
+from nerif.analysis.prediction import reproject
+from nerif.analysis.verdict import verdict
+from nerif.data.volume import quantities_of
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
+from nerif.physics.quantities import NOT_UNIFORM, masked_lines
+from nerif.reconstruction.base import Reconstruction, compose
+from nerif.reconstruction.files import FIELD, checkpoints
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.rig.parameters import moved_lines, with_corrections
+from nerif.reconstruction.rig.posterior import with_posterior
+from nerif.reconstruction.rig.refinement import refit
+from nerif.results.directory import CALIBRATION, versions
+from nerif.workflow.job import Job
+from nerif.workflow.repeats import Members, all_quantities
+from nerif.workflow.reports import write_report
+
+__all__ = ["CLOSING", "STEPS", "PipelineStep"]
+
+
+class PipelineStep(ABC):
+    """A step of the pipeline."""
+
+    sections: ClassVar[tuple[str, ...]] = ()
+    """Entries of metrics.json that it writes."""
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        """Return whether the step has anything to do."""
+        return True
+
+    @staticmethod
+    @abstractmethod
+    def run(job: Job) -> None:
+        """Do it."""
+
+
+class CrossValidate(PipelineStep):
+    """Predict a view from a short run without it; the main run starts from the field of that run.
+
+    Writes and resumes from cross_validation/. If it is interrupted, its field is the result.
+    """
+
+    sections = ("cross_validation",)
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return job.validation is not None and job.state is None
+
+    @staticmethod
+    def run(job: Job) -> None:
+        assert job.validation is not None
+        short = job.validation(job.begin)
+        if short is None:
+            return
+        job.initial, job.method = short.field, job.reconstructor.in_two()[1]
+        if short.outcome.reason == "interrupted":
+            job.result = replace(short, state=None)
+            job.measurement, job.withheld = job.validation.data, (job.validation.view,)
+
+
+class Fit(PipelineStep):
+    """Reconstruct the field from all views that are not withheld; resumes from checkpoint.safetensors."""
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return job.result is None
+
+    @staticmethod
+    def run(job: Job) -> None:
+        title = "training" if isinstance(job.reconstructor, NeRIF) else "solving"
+        with job.watching(withheld=bool(job.withheld)).training(title) as progress:
+            callbacks = [progress]
+            if job.ranks.is_first:  # under torchrun only the first process writes
+                callbacks = [job.begin, progress, checkpoints(job.out.path, job.run.checkpoint_every)]
+            if job.on_step is not None:
+                callbacks.append(job.on_step)
+            initial = job.initial if job.state is None else None
+            job.result = job.method(job.inputs.training, compose(*callbacks), job.state, initial)
+
+
+class WriteField(PipelineStep):
+    """Write field, history, volumes, run.toml and the figures of the run, the most expensive first."""
+
+    sections = ("seconds", "peak_memory_bytes", "device", "outcome", "message", "measurement")
+
+    @staticmethod
+    def run(job: Job) -> None:
+        out, result, say = job.out, the_result(job), job.monitor.say
+        job.begin()
+        out.write_field(result)
+        out.write_history(result.history)
+        say(f"{result.outcome.reason}: {result.outcome.message}")
+        with job.monitor.counting("sampling the field"):
+            volumes = all_quantities(result, job.run.gas, job.voxels)
+            out.write_volumes(volumes)
+        for line in masked_lines(volumes):
+            say(line)
+        temperature = "temperature" in quantities_of(job.measurement.quantity)
+        if temperature and all(v.quantity != "temperature" for v in volumes):
+            say(f"temperature: not computed: {NOT_UNIFORM}")
+        scores = {} if job.validation is None else job.validation.scores()
+        metrics: dict[str, Any] = {"cross_validation": scores} if scores else {}
+        metrics |= {name: getattr(result, name) for name in ("seconds", "peak_memory_bytes", "device")}
+        metrics |= {"outcome": result.outcome.reason, "message": result.outcome.message}
+        out.write_metrics({**metrics, "measurement": job.settings["measurement"]})
+        about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
+        out.write_settings(job.settings, about | ({"gains": job.inputs.gains} if job.inputs.gains else {}))
+
+
+class WriteRig(PipelineStep):
+    """Write the refined calibration with its uncertainty; predictions use it from here on."""
+
+    sections = ("rig", "rig_withheld", "views_refitted")
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return bool(the_result(job).rig)
+
+    @staticmethod
+    def run(job: Job) -> None:
+        out, result, monitor, measurement = job.out, the_result(job), job.monitor, job.measurement
+        with monitor.counting("uncertainty of the rig") as bar:
+            training = measurement.without(job.withheld)
+            rig = with_posterior(result.rig, training, result.field, result.settings, bar)
+        job.measurement = with_corrections(measurement, rig)
+        out.add_metrics({"rig": rig})
+        with out.writing(CALIBRATION) as path:
+            write_cameras(path, [CalibratedCamera.from_camera(c) for c in job.measurement.cameras])
+        for line in moved_lines(rig):
+            monitor.say(line)
+        if not job.withheld:
+            return
+        withheld = measurement.select(job.withheld)
+        with monitor.counting("refining the withheld views"):
+            table = refit(result.field, withheld, result.settings, result.device)
+            refitted = reproject(result.field, with_corrections(withheld, table), job.withheld, result.device)
+        views = evaluate_views(refitted) if table else []
+        out.add_metrics({"rig_withheld": table, "views_refitted": views})
+        for line in score_lines(views):
+            monitor.say(f"{line}, its camera refined against the field")
+
+
+class Reproject(PipelineStep):
+    """Write the prediction of every view, and its scores."""
+
+    sections = ("views", "reprojection")
+
+    @staticmethod
+    def run(job: Job) -> None:
+        out, result, monitor = job.out, the_result(job), job.monitor
+        with monitor.counting("re-projecting") as bar:
+            reprojection = reproject(result.field, job.measurement, job.withheld, result.device, bar, result.model)
+        with monitor.counting("scoring the views"):
+            views = evaluate_views(reprojection)
+            out.add_metrics({"views": views, "reprojection": [a.entries for a in reprojection.accuracies]})
+            out.write_reprojection(reprojection)
+        for line in (*score_lines(views), *(accuracy.sentence for accuracy in reprojection.accuracies)):
+            monitor.say(line)
+        seconds, volume = f"{result.seconds:.0f} s on {result.device}", out / "volume.vti"
+        monitor.say(f"{out.path}: result of {seconds}; open {volume} in ParaView")
+
+
+class WriteAxis(PipelineStep):
+    """Write the axis of a symmetric flow, and the asymmetry of the measurement."""
+
+    sections = ("axis", "asymmetry")
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return the_result(job).axis is not None
+
+    @staticmethod
+    def run(job: Job) -> None:
+        axis = the_result(job).axis
+        assert axis is not None
+        departures = asymmetry(job.inputs.all_views, axis.symmetry) if axis.symmetry.axial else []
+        job.out.add_metrics({"axis": axis.record, "asymmetry": departures})
+        for line in (*axis.sentences, *(asymmetry_sentence(d) for d in departures)):
+            job.monitor.say(line)
+
+
+class Bootstrap(PipelineStep):
+    """Add standard deviations to the volumes; writes and resumes from trials/."""
+
+    sections = ("uncertainty",)
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return bool(job.trials.members) and the_result(job).outcome.reason != "interrupted"
+
+    @staticmethod
+    def run(job: Job) -> None:
+        result = the_result(job)
+        if result.outcome.failed:
+            job.monitor.say(f"uncertainty: skipped: the main run {result.outcome.reason}")
+            return
+        corrected = with_corrections(job.inputs.training, result.rig)  # trials do not refine the rig again
+        dependencies = {"start_from": str(job.run.start_from)}
+        monitor = job.watching(withheld=False, looks=False)
+        members = Members(
+            job.out, job.trials, job.reconstructor, corrected, job.start, dependencies, job.run.checkpoint_every,
+            monitor,
+        )  # fmt: skip
+        members.add_to(result, job.run.gas, job.voxels)
+
+
+class Judge(PipelineStep):
+    """Write the verdict on the result, and the meridian plane of a symmetric flow."""
+
+    sections = ("verdict",)
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return job.result is not None and job.begun and job.out.has(FIELD)
+
+    @staticmethod
+    def run(job: Job) -> None:
+        result = job.out.read()
+        if (meridian := result.meridian) is not None:
+            job.out.write_meridian(meridian)
+        assessment = verdict(result)
+        job.out.add_metrics({"verdict": asdict(assessment)})
+        job.monitor.say(assessment.sentence)
+
+
+class WriteReport(PipelineStep):
+    """Write report.html."""
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return job.run.report and Judge.wanted(job)
+
+    @staticmethod
+    def run(job: Job) -> None:
+        write_report(job.out.path, monitor=job.monitor)
+
+
+STEPS: tuple[type[PipelineStep], ...] = (
+    CrossValidate, Fit, WriteField, WriteRig, Reproject, WriteAxis, Bootstrap,
+)  # fmt: skip
+CLOSING: tuple[type[PipelineStep], ...] = (Judge, WriteReport)
+"""Run whatever became of the others, if there is a field."""
+
+
+def the_result(job: Job) -> Reconstruction:
+    """Return the result of the main run, which a step before has produced."""
+    assert job.result is not None
+    return job.result
