@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from nerif.common.conventions import InputError, check_positive
+from nerif.common.conventions import InputError
+from nerif.common.settings import Positive, check_settings
 from nerif.geometry import Ring
 from nerif.physics.gas_optics import ambient_index
 
@@ -25,29 +26,29 @@ DOT = 3.0  # px
 class DesignSettings:
     """The flow, the light and the optical flow."""
 
-    index_contrast: float = 2.0e-4
+    index_contrast: Positive = 2.0e-4
     """Largest difference of the index to the ambient."""
-    temperature: float | None = None
+    temperature: Positive | None = None
     """Hottest (or coldest) temperature of air, K; replaces index_contrast."""
-    ambient_temperature: float = 293.15
+    ambient_temperature: Positive = 293.15
     """Temperature of the air around, K."""
-    pressure_pa: float = 101325.0
+    pressure_pa: Positive = 101325.0
     """Pressure, Pa."""
-    f_number: float = 16.0
+    f_number: Positive = 16.0
     """Focal length over aperture; of a telecentric lens the f-number on the sensor's side."""
-    wavelength_nm: float = 532.0
+    wavelength_nm: Positive = 532.0
     """Wavelength of the light, nm."""
-    flow_size: float = 50.0
+    flow_size: Positive = 50.0
     """Width of the flow, and path length through it, mm."""
-    feature_size: float = 5.0
+    feature_size: Positive = 5.0
     """Smallest structure of interest, which has the whole contrast, mm."""
-    displacement_noise: float = 0.03
+    displacement_noise: Positive = 0.03
     """Noise of the optical flow, px."""
-    window: float = 8.0
+    window: Positive = 8.0
     """Averaging window of the optical flow, px."""
 
     def __post_init__(self) -> None:
-        check_positive(self, *(name for name in self.__dataclass_fields__ if getattr(self, name) is not None))
+        check_settings(self)
         if self.temperature == self.ambient_temperature:
             raise InputError(f"expected not ambient_temperature, {self.temperature} K", field="temperature")
 

@@ -7,13 +7,16 @@ is the mean of the texture at X. Without a field the same rays are straight: the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError, Points
+from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.fields.base import Field
 from nerif.forward.ray_tracing import trace
 from nerif.geometry import Box, Camera, Lens, Plane, Rays
@@ -81,16 +84,13 @@ class Sensor:
     read_noise : standard deviation, electrons
     """
 
-    bits: int = 12
-    exposure: float = 0.8
-    full_well: float = 10000.0
-    read_noise: float = 10.0
+    bits: Annotated[int, Ge(8), Le(16)] = 12
+    exposure: Positive = 0.8
+    full_well: NonNegative = 10000.0
+    read_noise: NonNegative = 10.0
 
     def __post_init__(self) -> None:
-        if not 8 <= self.bits <= 16:
-            raise InputError(f"expected 8 to 16, got {self.bits}", field="bits")
-        if not self.exposure > 0 or not self.full_well >= 0 or not self.read_noise >= 0:
-            raise InputError("expected exposure > 0, full_well >= 0 and read_noise >= 0", field="sensor")
+        check_settings(self)
 
     def expose(self, light: Float[Tensor, "row column"], seed: int) -> np.ndarray:
         """Return counts of light from 0 (black) to 1 (white paper): shot noise, read noise, rounding, saturation."""

@@ -6,16 +6,19 @@ techniques have straight rays.
 
 from __future__ import annotations
 
-import sys
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Lt
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError, check_positive
+from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
+from nerif.common.settings import Count, check_settings
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import INDEX, Volume
@@ -32,6 +35,7 @@ from nerif.geometry import Box, Camera, Grid, Rays
 
 __all__ = ["Simulation", "add_noise", "add_quantum_noise", "simulate", "view_displacement"]
 
+Finite = Annotated[float, Ge(0), Lt(math.inf)]
 MOVING = ("flame", "2", "3", "4", "5", "6", "7")
 PEAK_VOXELS = 64  # along the longest edge, to find the largest value of a phantom
 RAY_CHUNK = 2048  # rays that are integrated at a time
@@ -159,11 +163,11 @@ class Simulation:
     1-7 (the paper's numbers), or your own volume file (.nc, .vti)."""
     technique: tuple[str, ...] = (ASSUMED.name,)
     """Data of a pixel: deflection, absorption, emission or interferometry; several if they share one field."""
-    peak: float = 0.0
+    peak: Finite = 0.0
     """Largest extinction or emission, 1/mm, that a phantom is scaled to; 0 for one that gives about 1 along a ray."""
     noise: float = 0.0
     """Standard deviation of the noise as a share of the rms over rays that cross the box."""
-    counts: float = 0.0
+    counts: Finite = 0.0
     """Detected quanta, for shot noise instead: without the medium (absorption) or where it is brightest."""
     seed: int = 0
     """Of phantom and noise."""
@@ -177,24 +181,22 @@ class Simulation:
     """Wavelength of the light, nm (stored in the file)."""
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
     """Faces of the box on which the index is ambient (stored in the file)."""
-    truth_voxels: int = 100
+    truth_voxels: Count = 100
     """Voxels of the truth along the longest edge."""
     steps: int = STEPS
     """Runge-Kutta steps of a ray through the box."""
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if not self.technique:
             raise InputError(f"expected one or more of {', '.join(TECHNIQUES)}, got none", field="technique")
         kinds = [technique(name) for name in self.technique]
         check_simulated(kinds)
-        check_positive(self, "peak", "counts", zero=True, limit=sys.float_info.max)
         if self.peak and (self._is_file or kinds[0].quantity == INDEX):
             what = "a volume file, which is not scaled" if self._is_file else f"{kinds[0].name}, of an index"
             raise InputError(f"expected for the extinction or emission of a phantom, got {what}; omit it", field="peak")
         if self.counts and self.noise:
             raise InputError("expected without --noise, which it replaces", field="counts")
-        if self.truth_voxels < 1:
-            raise InputError(f"expected at least 1, got {self.truth_voxels}", field="truth_voxels")
 
     def __call__(
         self, cameras: Sequence[Camera], on_view: Callable[[int], None] | None = None, frame: int = 0

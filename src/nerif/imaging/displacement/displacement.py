@@ -13,11 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Lt
 from jaxtyping import Bool, Float, Shaped
 
-from nerif.common.conventions import InputError, check_positive
+from nerif.common.conventions import InputError
+from nerif.common.settings import Positive, check_settings
 from nerif.imaging.displacement.noise import FLOOR, local_correlation, smoothing_error, structure_variance
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
@@ -45,24 +48,21 @@ class DisplacementSettings:
     method: str = "correlation"
     """correlation (windows of 12 px x smoothness; best on dots), dis (fast, good on noise), deepflow (the paper's),
     ilk, tvl1."""
-    smoothness: float = 1.0
+    smoothness: Positive = 1.0
     """Above 1 for smoother displacements; scales window or regularisation (fixed for deepflow)."""
-    local_contrast: int = 0
+    local_contrast: Annotated[int, Ge(0)] = 0
     """Window (px) over which brightness and contrast are equalised; 0 matches them over the whole image only."""
-    shake_border: int = 0
+    shake_border: Annotated[int, Ge(0)] = 0
     """Width (px) of the flow-free border to which shift, rotation and zoom are fitted and removed; 0 for none."""
-    max_sigma: float = 0.5
+    max_sigma: Positive = 0.5
     """Pixels with more noise than this are not valid, px."""
-    min_correlation: float = 0.5
+    min_correlation: Annotated[float, Ge(-1), Lt(1)] = 0.5
     """Pixels with a lower local correlation of flow image and warped reference are not valid."""
 
     def __post_init__(self) -> None:
         if self.method not in FLOWS:
             raise InputError(f"expected one of {', '.join(FLOWS)}, got '{self.method}'", field="method")
-        check_positive(self, "smoothness", "max_sigma")
-        check_positive(self, "local_contrast", "shake_border", zero=True)
-        if not -1 <= self.min_correlation < 1:
-            raise InputError(f"expected a number from -1 to 1, got {self.min_correlation}", field="min_correlation")
+        check_settings(self)
 
     @property
     def reach(self) -> float:

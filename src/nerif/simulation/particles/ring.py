@@ -14,17 +14,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
+from nerif.common.conventions import InputError
+from nerif.common.settings import check_settings
 from nerif.geometry import Box
 from nerif.simulation.particles.cloud import Particles
 
 __all__ = ["VortexRing"]
 
+Length = Annotated[float, Gt(0), Lt(math.inf)]
 SEGMENTS = 128  # of the circle
 MIN_CORE = 0.05  # of the radius: thinner cores need more segments
 CHUNK = 2048  # points at a time
@@ -44,13 +48,13 @@ class VortexRing:
     centre : mm
     """
 
-    radius: float
-    core: float
+    radius: Length
+    core: Length
     circulation: float
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_positive(self, "radius", "core", limit=LARGEST_LENGTH)
+        check_settings(self)
         if self.core < MIN_CORE * self.radius:
             raise InputError(
                 f"expected at least {MIN_CORE} of the radius, {self.radius} mm, got {self.core}", field="core"
