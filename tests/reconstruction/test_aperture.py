@@ -21,7 +21,7 @@ from nerif.forward.images import Images
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
-from nerif.reconstruction.aperture import lens_rays, seen_through
+from nerif.reconstruction.aperture import apply_aperture, lens_rays
 from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective
@@ -94,10 +94,10 @@ def test_windows_are_in_files_and_apply_to_displacements_alone(wide, tmp_path):
     dataset = xr.load_dataset(tmp_path / "m.nc")
     assert dataset["window"].attrs["units"] == "px"
     assert "aperture_diameter" not in dataset
-    assert lens_rays(seen_through(back, "auto")) > 1
-    assert lens_rays(seen_through(back, "off")) == 1
+    assert lens_rays(apply_aperture(back, "auto")) > 1
+    assert lens_rays(apply_aperture(back, "off")) == 1
     with refused("aperture"):
-        seen_through(back, "on")
+        apply_aperture(back, "on")
     assert Images.seen_by(cameras[3]).lens.window == 0
     assert wide.techniques[0].seen_by(cameras[3]).lens.window == 3
     dataset["window"][1] = -1.0
@@ -142,14 +142,14 @@ def test_the_operator_agrees_with_the_path_integral(wide):
 
 
 def test_the_aperture_can_be_off_or_required(wide):
-    thin = seen_through(wide, "off")
+    thin = apply_aperture(wide, "off")
     assert all(camera.lens is None for camera in thin.cameras)
-    assert seen_through(wide, "auto") is seen_through(wide, "on") is wide
-    assert seen_through(thin, "off") is thin
+    assert apply_aperture(wide, "auto") is apply_aperture(wide, "on") is wide
+    assert apply_aperture(thin, "off") is thin
     none = replace(wide, cameras=tuple(replace(camera, lens=Lens(0.0)) for camera in wide.cameras))
-    assert all(camera.lens is None for camera in seen_through(none, "auto").cameras)
+    assert all(camera.lens is None for camera in apply_aperture(none, "auto").cameras)
     with refused("aperture"):
-        seen_through(thin, "on")
+        apply_aperture(thin, "on")
     for kind in (NeRIF, Tikhonov):
         with refused("aperture"):
             kind(aperture="f/8")
@@ -163,7 +163,7 @@ def test_a_wider_cone_has_more_rays(wide):
     def of(diameter: float, count: int = 0) -> int:
         return lens_rays(replace(wide, cameras=tuple(replace(c, lens=Lens(diameter)) for c in wide.cameras)), count)
 
-    assert lens_rays(seen_through(wide, "off")) == 1
+    assert lens_rays(apply_aperture(wide, "off")) == 1
     assert [of(0.0), of(1.0), of(100.0), of(4.0, 8)] == [1, 2, 12, 8]
     assert 2 <= of(4.0) <= of(8.0) <= of(16.0) <= 12
 
@@ -221,7 +221,7 @@ def test_a_run_through_lenses_resumes_exactly(wide):
     half = settings(wide, on_step=lambda step: step.step == 10)
     assert torch.equal(whole.field(points), settings(wide, resume=half.state).field(points))
     with refused("resume"):
-        settings(seen_through(wide, "off"), resume=half.state)
+        settings(apply_aperture(wide, "off"), resume=half.state)
 
 
 @pytest.mark.slow
@@ -234,7 +234,7 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     assert main(["reconstruct", str(path), "-o", str(out), "--aperture", "off", *quick]) == 0
     assert main(["evaluate", str(out), "--measurement", str(path)]) == 0
     field, _, _ = ResultDirectory(out).field()
-    seen = {name: reproject(field, seen_through(wide, name)) for name in ("auto", "off")}
+    seen = {name: reproject(field, apply_aperture(wide, name)) for name in ("auto", "off")}
     scores = {name: evaluate_views(reprojection)[0]["rms"] for name, reprojection in seen.items()}
     assert ResultDirectory(out).metrics()["views"][0]["rms"] == pytest.approx(scores["off"], rel=1e-4)
     assert scores["auto"] != pytest.approx(scores["off"], rel=1e-3)
@@ -245,7 +245,7 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     assert [c.lens.diameter for c in Measurement.read(tmp_path / "p.nc").cameras] == pytest.approx([12.5, 12.5])
     assert main(["simulate", "-o", str(tmp_path / "s.nc"), *ring, "--steps", "5", "--truth-voxels", "4"]) == 0
     assert [c.lens.diameter for c in Measurement.read(tmp_path / "s.nc").cameras] == pytest.approx([12.5, 12.5])
-    seen_through(wide, "off").write(tmp_path / "thin.nc")
+    apply_aperture(wide, "off").write(tmp_path / "thin.nc")
     capsys.readouterr()
     assert main(["reconstruct", str(tmp_path / "thin.nc"), "-o", str(tmp_path / "t"), "--aperture", "on", *quick]) == 2
     told = capsys.readouterr().err
@@ -272,7 +272,7 @@ def test_a_check_uses_the_lenses_by_default(wide, tmp_path, capsys):
     thin = [view.agreement for view in check_consistency(wide, 12, aperture="off").views]
     assert len(through) == len(thin) == len(wide.names)
     assert through != thin
-    seen_through(wide, "off").write(tmp_path / "thin.nc")
+    apply_aperture(wide, "off").write(tmp_path / "thin.nc")
     for more in ([], ["--refine", "cameras", "--time-limit", "1"]):
         assert main(["check", str(tmp_path / "thin.nc"), "--aperture", "on", *more]) == 2
         assert "aperture: expected a measurement that knows aperture_diameter" in capsys.readouterr().err

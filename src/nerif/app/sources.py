@@ -13,7 +13,7 @@ from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.plotting.drawing import colour_range, shown
 from nerif.report.isosurface import default_level
-from nerif.report.movie import frames_there, ranges_over_time
+from nerif.report.movie import finished_frames, ranges_over_time
 from nerif.report.packing import coarsen
 from nerif.results.directory import VOLUME
 
@@ -98,7 +98,7 @@ class Film:
     def __init__(self, path: Path) -> None:
         self.path = path
         store = VolumeSequence(path)
-        self.times, self.frames = store.times, frames_there(store)
+        self.times, self.frames = store.times, finished_frames(store)
         self.quantities = _worth_showing(store.quantities)
         if not self.frames:
             raise InputError("no frame of it is done yet", field=path.name)

@@ -31,10 +31,10 @@ __all__ = [
     "draw_map",
     "draw_slice",
     "draw_slices",
-    "drawn_of",
     "label_of",
     "map_colours",
     "map_range",
+    "plotted_quantities",
     "shown",
     "style",
 ]
@@ -72,7 +72,7 @@ LABELS = {
 """Label of a colour bar, and unit."""
 
 
-def drawn_of(quantities: Iterable[str]) -> tuple[str, ...]:
+def plotted_quantities(quantities: Iterable[str]) -> tuple[str, ...]:
     """Return the quantities of a result to plot: without statistics, and without the index excess, which n shows."""
     return tuple(q for q in quantities if q != "index_excess" and q.rpartition("_")[2] not in STATISTICS)
 

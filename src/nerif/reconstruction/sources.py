@@ -20,7 +20,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, Observation
 
-__all__ = ["Stage", "check_source", "chosen_source", "of_source", "stages"]
+__all__ = ["Stage", "check_source", "of_source", "resolve_source", "stages"]
 
 SOURCES = ("auto", "images", "displacements", "both")
 SOFT_PX = 0.6  # standard deviation
@@ -57,7 +57,7 @@ def check_source(source: str, measurement: Measurement | None = None) -> None:
         raise InputError(f"expected displacements for '{source}', got images alone; give --from images", field="from")
 
 
-def chosen_source(measurement: Measurement, source: str, preferred: str) -> str:
+def resolve_source(measurement: Measurement, source: str, preferred: str) -> str:
     """Return the source, with "auto" replaced by the preferred one if there are both displacements and images."""
     images, displacements = _pair(measurement)
     return preferred if source == "auto" and images is not None and displacements is not None else source
@@ -72,7 +72,7 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, pref
     images, displacements = _pair(measurement)
     if images is None:
         return measurement
-    source = chosen_source(measurement, source, preferred)
+    source = resolve_source(measurement, source, preferred)
     if displacements is not None and source == "displacements":
         return images.without(measurement)
     whole = measurement if source == "both" or displacements is None else displacements.without(measurement)

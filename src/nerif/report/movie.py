@@ -18,7 +18,7 @@ from nerif.data.volume_sequence import VolumeSequence
 from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
 from nerif.report.isosurface import default_level, filled
 
-__all__ = ["STYLES", "Movie", "frames_there", "ranges_over_time"]
+__all__ = ["STYLES", "Movie", "finished_frames", "ranges_over_time"]
 
 STYLES = ("isosurface", "slices")
 FORMATS = (".mp4", ".gif")
@@ -164,7 +164,7 @@ def ranges_over_time(
     return limits, float(np.median([default_level(v) for v in sample]))
 
 
-def frames_there(store: VolumeSequence) -> list[int]:
+def finished_frames(store: VolumeSequence) -> list[int]:
     """Return the available frames: all of a store without status, else the finished ones."""
     if "status" not in store.group:
         return list(range(len(store)))

@@ -19,7 +19,15 @@ from nerif.data.measurement import Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
 from nerif.plotting import drawing
-from nerif.plotting.drawing import add_colour_bar, colour_range, draw_map, drawn_of, label_of, map_range, shown
+from nerif.plotting.drawing import (
+    add_colour_bar,
+    colour_range,
+    draw_map,
+    label_of,
+    map_range,
+    plotted_quantities,
+    shown,
+)
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
@@ -60,7 +68,7 @@ def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi
 
 def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[str, Figure]]:
     """Draw the figures one by one, with their names; `single` and `double` are column widths, mm."""
-    metrics, quantities = result.metrics, drawn_of(result.volumes)
+    metrics, quantities = result.metrics, plotted_quantities(result.volumes)
 
     def plot(height_over_width: float, draw: Callable[..., object], *data: Any) -> Figure:
         figure = _page(single, height_over_width)
@@ -78,7 +86,7 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
     if (meridian := result.meridian) is not None:
         plots = ("section", draw_section), ("profiles", draw_profiles), ("centre_line", draw_centre_line)
-        for quantity, (name, draw) in itertools.product(drawn_of(meridian.quantities), plots):
+        for quantity, (name, draw) in itertools.product(plotted_quantities(meridian.quantities), plots):
             yield f"{name}_{quantity}", plot(0.9 if name == "section" else 0.7, draw, meridian, quantity)
     if result.reprojection is not None:
         used: set[str] = set()

@@ -17,7 +17,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import quantities_of
 from nerif.fields.base import Field
 from nerif.physics.quantities import GasSettings
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import method_name
@@ -102,7 +102,7 @@ class Inputs:
         path = None if isinstance(measurement, Measurement) else Path(measurement)
         if not isinstance(measurement, Measurement):
             measurement = Measurement.read(measurement)
-        all_views = seen_through(measurement, reconstructor.aperture)
+        all_views = apply_aperture(measurement, reconstructor.aperture)
         check_source(reconstructor.source, all_views)  # before any view is withheld
         measurement, reconstructor, withheld = with_halves(run.withhold, all_views, reconstructor)
         training = measurement.without(withheld)
