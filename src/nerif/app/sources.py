@@ -11,7 +11,7 @@ from nerif.common.conventions import STATISTICS, InputError
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.plotting.drawing import colour_range, shown
+from nerif.plotting.drawing import colour_range, plotted_values
 from nerif.report.isosurface import default_level
 from nerif.report.movie import finished_frames, ranges_over_time
 from nerif.report.packing import coarsen
@@ -75,7 +75,7 @@ class Still:
 
     def limits(self, quantity: str) -> Limits:
         """Return the ends of its colours."""
-        return colour_range(shown(self.volume(quantity)))
+        return colour_range(plotted_values(self.volume(quantity)))
 
     def level(self, quantity: str) -> float:
         """Return the level of its isosurface to begin with."""

@@ -35,7 +35,7 @@ __all__ = [
     "map_colours",
     "map_range",
     "plotted_quantities",
-    "shown",
+    "plotted_values",
     "style",
 ]
 
@@ -110,7 +110,7 @@ def label_of(quantity: str) -> str:
     return f"{name} [{unit}]"
 
 
-def shown(volume: Drawable) -> np.ndarray:
+def plotted_values(volume: Drawable) -> np.ndarray:
     """Return the values to plot, (z, y, x): n - 1 for n."""
     values = volume.values.double().numpy()
     return values - 1 if volume.quantity == "n" else values
@@ -120,7 +120,7 @@ def draw_slice(
     axes: Axes, volume: Drawable, normal: str, limits: tuple[float, float] | None = None, colour_map: str | None = None
 ) -> Axes:
     """Draw the middle slice of a volume across the axis `normal`; lengths in mm, masked voxels grey."""
-    values = shown(volume)
+    values = plotted_values(volume)
     low, high = limits or colour_range(values)
     axis = "zyx".index(normal)
     plane = np.take(values, values.shape[axis] // 2, axis=axis)

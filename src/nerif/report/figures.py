@@ -10,7 +10,7 @@ import numpy as np
 from nerif.analysis.metrics import LEVELS
 from nerif.data.volume import Volume
 from nerif.geometry import Camera
-from nerif.plotting.drawing import COLOURS, label_of, plotted_quantities, shown
+from nerif.plotting.drawing import COLOURS, label_of, plotted_quantities, plotted_values
 from nerif.reconstruction.uncertainty.bootstrap import TAILS
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def draw_bands(axes: Axes, volumes: Mapping[str, Volume], quantity: str) -> Axes
     quantity : one of `banded`
     """
     volume = volumes[quantity]
-    values, std = shown(volume), volumes[f"{quantity}_std"].values.double().numpy()
+    values, std = plotted_values(volume), volumes[f"{quantity}_std"].values.double().numpy()
     ends = [volumes.get(f"{quantity}_{name}") for name in ("p05", "p95")]
     low, high = (
         values + sign * BAND_SIGMAS * std if end is None else end.values.double().numpy()

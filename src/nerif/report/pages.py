@@ -26,7 +26,7 @@ from nerif.plotting.drawing import (
     label_of,
     map_range,
     plotted_quantities,
-    shown,
+    plotted_values,
 )
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface
@@ -128,7 +128,7 @@ def slices(volume: Volume, width: float, std: Volume | None = None) -> Figure:
     ratios = [ex, ex, ey]
     figure = _page(width, max(0.2, 0.80 * max(ey, ez) / sum(ratios)) + 0.06)
     row = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
-    low, high = limits = colour_range(shown(volume))
+    low, high = limits = colour_range(plotted_values(volume))
     doubtful = None if std is None else std.values.double().numpy() > HATCHED_STD * (high - low)
     drawing.draw_slices(row, volume, limits, doubtful=doubtful)
     add_colour_bar(row, label_of(volume.quantity))
@@ -239,7 +239,7 @@ def rig(reprojection: Reprojection, width: float) -> Figure:
 def comparison(field: Volume, error: Volume, width: float) -> Figure:
     """Draw middle slices of reconstruction, truth and error."""
     truth = replace(field, values=field.values - error.values)
-    limits = colour_range(shown(truth))
+    limits = colour_range(plotted_values(truth))
     largest = float(error.values.abs().max()) or 1.0
     ex, ey, ez = field.grid.box.edges
     figure = _page(width, max(0.3, 2.7 * max(ey, ez) / (2 * ex + ey)) + 0.08)

@@ -15,7 +15,7 @@ from nerif.common.conventions import with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.physics.quantities import TEMPERATURE_RANGE
-from nerif.plotting.drawing import LABELS, plotted_quantities, shown
+from nerif.plotting.drawing import LABELS, plotted_quantities, plotted_values
 from nerif.plotting.notebook import number, percent, span
 from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.rig.parameters import refinement_lines
@@ -69,7 +69,7 @@ def field_rows(result: Result) -> Rows:
         volume = result.volumes[quantity]
         name, unit = LABELS.get(quantity, (quantity, volume.unit))
         digits = 4 if quantity == "temperature" else 3
-        rows.append((name if quantity == "n" else name.capitalize(), span(shown(volume), unit, digits)))
+        rows.append((name if quantity == "n" else name.capitalize(), span(plotted_values(volume), unit, digits)))
     ambient = _ambient_temperature(result)
     if ambient is not None:
         rows.append(("Ambient temperature, implied", f"{ambient:.1f} K"))

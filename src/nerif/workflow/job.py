@@ -63,12 +63,12 @@ class Run:
         check_settings(self)
 
 
-def remedy(out: ResultDirectory, own: bool) -> str:
-    """Return what an interrupted run has saved, and how to continue; `own`: the directory holds files of this run."""
+def remedy(out: ResultDirectory, own_files: bool) -> str:
+    """Return what an interrupted run (with own files in the directory or not) has saved, and how to continue."""
     resume = f"nerif reconstruct --resume --out {out.path}"
-    if own and out.has(FIELD):
+    if own_files and out.has(FIELD):
         return f"{out.path} holds the field, but not all other files; complete it with {resume}"
-    if own and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):
+    if own_files and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):
         return f"{out.path} holds the last checkpoint; continue with {resume}"
     return "nothing was saved yet; run the same command again"
 
