@@ -19,6 +19,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, Observation
+from nerif.forward.images import masked_blur
 
 __all__ = ["Stage", "check_source", "of_source", "resolve_source", "stages"]
 
@@ -115,15 +116,11 @@ def _pair(measurement: Measurement) -> tuple[Observation | None, Observation | N
 
 def _extrapolated(measurement: Measurement, displacements: Observation) -> Float[Tensor, "view row column 2"]:
     """The displacement, and where it is not usable a weighted mean of its surroundings."""
-    from scipy.ndimage import gaussian_filter
-
     d, usable = displacements.values, measurement.usable_for(displacements)
     result = torch.zeros_like(d)
     for i, camera in enumerate(measurement.cameras):
         inside = i, slice(0, camera.image_size[0]), slice(0, camera.image_size[1])
-        good = usable[inside][..., None]
-        values = torch.where(good, d[inside], 0.0).double()
-        weight = torch.from_numpy(gaussian_filter(good[..., 0].double().numpy(), FILL_PX)).clamp(min=1e-6)
-        mean = torch.from_numpy(gaussian_filter(values.numpy(), (FILL_PX, FILL_PX, 0))) / weight[..., None]
-        result[inside] = torch.where(good, d[inside], mean.to(d))
+        good = usable[inside]
+        mean = masked_blur(d[inside], good, FILL_PX).to(d)
+        result[inside] = torch.where(good[..., None], d[inside], mean)
     return result
