@@ -261,7 +261,7 @@ class Axis:
             "values": self.values,
             "sigma": self.sigma,
             "sigma_after": self.sigma_after,
-            "told": self.constrained,
+            "constrained": self.constrained,
         }
         named = {key: dict(zip(NAMES, column, strict=True)) for key, column in columns.items()}
         return {"symmetry": asdict(self.symmetry), **named}
