@@ -31,20 +31,9 @@ from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.rays import BackgroundPoints, Rays
 
 __all__ = [
-    "PERSPECTIVE",
-    "POWERS",
-    "PROJECTIONS",
-    "TELECENTRIC",
-    "Camera",
-    "Perspective",
-    "Plane",
-    "Projection",
-    "Telecentric",
-    "distort",
-    "fold",
-    "projection_named",
-    "undistort",
-]
+    "PERSPECTIVE", "POWERS", "PROJECTIONS", "TELECENTRIC", "Camera", "Perspective", "Plane", "Projection",
+    "Telecentric", "distort", "fold", "projection_named", "undistort",
+]  # fmt: skip
 
 POWERS = (2, 4, 1, 1, 6)
 """Units of k1, k2, p1, p2, k3: inverse powers of that of (x, y)."""
@@ -230,13 +219,7 @@ def projection_named(name: object, field: str = "projection") -> Projection:
 
 @dataclass(frozen=True)
 class Plane:
-    """The plane normal . x = offset.
-
-    Parameters
-    ----------
-    normal : (3,) unit vector, world frame
-    offset : mm
-    """
+    """The plane normal . x = offset (mm), its normal (3,) a unit vector in the world frame."""
 
     normal: Float[Tensor, 3]
     offset: float
@@ -272,66 +255,45 @@ class Camera:
     pose_sigma: Float[Tensor, 6] | None = None
 
     def __post_init__(self) -> None:
-        plane = self.background
+        def check(name: str, valid: bool, expected: str, got: object, remedy: str = "") -> None:
+            if not valid:
+                raise InputError(f"expected {expected}, got {got}{remedy}", field=f"{name} of view '{self.name}'")
+
+        plane, lens, kind, k, r = self.background, self.lens, self.projection, self.intrinsics, self.rotation
         for name, value, limit, unit in (
-            ("intrinsics", self.intrinsics, 1e7, "px"),
-            ("translation", self.translation, LARGEST_LENGTH, "mm"),
+            ("intrinsics", k, 1e7, " px"),
+            ("translation", self.translation, LARGEST_LENGTH, " mm"),
             ("distortion", self.distortion, 1e6, ""),
-            ("background_offset", torch.tensor(0.0 if plane is None else plane.offset), LARGEST_LENGTH, "mm"),
+            ("background_offset", torch.tensor(0.0 if plane is None else plane.offset), LARGEST_LENGTH, " mm"),
         ):
-            if not bool((value.abs() <= limit).all()):
-                expected = f"expected numbers up to {limit:g} {unit}".rstrip()
-                raise InputError(f"{expected}, got {value.tolist()}", field=self._field(name))
-        if plane is not None and not abs(float(plane.normal.norm()) - 1) < 1e-2:
-            got = plane.normal.tolist()
-            raise InputError(f"expected a unit vector, got {got}", field=self._field("background_normal"))
-        r = self.rotation
-        error = float((r @ r.T - torch.eye(3, dtype=r.dtype)).abs().max())
-        determinant = float(torch.linalg.det(r))
-        if not (error < 1e-4 and determinant > 0):
-            raise InputError(
-                f"expected a rotation matrix (R R^T = 1, det = +1), "
-                f"got |R R^T - 1| = {error:.2g}, det = {determinant:.3g}; check for a swapped or mirrored axis",
-                field=self._field("rotation"),
-            )
-        k, kind = self.intrinsics, self.projection
-        if not min(float(k[0, 0]), float(k[1, 1])) >= kind.least_scale:
-            raise InputError(
-                f"expected positive {kind.scale}s in {kind.unit}, "
-                f"got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}",
-                field=self._field("intrinsics"),
-            )
-        if abs(float(k[2, 2]) - 1) > 1e-9 or float(k[2, :2].abs().max()) > 0 or float(k[1, 0]) != 0:
-            raise InputError(
-                "expected K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; a transposed K (MATLAB) has to be transposed back",
-                field=self._field("intrinsics"),
-            )
-        if not (min(self.image_size) > 0 and max(self.image_size) <= MAX_IMAGE_EDGE):
-            raise InputError(
-                f"expected (height, width) between 1 and {MAX_IMAGE_EDGE} px, got {self.image_size}",
-                field=self._field("image_size"),
-            )
-        if self.pose_sigma is not None and not bool(((self.pose_sigma >= 0) & (self.pose_sigma < torch.inf)).all()):
-            got = self.pose_sigma.tolist()
-            raise InputError(f"expected standard deviations of 0 or more, got {got}", field=self._field("pose_sigma"))
-        if self.lens is not None and self.lens.diameter > 0:
-            self._check_focus(self.lens)
-
-    def _field(self, name: str) -> str:
-        return f"{name} of view '{self.name}'"
-
-    def _check_focus(self, lens: Lens) -> None:
-        if lens.focus is None and self.background is None:
-            raise InputError(
-                f"expected mm along the optical axis for a lens of {lens.diameter:g} mm without a background, got none",
-                field=self._field("focus_distance"),
-            )
-        depth = self.depth(self.plane) if lens.focus is None else lens.focus
-        if not (depth > 0 or (depth < 0 and not self.projection.shows_depth)):
-            raise InputError(
-                f"expected a plane in focus in front of the camera, got a depth of {depth:g} mm; check "
-                "background_offset, or give the distance",
-                field=self._field("focus_distance"),
+            check(name, bool((value.abs() <= limit).all()), f"numbers up to {limit:g}{unit}", value.tolist())
+        if plane is not None:
+            unit_length = abs(float(plane.normal.norm()) - 1) < 1e-2
+            check("background_normal", unit_length, "a unit vector", plane.normal.tolist())
+        error, determinant = float((r @ r.T - torch.eye(3, dtype=r.dtype)).abs().max()), float(torch.linalg.det(r))
+        check(
+            "rotation", error < 1e-4 and determinant > 0, "a rotation matrix (R R^T = 1, det = +1)",
+            f"|R R^T - 1| = {error:.2g}, det = {determinant:.3g}", "; check for a swapped or mirrored axis",
+        )  # fmt: skip
+        fx, fy = float(k[0, 0]), float(k[1, 1])
+        positive = min(fx, fy) >= kind.least_scale
+        check("intrinsics", positive, f"positive {kind.scale}s in {kind.unit}", f"fx = {fx:.6g}, fy = {fy:.6g}")
+        upper = abs(float(k[2, 2]) - 1) <= 1e-9 and not float(k[2, :2].abs().max()) and not float(k[1, 0])
+        remedy = "; a transposed K (MATLAB) has to be transposed back"
+        check("intrinsics", upper, "K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]", k.tolist(), remedy)
+        valid = min(self.image_size) > 0 and max(self.image_size) <= MAX_IMAGE_EDGE
+        check("image_size", valid, f"(height, width) between 1 and {MAX_IMAGE_EDGE} px", self.image_size)
+        if (sigma := self.pose_sigma) is not None:
+            valid = bool(((sigma >= 0) & (sigma < torch.inf)).all())
+            check("pose_sigma", valid, "standard deviations of 0 or more", sigma.tolist())
+        if lens is not None and lens.diameter > 0:
+            named = lens.focus is not None or plane is not None
+            check("focus_distance", named, f"mm for a lens of {lens.diameter:g} mm without a background", "none")
+            depth = self.depth(self.plane) if lens.focus is None else lens.focus
+            valid = depth > 0 or (depth < 0 and not kind.shows_depth)
+            remedy = "; check background_offset, or give the distance"
+            check(
+                "focus_distance", valid, "a plane in focus in front of the camera", f"a depth of {depth:g} mm", remedy
             )
 
     @property
@@ -359,7 +321,8 @@ class Camera:
     def plane(self) -> Plane:
         """The background, which has to be there."""
         if self.background is None:
-            raise InputError("expected a plane, normal . x = offset, got none", field=self._field("background"))
+            name = f"background of view '{self.name}'"
+            raise InputError("expected a plane, normal . x = offset, got none", field=name)
         return self.background
 
     def pixel_grid(self) -> Float[Tensor, "row column 2"]:
@@ -382,7 +345,7 @@ class Camera:
             raise InputError(
                 f"expected coefficients that can be inverted over the image, "
                 f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)",
-                field=self._field("distortion"),
+                field=f"distortion of view '{self.name}'",
             )
 
     def project(self, points: Points) -> Pixels:

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.common.conventions import LARGEST_LENGTH, InputError
+from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
 from nerif.geometry.grid import Box
 
 __all__ = ["Columns", "Lens", "LensDiscs", "spread_points"]
@@ -78,10 +78,8 @@ class Lens:
             raise InputError(f"expected 0 mm or more, got {self.diameter}", field="aperture_diameter")
         if self.focus is not None and not 0 < abs(self.focus) <= LARGEST_LENGTH:
             raise InputError(f"expected a distance other than 0 mm, got {self.focus}", field="focus_distance")
-        if self.points < 1:
-            raise InputError(f"expected at least one point on the lens, got {self.points}", field="points")
-        if not 0 <= self.window <= MAX_WINDOW:
-            raise InputError(f"expected an edge of 0 to {MAX_WINDOW} px, got {self.window}", field="window")
+        check_positive(self, "points")
+        check_positive(self, "window", zero=True, limit=MAX_WINDOW)
 
     @property
     def wide(self) -> bool:
@@ -163,12 +161,12 @@ def spread_points(rays: int, count: int, generator: torch.Generator | None = Non
     if count == 1:
         return torch.zeros(rays, 1, 4)
     generator = generator or torch.Generator().manual_seed(SEED)
-    disc = disc_points(rays, count, generator)
+    disc = _disc(rays, count, generator)
     return torch.cat([disc, _square(torch.rand(rays, 1, 2, generator=generator), count)], dim=-1)
 
 
-def disc_points(rays: int, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "n k 2"]:
-    """Return points of the unit disc for each ray whose mean approximates that over the disc, rotated at random.
+def _disc(rays: int, count: int, generator: torch.Generator) -> Float[Tensor, "n k 2"]:
+    """Points of the unit disc whose mean approximates that over the disc, rotated at random for each ray.
 
     They are evenly spaced on one ring, or on two from TWO_RINGS points on: exact for polynomials up to degree 3 or 7 in
     the radius, and up to the number of points on a ring, less one, in the angle.
@@ -176,12 +174,10 @@ def disc_points(rays: int, count: int, generator: torch.Generator | None = None)
     Source: Gauss-Legendre quadrature in the square of the radius; Stroud, Approximate Calculation of Multiple Integrals
     (1971), S2.
     """
-    if count == 1:
-        return torch.zeros(rays, 1, 2)
     assert count % 2 == 0, "expected an even number of points"
     rings = RINGS[count >= TWO_RINGS]
     on_ring = count // len(rings)
-    turn = torch.rand(rays, 1, 1, generator=generator or torch.Generator().manual_seed(SEED))
+    turn = torch.rand(rays, 1, 1, generator=generator)
     share = torch.arange(on_ring) / on_ring + torch.arange(len(rings))[:, None] / (len(rings) * on_ring)
     angle = 2 * math.pi * (turn + share)
     radius = torch.tensor(rings).sqrt()[:, None]

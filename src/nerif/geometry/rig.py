@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
 from nerif.geometry.camera import Camera, Plane, Projection, projection_named
 from nerif.geometry.grid import Box
 
@@ -43,9 +43,8 @@ class Ring:
     """Distance from the centre of the box to the background, mm."""
 
     def __post_init__(self) -> None:
-        for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"expected a positive number, got {getattr(self, name)}", field=name)
+        lengths = ("focal_length", "pixel_pitch", "distance", "background_distance")
+        check_positive(self, "views", *lengths, limit=LARGEST_LENGTH)
         for name in ("arc", "extra_angles", "elevation"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
                 raise InputError(f"expected degrees, got {getattr(self, name)}", field=name)

@@ -82,19 +82,13 @@ def style(size: float = 7.0) -> Iterator[None]:
     """Use text of `size` points, thin lines, and fonts that stay text in PDF and SVG."""
     import matplotlib as mpl
 
+    lines, small = ("axes.linewidth", "xtick.major.width", "ytick.major.width", "hatch.linewidth"), size - 0.5
     settings: Any = {
-        "font.size": size,
-        "axes.titlesize": size,
-        "axes.labelsize": size,
-        "legend.fontsize": size - 0.5,
-        "xtick.labelsize": size - 0.5,
-        "ytick.labelsize": size - 0.5,
-        "axes.linewidth": 0.6,
-        "xtick.major.width": 0.6,
-        "ytick.major.width": 0.6,
+        **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), size),
+        **dict.fromkeys(("legend.fontsize", "xtick.labelsize", "ytick.labelsize"), small),
+        **dict.fromkeys(lines, 0.6),
         "pdf.fonttype": 42,
         "svg.fonttype": "none",
-        "hatch.linewidth": 0.6,
     }
     with mpl.rc_context(settings):
         yield

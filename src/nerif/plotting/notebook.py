@@ -22,7 +22,7 @@ from nerif.plotting.drawing import (
     map_range,
     plotted_values,
     style,
-)
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
