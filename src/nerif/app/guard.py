@@ -1,6 +1,6 @@
 """Who may ask the server anything: the browser that was given the token, on a page of this server.
 
-Each request, of pages, of static files and of the websocket alike, is refused unless
+Each request, of a page, a static file or the websocket, is refused unless
 
     Host      is an address of this server        (a foreign name that leads here is not: DNS rebinding)
     Origin    is this server, where it is sent    (pages of others may not post or open websockets)
@@ -69,7 +69,7 @@ class Guard:
         if headers.get("host", "").lower() not in self.allowed:
             await _refuse(scope, receive, send, 421, "This address is not the one of this server.")
         elif "origin" in headers and not self._own(headers["origin"]):
-            await _refuse(scope, receive, send, 403, "Another page asked for this.")
+            await _refuse(scope, receive, send, 403, "This request comes from another page.")
         elif self._known(cookies):
             await self._pass(scope, receive, send)
         elif scope["type"] == "http" and self._given(scope):
@@ -94,9 +94,9 @@ class Guard:
     async def _pass(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def with_headers(message: MutableMapping[str, Any]) -> None:
             if message["type"] == "http.response.start":
-                own = list(message.get("headers", ()))
-                named = {name.lower() for name, _ in own}  # an answer may have a policy of its own
-                message["headers"] = [*own, *((name, value) for name, value in HEADERS if name not in named)]
+                local = list(message.get("headers", ()))
+                named = {name.lower() for name, _ in local}  # an answer may have a policy of its own
+                message["headers"] = [*local, *((name, value) for name, value in HEADERS if name not in named)]
             await send(message)
 
         await self.app(scope, receive, with_headers)

@@ -9,7 +9,7 @@ from nicegui import ui
 
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_told import LINES, JobTold
+from nerif.app.job_status import LINES, JobStatus
 from nerif.app.pieces import CommandLine, refusals
 from nerif.app.workspace import Workspace
 
@@ -44,7 +44,7 @@ class JobForm:
         self.view = FormView(form, self._changed, work.draft(name), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
-        self.told = JobTold(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
+        self.notice = JobStatus(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
         self.show()
 
     @property
@@ -70,4 +70,4 @@ class JobForm:
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments
-            self.told.follow(self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}"))
+            self.notice.follow(self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}"))

@@ -1,11 +1,11 @@
 """Runs of `nerif ...`, one after the other: a queue on disk, which a server that is started again finds as it was.
 
-Each run has a folder of its own in FOLDER/.nerif/jobs with job.json (what is asked), log.txt, and what its process
+Each run has a folder of its own in FOLDER/.nerif/jobs with job.json (the request), log.txt, and what its process
 writes down: started.json and ended.json (runner.py). State is nowhere else. The name of an empty file says whose the
 run is: `waiting`, and once a server has started a process for it, runner-PID-TIME of that process. Renaming it is the
 claim, which one server alone can make. Where that process has gone before the run began, the run waits again.
 
-A folder may come from somebody else, runs in it among them. job.json is signed with a secret of the user (private.py);
+A folder, with runs in it, may come from another person. job.json is signed with a secret of the user (private.py);
 what is not, or was changed, or was signed for another folder, is refused: it is shown, and never started.
 
     queued ─▶ running ─▶ done | failed | stopped
@@ -71,7 +71,7 @@ class Job:
     arguments : of nerif, the verb first
     attempt : those of the present start: of a run that is gone on with, other ones
     out : what it writes, relative to the folder; empty if that is no result directory
-    asked : "", "stop" or "pause"
+    request : "", "stop" or "pause"
     place : in the queue
     state : queued, running, paused, done, failed, stopped or refused
     pid : of its process while it runs
@@ -84,7 +84,7 @@ class Job:
     arguments: tuple[str, ...]
     attempt: tuple[str, ...]
     out: str = ""
-    asked: str = ""
+    request: str = ""
     place: float = 0.0
     state: str = "queued"
     pid: int = 0
@@ -109,7 +109,7 @@ class Job:
 
 
 KEPT: dict[str, type | tuple[type, ...]] = {
-    "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "asked": str, "place": (int, float),
+    "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "request": str, "place": (int, float),
 }  # fmt: skip
 SIGNATURE = "signature"
 
@@ -135,9 +135,9 @@ class Jobs:
 
     def all(self) -> list[Job]:
         """Return all runs: what waits and runs in the order of the queue, then what has ended, the last one first."""
-        found = [job for job in map(self._read, self._names()) if job is not None]
-        open_, over = ("running", "queued", "paused"), [j for j in found if j.state in OVER]
-        return sorted((j for j in found if j.state in open_), key=lambda j: (open_.index(j.state), j.place)) + sorted(
+        outcome = [job for job in map(self._read, self._names()) if job is not None]
+        open_, over = ("running", "queued", "paused"), [j for j in outcome if j.state in OVER]
+        return sorted((j for j in outcome if j.state in open_), key=lambda j: (open_.index(j.state), j.place)) + sorted(
             over, key=lambda j: j.ended, reverse=True
         )
 
@@ -174,31 +174,31 @@ class Jobs:
     def _read(self, name: str) -> Job | None:
         """A run and its state; None where its folder is damaged or just being removed."""
         where = self.directory / name
-        found = _json(where / JOB)
-        kept, signature = {k: v for k, v in found.items() if k in KEPT}, found.get(SIGNATURE)
-        if not _is_job(kept):
+        outcome = _json(where / JOB)
+        memory, signature = {k: v for k, v in outcome.items() if k in KEPT}, outcome.get(SIGNATURE)
+        if not _is_job(memory):
             return None
-        job = Job(**{**kept, "arguments": tuple(kept["arguments"]), "attempt": tuple(kept["attempt"])})
-        if job.id != name or not hmac.compare_digest(str(signature).encode(), self._signature(kept).encode()):
+        job = Job(**{**memory, "arguments": tuple(memory["arguments"]), "attempt": tuple(memory["attempt"])})
+        if job.id != name or not hmac.compare_digest(str(signature).encode(), self._signature(memory).encode()):
             return replace(job, id=name, state="refused", ended=(where / JOB).stat().st_mtime)
         owned = _owned(_owner(where))  # before the others are read: how a run ended is written just before its end
         started, ended = _json(where / STARTED), _json(where / ENDED)
         if ended:
             job = replace(job, code=int(ended["code"]), started=started.get("time", 0.0), ended=ended["time"])
-            over = {"pause": "paused", "stop": "stopped"}.get(job.asked, "done")
+            over = {"pause": "paused", "stop": "stopped"}.get(job.request, "done")
             if job.code and job.arguments[0] != "sequence":  # which ends by Ctrl-C in no other way
                 over = "stopped"
-            return replace(job, state=over if job.asked or not job.code else "failed")
+            return replace(job, state=over if job.request or not job.code else "failed")
         if started:
             job = replace(job, started=started["time"], pid=int(started["pid"]))
             if owned or _alive(job.pid, started["began"]):
                 return replace(job, state="running")
-            return replace(job, state="stopped" if job.asked else "failed", ended=(where / STARTED).stat().st_mtime)
-        if job.asked:
+            return replace(job, state="stopped" if job.request else "failed", ended=(where / STARTED).stat().st_mtime)
+        if job.request:
             return replace(job, state="stopped")
         return replace(job, state="running" if owned else "queued")
 
-    # -- what is asked -------------------------------------------------------------------------------------------
+    # -- requests -------------------------------------------------------------------------------------------
 
     def add(self, arguments: Sequence[str], title: str, out: str = "") -> Job:
         """Put a run at the end of the queue.
@@ -220,7 +220,7 @@ class Jobs:
         return job
 
     def stop(self, id: str) -> None:
-        """Ask a run to end, with what it has; asked twice, it breaks off. One that waits does not begin."""
+        """Request a run to end with its present result; a second request aborts it. A waiting run does not begin."""
         self._ask(id, "stop")
 
     def pause(self, id: str) -> None:
@@ -253,7 +253,7 @@ class Jobs:
             attempt = tuple(word for word in attempt if word != "--force")
         elif job.resumable and (self.folder / job.out / RUN).is_file():
             attempt = (job.arguments[0], "--resume", "--out", job.out, *(("--live",) if "--live" in attempt else ()))
-        self._keep(replace(job, attempt=attempt, asked="", place=time.time()))
+        self._keep(replace(job, attempt=attempt, request="", place=time.time()))
         for name in (STARTED, ENDED):  # it waits once the last of them is gone
             (self._of(job) / name).unlink(missing_ok=True)
 
@@ -309,20 +309,20 @@ class Jobs:
         job = self.get(id)
         if job.state not in ("queued", "running", "paused"):
             return
-        self._keep(replace(job, asked=what))
-        now = self._read(id)  # it may have begun meanwhile; one that begins later looks at what is asked
+        self._keep(replace(job, request=what))
+        now = self._read(id)  # it may have begun meanwhile; one that begins later reads the request
         if job.state == "running" and now is not None and now.state == "running" and now.pid:
             os.kill(now.pid, signal.SIGINT)
 
     def _keep(self, job: Job) -> None:
         if job.state == "refused":
             raise InputError(str(REFUSED), field=f"job {job.id}")
-        kept = {name: value for name, value in asdict(job).items() if name in KEPT}
-        write_json(self._of(job) / JOB, {**kept, SIGNATURE: self._signature(kept)})
+        memory = {name: value for name, value in asdict(job).items() if name in KEPT}
+        write_json(self._of(job) / JOB, {**memory, SIGNATURE: self._signature(memory)})
 
-    def _signature(self, kept: Mapping[str, Any]) -> str:
+    def _signature(self, memory: Mapping[str, Any]) -> str:
         """What only this user can write of a run in this folder."""
-        words = json.dumps([str(self.folder), kept], sort_keys=True)
+        words = json.dumps([str(self.folder), memory], sort_keys=True)
         return hmac.new(self._secret, words.encode(), "sha256").hexdigest()
 
     # -- the queue -----------------------------------------------------------------------------------------------
@@ -355,11 +355,11 @@ class Jobs:
         threading.Thread(target=wait, daemon=True).start()
 
 
-def _is_job(kept: Mapping[str, Any]) -> bool:
+def _is_job(memory: Mapping[str, Any]) -> bool:
     """Whether the entries of a job.json are there, and of the right kind."""
-    if set(kept) != set(KEPT) or not all(isinstance(kept[name], kind) for name, kind in KEPT.items()):
+    if set(memory) != set(KEPT) or not all(isinstance(memory[name], kind) for name, kind in KEPT.items()):
         return False
-    return all(words and all(isinstance(w, str) for w in words) for words in (kept["arguments"], kept["attempt"]))
+    return all(words and all(isinstance(w, str) for w in words) for words in (memory["arguments"], memory["attempt"]))
 
 
 def _owner(where: Path) -> Path:
@@ -391,11 +391,11 @@ def claim(where: Path, pid: int) -> bool:
 def _json(path: Path) -> dict[str, Any]:
     """The entries of a JSON file; none where it is missing, damaged or just being written."""
     try:
-        found = json.loads(path.read_text())
-        json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair is no text that a page can show
+        outcome = json.loads(path.read_text())
+        json.dumps(outcome, ensure_ascii=False).encode()  # half of a surrogate pair is no text that a page can show
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return outcome if isinstance(outcome, dict) else {}
 
 
 def _alive(pid: int, began: float) -> bool:

@@ -1,4 +1,4 @@
-"""How one run goes, told where it was asked for: it waits, what it says, how it ended, what to go on with."""
+"""Status of a run on the page that started it: waiting, output, outcome, next steps."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 
-__all__ = ["LINES", "JobTold"]
+__all__ = ["LINES", "JobStatus"]
 
 EVERY = 0.7  # seconds
 LINES = 3  # of the log
 SAID = {"done": "It is done.", "failed": "It failed; what it said:", "stopped": "It was stopped.", "refused": REFUSED}
 
 
-class JobTold:
+class JobStatus:
     """A few lines about one run, where the page is being built; a page that is loaded again goes on with it.
 
     Parameters
@@ -43,7 +43,7 @@ class JobTold:
             ui.timer(EVERY, self._look)
 
     def follow(self, job: Job) -> None:
-        """Tell of that run from now on."""
+        """Follow that run."""
         self.job = job.id
         self.work.keep(self.name, {"job": job.id})
         self.further.clear()
@@ -55,7 +55,7 @@ class JobTold:
         self._shown = (text, *log)
         self.place.clear()
         with self.place:
-            text_html(text, classes="told")
+            text_html(text, classes="status")
             if log:
                 text_html("\n".join(log), "pre", "said")
 
