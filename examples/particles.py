@@ -53,7 +53,7 @@ velocity = velocity_between(*volumes, seconds, arguments.window)
 quality = quality_factor(volumes[0].values, before.volume(grid).values)
 truth = ring.velocity(velocity.points.reshape(-1, 3)).reshape(velocity.points.shape)
 error = velocity.rms_error(truth) / voxel
-print(f"Q {quality:.3f}, rms error {error:.3f} voxel a component, valid at {velocity.found.double().mean():.0%}")
+print(f"Q {quality:.3f}, rms error {error:.3f} voxel a component, valid at {velocity.valid.double().mean():.0%}")
 
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
 left.imshow(measurements[0].maps["radiance"][0].numpy(), cmap="gray")

@@ -11,9 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from line_scans import LineScan
 
 from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from refusals import refused
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -66,38 +70,73 @@ def test_knocked_camera(tmp_path):
     assert errors["refined"] < 1.1 * errors["good"]
 
 
+def test_line_scans():
+    """Offset, noise, saturation, axis and misplaced angles of a scan through two columns; its slice is upright."""
+    axis, offset, k, columns = -0.31, -0.6, 0.05, ((-1.5, 0.8, 0.6, 1.1), (2.0, -0.5, 0.5, 0.8))  # x, y, width, mu
+    angles, positions = np.radians(np.arange(0, 180, 12.0)), -6 + 0.25 * np.arange(47)
+    total = np.zeros((len(angles), len(positions)))
+    for x, y, width, extinction in columns:
+        distance = positions - axis - (x * np.cos(angles) + y * np.sin(angles))[:, None]
+        total += extinction * width * np.sqrt(2 * np.pi) * np.exp(-((distance / width) ** 2) / 2)
+    noise = np.random.default_rng(0).normal(0, 1e-3, total.shape)
+    estimate = LineScan(angles, positions, LineScan.saturate(total, k) + offset + noise).estimate()
+    assert estimate.offset == pytest.approx(offset, abs=5e-4)
+    assert estimate.noise == pytest.approx(1e-3, rel=0.3)
+    assert estimate.saturation == pytest.approx(k, abs=0.005)
+    assert estimate.corrected_scatter < 0.3 * estimate.scatter
+    assert estimate.axis == pytest.approx(axis, abs=0.01)
+    scan = LineScan(angles, positions, total)
+    measurement = scan.measurement(axis)
+    assert measurement.names[:3] == ("0deg", "12deg", "24deg")
+    result = Tikhonov(voxels=32, basis="linear", regularisation=1e-6, iterations=60, device="cpu")(measurement)
+    for x, y, _, extinction in columns:
+        values = result.field(torch.tensor([[x, y, 0.0], [-x, y, 0.0], [x, -3 * y, 0.0]]))
+        np.testing.assert_allclose(values.flatten(), [extinction, 0, 0], atol=0.2)
+    shifted, cut = total.copy(), total.copy()
+    shifted[4] = np.interp(positions - 0.05, positions, total[4])
+    assert LineScan(angles, positions, shifted).shifts()[4] == pytest.approx(0.05, rel=0.2)
+    cut[3, :5] = 0.4
+    assert 3 not in LineScan(angles, positions, cut).complete
+    with refused("angles"):
+        LineScan(np.where(angles == angles[3], angles[4], angles), positions, total).measurement(axis)
+    with refused("positions"):
+        LineScan(angles, positions**3, total)
+    for call in (scan.select([0, 1, 2, 3]).without_offset(-1.0).saturation, lambda: scan.select([0, 1])):
+        with refused("readings"):
+            call()
+
+
 SPRAY = Path(__file__).parents[2] / "shared" / "data" / "spray_absorption" / "spray_Re6700.hdf5"
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not SPRAY.is_file(), reason="the data of the spray are not beside the project (shared/data)")
 def test_spray(tmp_path, monkeypatch, capsys):
-    """Two jets of water: their density is that of water, though nothing was told of it."""
+    """Two jets of water have the density of water."""
     arguments = ["--slice", "jets", "--method", "nerif", "--steps", "20", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["spray.py", str(SPRAY), *arguments])
     example = runpy.run_path(str(EXAMPLES / "spray.py"), run_name="__main__")
-    said = capsys.readouterr().out
-    assert "axis at -0.27" in said
+    assert "axis at -0.27" in capsys.readouterr().out
     assert (tmp_path / "jets-nerif.png").stat().st_size > 20_000
     method = example["TotalVariation"](voxels=40, basis="linear", regularisation=2e-3, iterations=30, device="cpu")
-    _, _, found, told = example["reconstruct"](example["read"](SPRAY, "jets"), example["WITHHELD"], method)
-    density = found.volume(Grid.of_resolution(found.box, 50)).values / example["WATER"] * 1e3
+    _, _, result, estimate = example["reconstruct"](example["read"](SPRAY, "jets"), example["WITHHELD"], method)
+    density = result.volume(Grid.of_resolution(result.box, 50)).values / example["WATER"] * 1e3
     inside = density[density > 0.5]
     assert 0.95 < float(inside.median()) < 1.1  # mg/mm3
-    assert told.scatter_after < 0.5 * told.scatter
+    assert estimate.corrected_scatter < 0.5 * estimate.scatter
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not SPRAY.is_file(), reason="the data of the spray are not beside the project (shared/data)")
 @pytest.mark.parametrize("name", ["impingement", "jets", "near"])
 def test_axis_of_a_spray_by_refinement(name):
-    """A rig refined together with the field has its axis of rotation where the centres of mass have it."""
+    """The axis of rotation by refinement of the rig is that of the centres of mass."""
     example = runpy.run_path(str(EXAMPLES / "spray.py"))
     scan = example["read"](SPRAY, name)
-    told = scan.tell()
-    found = example["refined_axis"](scan, told, example["TotalVariation"](voxels=40, basis="linear", device="cpu"))
-    assert abs(found - told.axis) < 0.03  # mm; the readings are 0.2 to 0.4 mm apart
-    assert -0.36 < found < -0.24
+    estimate = scan.estimate()
+    axis = example["refined_axis"](scan, estimate, example["TotalVariation"](voxels=40, basis="linear", device="cpu"))
+    assert abs(axis - estimate.axis) < 0.03  # mm; the readings are 0.2 to 0.4 mm apart
+    assert -0.36 < axis < -0.24
 
 
 JET = Path(__file__).parents[2] / "shared" / "data" / "bos_pairs"
@@ -135,6 +174,7 @@ def test_examples_are_all_tested():
         "from_images.py",
         "knocked_camera.py",
         "particles.py",
+        "line_scans.py",
         "spray.py",
         "jet.py",
     }

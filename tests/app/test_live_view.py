@@ -15,7 +15,7 @@ from nerif.app.jobs import Jobs
 from nerif.app.live_surface import said_of
 from nerif.app.live_view import told
 from nerif.common.files import write_json
-from nerif.results.directory import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_FIELD
 from nerif.results.live import read_look
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
@@ -36,7 +36,7 @@ def look(directory: Path, radius: float, seconds: float) -> None:
     view = np.linspace(0, 1, 30, dtype=np.float32).reshape(5, 6, 1)
     part = directory / "part.npz"
     np.savez(part, about=np.array(json.dumps(about)), values=values.astype(np.float32), measured=view, predicted=view)
-    part.replace(directory / LIVE_LOOK)
+    part.replace(directory / LIVE_FIELD)
 
 
 def watched(folder: Path) -> None:

@@ -10,9 +10,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.common.conventions import InputError
 from nerif.imaging.displacement.correlation import normalised_median_outliers, window_correlation
-from nerif.imaging.displacement.displacement import DisplacementSettings, displacement, measure
+from nerif.imaging.displacement.displacement import DisplacementSettings, border, displacement, measure, remove_shake
 from nerif.imaging.displacement.optical_flow import FLOWS
-from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.patterns import Background
 from refusals import refused

@@ -18,7 +18,7 @@ from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid, Lens, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_asked
+from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_of
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.layout import Symmetric
 from nerif.reconstruction.voxels.multiplicative import MLEM
@@ -131,7 +131,7 @@ def test_two_views_determine_the_axis():
 
 def test_the_axis_can_be_fixed(jet):
     fixed = Tikhonov(voxels=16, symmetry="axis", axis_sigma_mm=0.0, axis_sigma_deg=0.0)
-    assert fixed(one_view(jet)).axis.symmetry == symmetry_asked(fixed, one_view(jet))
+    assert fixed(one_view(jet)).axis.symmetry == symmetry_of(fixed, one_view(jet))
 
 
 class Bent(Field):

@@ -27,7 +27,7 @@ def test_particles_are_drawn_by_seed_evenly_over_the_box():
     cloud = Particles.draw(BOX, 20_000, variation=0.5, seed=3)
     assert torch.equal(cloud.positions, Particles.draw(BOX, 20_000, variation=0.5, seed=3).positions)
     assert not torch.equal(cloud.positions, Particles.draw(BOX, 20_000, variation=0.5, seed=4).positions)
-    assert len(cloud.moved(cloud.positions)) == len(cloud) == 20_000
+    assert len(cloud.moved_to(cloud.positions)) == len(cloud) == 20_000
     edges = torch.tensor(BOX.edges).double()
     assert (cloud.positions.mean(dim=0).abs() < 0.02 * edges).all()
     torch.testing.assert_close(cloud.positions.std(dim=0), edges / math.sqrt(12), rtol=0.02, atol=0)
@@ -37,7 +37,7 @@ def test_particles_are_drawn_by_seed_evenly_over_the_box():
 
 def test_particles_that_leave_the_box_are_gone():
     cloud = Particles(torch.tensor([[0.0, 0, 0], [0.9, 0, 0], [0, 1.9, 0]]).double(), torch.arange(3).double(), BOX)
-    later = cloud.moved(cloud.positions + torch.tensor([0.2, 0, 0]))
+    later = cloud.moved_to(cloud.positions + torch.tensor([0.2, 0, 0]))
     assert later.brightness.tolist() == [0, 2]
 
 

@@ -57,7 +57,7 @@ def test_a_ring_within_a_box_is_as_fast_as_asked():
 
 def test_particles_go_with_the_ring_and_back():
     cloud = Particles.draw(Box.cube(40.0), 50, seed=1)
-    inside = cloud.moved(cloud.positions / 4)
+    inside = cloud.moved_to(cloud.positions / 4)
     there = RING.advect(inside, 0.02)
     back = RING.advect(there, -0.02)
     assert float((there.positions - inside.positions).norm(dim=1).max()) > 0.5
@@ -79,7 +79,7 @@ def test_a_shift_is_found_with_its_direction_and_unit():
     assert velocity.points.shape == velocity.values.shape == (7, 9, 5, 3)
     torch.testing.assert_close(velocity.points[0, 0, 0], torch.tensor(BOX.lower).double() + 0.8)
     torch.testing.assert_close(velocity.points[-1, -1, -1], torch.tensor(BOX.upper).double() - 0.8)
-    assert velocity.found.all()
+    assert velocity.valid.all()
     expected = 0.1 * torch.tensor(shift).double() / 0.002
     assert velocity.rms_error(expected.expand_as(velocity.points)) < 0.05 * 0.1
     error = velocity.displacement / 0.1 - torch.tensor(shift)
@@ -93,7 +93,7 @@ def test_the_velocity_is_that_halfway():
     turn = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]]).double()
     start, end = (Particles(cloud.positions @ t.T, cloud.brightness, cloud.box).volume(GRID) for t in (turn.T, turn))
     velocity = velocity_between(start, end, seconds=1.0, window=12, passes=3)
-    inner = velocity.found & (velocity.points[..., 1:].norm(dim=-1) < 1.5)
+    inner = velocity.valid & (velocity.points[..., 1:].norm(dim=-1) < 1.5)
     _, y, z = velocity.points[inner].unbind(-1)
     _, v, w = velocity.values[inner].unbind(-1)
     size = (y**2 + z**2).sum()
@@ -108,7 +108,7 @@ def test_where_there_are_no_particles_there_is_no_velocity():
     velocity = velocity_between(first, second, seconds=1.0, window=12, passes=2)
     dark = velocity.points[..., 1] > 0.8
     assert velocity.displacement[dark].isnan().all()
-    assert float(velocity.found[velocity.points[..., 1] < -0.5].double().mean()) > 0.95
+    assert float(velocity.valid[velocity.points[..., 1] < -0.5].double().mean()) > 0.95
 
 
 def test_outliers_are_told_in_three_dimensions():

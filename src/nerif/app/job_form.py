@@ -56,7 +56,7 @@ class JobForm:
         """Show the command line as it is now."""
         if hasattr(self, "command"):
             self.command.show(self.arguments)
-            self.button.set_enabled(self.view.right)
+            self.button.set_enabled(self.view.valid)
 
     def _changed(self) -> None:
         self.work.keep(self.name, self.view.form.changed(self.view.values))
@@ -64,7 +64,7 @@ class JobForm:
 
     async def _start(self) -> None:
         with refusals():
-            self.view.made()
+            self.view.record()
             if self.first is not None:
                 await self.first()
             if self.out is not None:

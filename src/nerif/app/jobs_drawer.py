@@ -13,7 +13,7 @@ from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.report.movie import frames_there
+from nerif.report.movie import finished_frames
 from nerif.results.live import read_live
 
 __all__ = ["JobsDrawer", "film_progress", "progress_of"]
@@ -53,7 +53,7 @@ def film_progress(path: Path) -> tuple[float, str]:
         store = VolumeSequence(path)
     except InputError:  # just being made
         return 0.0, ""
-    done, count = len(frames_there(store)), len(store)
+    done, count = len(finished_frames(store)), len(store)
     return done / max(count, 1), f"{done} of {count} frames"
 
 

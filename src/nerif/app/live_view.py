@@ -20,7 +20,7 @@ from nerif.data.volume import name_of
 from nerif.geometry import Box
 from nerif.plotting.drawing import colour_range, map_range
 from nerif.report.view_images import image_address
-from nerif.results.directory import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_FIELD
 from nerif.results.live import Look, read_live, read_look
 
 __all__ = ["LiveView", "curve_options", "look_html", "told"]
@@ -107,15 +107,15 @@ class LiveView:
             images, box, said = drawn
             self.look.set_content(images)
             if said:
-                self.surface.show(job.out, seen[LIVE_LOOK], box, said)
+                self.surface.show(job.out, seen[LIVE_FIELD], box, said)
 
 
 def _changed(out: Path, seen: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
     """What the run tells; of its last look, where it is not in `seen` yet, images, box, and its surface in words."""
-    stamp = _stamp(out / LIVE_LOOK)
+    stamp = _stamp(out / LIVE_FIELD)
     drawn = None
-    if stamp and stamp != seen.get(LIVE_LOOK):
-        seen[LIVE_LOOK] = stamp
+    if stamp and stamp != seen.get(LIVE_FIELD):
+        seen[LIVE_FIELD] = stamp
         look = read_look(out)
         if look is not None:
             volume = look.volume  # a flat one has no surface

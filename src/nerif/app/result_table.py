@@ -8,13 +8,13 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.analysis.evaluation import rms_text
+from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.verdict import verdict
 from nerif.app.project import Contents, Project
 from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.reconstruction.files import FIELD
-from nerif.report.movie import frames_there
+from nerif.report.movie import finished_frames
 from nerif.report.summary import accuracy_rows
 from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
 
@@ -62,7 +62,7 @@ def _cached(project: Project, name: str) -> Row:
 def _of(name: str, result: Result) -> Row:
     found, metrics = verdict(result), result.metrics
     views = [v for v in metrics.get("views", []) if v.get("rms") is not None]
-    worst = rms_text(max(views, key=lambda v: float(v["rms"])), 3) if views else ""
+    worst = rms_with_unit(max(views, key=lambda v: float(v["rms"])), 3) if views else ""
     outcome = str(metrics.get("outcome") or result.about.get("outcome") or "not ended").replace("_", " ")
     seconds = metrics.get("seconds", result.about.get("seconds"))
     error = "" if found.error is None else f"{found.error:.1%} of the variation"
@@ -80,7 +80,7 @@ def _film(project: Project, name: str) -> Row | None:
         store = VolumeSequence(project.path(name))
     except InputError:
         return None
-    count, done = len(store), len(frames_there(store))
+    count, done = len(store), len(finished_frames(store))
     span = f"{store.times[0]:g} to {store.times[-1]:g} s" if count else ""
     outcome = "complete" if done == count else f"{done} of {count} frames"
     grid = " × ".join(str(n) for n in store.grid.shape[::-1])

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge
 from jaxtyping import Bool, Shaped
 
-from nerif.common.conventions import InputError, check_positive, unit_shown
+from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import atomic
+from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.data.measurement import Measurement, Observation, integrals_of
 from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.open import read_mask
@@ -38,7 +41,7 @@ class MaskShape:
     kind: str
     points: tuple[tuple[float, float], ...]
     inside: bool = True
-    width: float = 8.0
+    width: Positive = 8.0
 
     def __post_init__(self) -> None:
         if self.kind not in MIN_POINTS:
@@ -49,7 +52,7 @@ class MaskShape:
             )
         if not np.isfinite(np.array(self.points, dtype=float)).all():
             raise InputError(f"expected finite numbers, got {self.points}", field="points")
-        check_positive(self, "width")
+        check_settings(self)
 
 
 def mask_of(shapes: Sequence[MaskShape], shape: tuple[int, int]) -> PixelMask:
@@ -106,17 +109,17 @@ def write_masks(
 class MaskSettings:
     """Settings of a flow mask by threshold."""
 
-    threshold: float = 4.0
+    threshold: NonNegative = 4.0
     """Flow is where the measured quantity (of displacements |d|) exceeds this multiple of sigma."""
-    smooth: float = 1.5
+    smooth: NonNegative = 1.5
     """Standard deviation of a Gaussian over the values / sigma before the threshold, px."""
-    smallest: int = 64
+    smallest: Annotated[int, Ge(0)] = 64
     """Islands and holes of fewer pixels are removed."""
-    grow: int = 3
+    grow: Annotated[int, Ge(0)] = 3
     """Pixels added all around, so that the mask includes the edge of the flow."""
 
     def __post_init__(self) -> None:
-        check_positive(self, "threshold", "smooth", "smallest", "grow", zero=True)
+        check_settings(self)
 
 
 STANDARD = MaskSettings()

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from annotated_types import Gt, Le, Lt
 
-from nerif.common.conventions import InputError, check_positive
+from nerif.common.conventions import InputError
 from nerif.common.files import atomic
+from nerif.common.settings import check_settings
 from nerif.imaging.calibration.targets import CalibrationTarget
 
 if TYPE_CHECKING:
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["KINDS", "Background", "paper_for", "print_pattern"]
 
+Length = Annotated[float, Gt(0), Lt(1e5)]
 KINDS = ("dots", "wavelet", "multiscale")
 MAX_PIXELS_PER_DOT = 12  # finer rasters look the same
 
@@ -35,13 +38,13 @@ class Background:
 
     kind: str = "dots"
     """dots (random, hardly overlapping), wavelet (band-limited noise) or multiscale (noise on all scales)."""
-    width: float = 200.0
+    width: Length = 200.0
     """Width of the pattern, mm."""
-    height: float = 200.0
+    height: Length = 200.0
     """Height of the pattern, mm."""
-    dot: float = 1.0
+    dot: Length = 1.0
     """Diameter of a dot, or the smallest feature of a noise, mm: 2 to 5 px in the image (nerif design)."""
-    fill: float = 0.35
+    fill: Annotated[float, Gt(0), Le(0.6)] = 0.35
     """Share of the paper covered by dots."""
     seed: int = 0
     """Of the pattern; different for each camera."""
@@ -49,9 +52,7 @@ class Background:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="kind")
-        check_positive(self, "width", "height", "dot", limit=1e5)
-        if not 0 < self.fill <= 0.6:
-            raise InputError(f"expected a share of the paper between 0 and 0.6, got {self.fill}", field="fill")
+        check_settings(self)
         if 4 * self.dot > (edge := min(self.width, self.height)):
             raise InputError(f"expected a quarter of the pattern ({edge:g} mm) or less, got {self.dot}", field="dot")
 

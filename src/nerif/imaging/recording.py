@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge
 from jaxtyping import Bool
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
+from nerif.common.settings import check_settings
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
@@ -123,7 +126,7 @@ class Recording:
     scene: Scene
     method: DisplacementSettings = field(default_factory=DisplacementSettings)
     masks: MaskSettings | None = None
-    references: int = 100
+    references: Annotated[int, Ge(0)] = 100
     images: bool = True
 
     def __post_init__(self) -> None:
@@ -134,8 +137,7 @@ class Recording:
                     "rename the view's folder, or choose --views",
                     field="calibration",
                 )
-        if self.references < 0:
-            raise InputError(f"expected 0 or more, got {self.references}", field="references")
+        check_settings(self)
 
     def processes(self, tasks: int, images: int) -> int:
         """Return the number of processes for tasks with `images` images in total: 1 if these are small."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,51 +20,30 @@ from nerif.imaging.readers.views import View
 from nerif.imaging.recording import Recording, Scene, ViewReference, join_views, silent
 from nerif.imaging.workers import work
 
-__all__ = ["RecordingReference", "frame_numbers", "instants_of", "measure_recording"]
+__all__ = ["frame_numbers", "instants_of", "measure_frame", "measure_recording", "references_of"]
 
 ROUNDING = 1e-9  # relative to the largest of the numbers compared
 
 
-@dataclass(frozen=True)
-class RecordingReference:
-    """All views with their evaluated reference images."""
-
-    views: tuple[ViewReference, ...]
-    scene: Scene
-
-    @classmethod
-    def of(
-        cls,
-        recording: Recording,
-        say: Callable[[str], None] = silent,
-        on_view: Callable[[int], None] = lambda count: None,
-        processes: int | None = None,
-    ) -> RecordingReference:
-        """Evaluate the reference images of all views."""
-        views, recording = recording.views, replace(recording, images=False)  # a sequence has no images
-        if processes is None:
-            processes = recording.processes(len(views), len(views))
-        references: dict[int, ViewReference] = {}
-        for i, (reference, lines) in work(_reference, recording, views, processes):
-            for line in lines:
-                say(line)
-            if isinstance(reference, InputError):
-                raise reference
-            references[i] = reference
-            on_view(len(references))
-        return cls(tuple(references[i] for i in sorted(references)), recording.scene)
-
-    def measure(self, number: int) -> tuple[Measurement, list[str]]:
-        """Return the measurement of one flow image, and the errors of the views that are left out."""
-        results, errors = [], []
-        for reference in self.views:
-            try:
-                results.append(reference.measure([number]))
-            except InputError as error:
-                errors.append(f"view '{reference.view.name}': {error}")
-        if not results:
-            raise InputError(errors[0])
-        return join_views(results, self.scene), errors
+def references_of(
+    recording: Recording,
+    say: Callable[[str], None] = silent,
+    on_view: Callable[[int], None] = lambda count: None,
+    processes: int | None = None,
+) -> tuple[ViewReference, ...]:
+    """Evaluate the reference images of all views."""
+    views, recording = recording.views, replace(recording, images=False)  # a sequence has no images
+    if processes is None:
+        processes = recording.processes(len(views), len(views))
+    references: dict[int, ViewReference] = {}
+    for i, (reference, lines) in work(_reference, recording, views, processes):
+        for line in lines:
+            say(line)
+        if isinstance(reference, InputError):
+            raise reference
+        references[i] = reference
+        on_view(len(references))
+    return tuple(references[i] for i in sorted(references))
 
 
 def _reference(recording: Recording, view: View) -> tuple[ViewReference | InputError, list[str]]:
@@ -73,6 +52,19 @@ def _reference(recording: Recording, view: View) -> tuple[ViewReference | InputE
         return ViewReference.of(recording, view, 1, lines.append), lines
     except InputError as error:
         return error, lines
+
+
+def measure_frame(references: Sequence[ViewReference], scene: Scene, number: int) -> tuple[Measurement, list[str]]:
+    """Return the measurement of one flow image, and the errors of the views that are left out."""
+    results, errors = [], []
+    for reference in references:
+        try:
+            results.append(reference.measure([number]))
+        except InputError as error:
+            errors.append(f"view '{reference.view.name}': {error}")
+    if not results:
+        raise InputError(errors[0])
+    return join_views(results, scene), errors
 
 
 def frame_numbers(text: str, views: Sequence[View]) -> range:
@@ -130,24 +122,24 @@ def measure_recording(
     """
     settings = json.loads(json.dumps({**(settings or {}), "frames": [numbers.start, numbers.stop]}, default=str))
     sequence = _existing(out, settings) if out.exists() and not force else None
-    reference = RecordingReference.of(recording, say, on_step, processes)
+    references = references_of(recording, say, on_step, processes)
     if sequence is not None:
-        _check_cameras(out, [view.camera for view in reference.views])
+        _check_cameras(out, [view.camera for view in references])
         count = sum(map(sequence.is_written, range(len(numbers))))
         say(f"{out}: {count} of {len(numbers)} frames exist already")
     else:
-        sequence = _create(reference, numbers, times, out, settings, force)
+        sequence = _create(references, recording.scene, numbers, times, out, settings, force)
     todo = [i for i in range(len(numbers)) if not sequence.is_written(i)]
     count, incomplete = len(numbers) - len(todo), 0
     if processes is None:
-        processes = recording.processes(len(todo), len(todo) * len(reference.views))
-    for i, lines in work(_measure_frame, (reference, sequence, numbers), todo, processes):
+        processes = recording.processes(len(todo), len(todo) * len(references))
+    for i, lines in work(_write_frame, (references, recording.scene, sequence, numbers), todo, processes):
         count += 1
-        on_step(len(reference.views) + count)
+        on_step(len(references) + count)
         incomplete += bool(lines)
         for line in lines:
             say(f"frame {numbers[todo[i]]}: left out: {line}")
-    say(f"{out}: {len(numbers)} frames of {len(reference.views)} views, {incomplete} of them incomplete")
+    say(f"{out}: {len(numbers)} frames of {len(references)} views, {incomplete} of them incomplete")
     return sequence
 
 
@@ -200,36 +192,32 @@ def _camera_numbers(camera: Camera) -> dict[str, Tensor]:
 
 
 def _create(
-    reference: RecordingReference,
-    numbers: range,
-    times: Sequence[float],
-    out: Path,
-    settings: dict[str, Any],
-    force: bool,
-) -> MeasurementSequence:
+    references: Sequence[ViewReference], scene: Scene, numbers: range, times: Sequence[float], out: Path,
+    settings: dict[str, Any], force: bool,
+) -> MeasurementSequence:  # fmt: skip
     """A new store with the first frame that has all views."""
     import zarr
 
-    first_error = None
+    reasons = []
     for index, number in enumerate(numbers):
         try:
-            measurement, errors = reference.measure(number)
+            measurement, errors = measure_frame(references, scene, number)
         except InputError as error:
-            first_error, errors = first_error or error, [str(error)]
+            errors = [str(error)]
         if not errors:
             sequence = MeasurementSequence.create(out, times, measurement, force)
             zarr.open_group(out, mode="r+").attrs["displacement"] = settings
             sequence.write_frame(index, measurement)
             return sequence
-        first_error = first_error or InputError(errors[0])
-    raise InputError(f"no frame in which every view could be used; {first_error}; choose --views")
+        reasons += errors
+    raise InputError(f"no frame in which every view could be used; {reasons[0]}; choose --views")
 
 
-def _measure_frame(common: tuple[RecordingReference, MeasurementSequence, range], index: int) -> list[str]:
+def _write_frame(common: tuple[Sequence[ViewReference], Scene, MeasurementSequence, range], index: int) -> list[str]:
     """Measure and write one frame; return the errors of views that are left out."""
-    reference, sequence, numbers = common
+    references, scene, sequence, numbers = common
     try:
-        measurement, errors = reference.measure(numbers[index])
+        measurement, errors = measure_frame(references, scene, numbers[index])
         sequence.write_frame(index, measurement)
     except InputError as error:
         return [str(error)]

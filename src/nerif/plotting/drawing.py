@@ -20,9 +20,24 @@ if TYPE_CHECKING:
     from nerif.geometry import Grid
 
 __all__ = [
-    "COLOURS", "COLOUR_MAPS", "DIVERGING", "LABELS", "SEQUENTIAL", "Drawable", "add_colour_bar", "colour_range",
-    "draw_map", "draw_slice", "draw_slices", "drawn_of", "label_of", "map_colours", "map_range", "shown", "style",
-]  # fmt: skip
+    "COLOURS",
+    "COLOUR_MAPS",
+    "DIVERGING",
+    "LABELS",
+    "SEQUENTIAL",
+    "Drawable",
+    "add_colour_bar",
+    "colour_range",
+    "draw_map",
+    "draw_slice",
+    "draw_slices",
+    "label_of",
+    "map_colours",
+    "map_range",
+    "plotted_quantities",
+    "plotted_values",
+    "style",
+]
 
 
 class Drawable(Protocol):
@@ -57,7 +72,7 @@ LABELS = {
 """Label of a colour bar, and unit."""
 
 
-def drawn_of(quantities: Iterable[str]) -> tuple[str, ...]:
+def plotted_quantities(quantities: Iterable[str]) -> tuple[str, ...]:
     """Return the quantities of a result to plot: without statistics, and without the index excess, which n shows."""
     return tuple(q for q in quantities if q != "index_excess" and q.rpartition("_")[2] not in STATISTICS)
 
@@ -89,7 +104,7 @@ def label_of(quantity: str) -> str:
     return f"{name} [{unit}]"
 
 
-def shown(volume: Drawable) -> np.ndarray:
+def plotted_values(volume: Drawable) -> np.ndarray:
     """Return the values to plot, (z, y, x): n - 1 for n."""
     values = volume.values.double().numpy()
     return values - 1 if volume.quantity == "n" else values
@@ -99,7 +114,7 @@ def draw_slice(
     axes: Axes, volume: Drawable, normal: str, limits: tuple[float, float] | None = None, colour_map: str | None = None
 ) -> Axes:
     """Draw the middle slice of a volume across the axis `normal`; lengths in mm, masked voxels grey."""
-    values = shown(volume)
+    values = plotted_values(volume)
     low, high = limits or colour_range(values)
     axis = "zyx".index(normal)
     plane = np.take(values, values.shape[axis] // 2, axis=axis)

@@ -20,7 +20,7 @@ from nerif.plotting.drawing import (
     draw_slices,
     label_of,
     map_range,
-    shown,
+    plotted_values,
     style,
 )  # fmt: skip
 
@@ -90,7 +90,7 @@ def show_slices(volume: Drawable) -> str:
 
     def draw(figure: Figure) -> None:
         line = list(figure.subplots(1, 3))
-        draw_slices(line, volume, colour_range(shown(volume)))
+        draw_slices(line, volume, colour_range(plotted_values(volume)))
         add_colour_bar(line, label_of(volume.quantity))
 
     return image(draw, 8.5, 2.8)

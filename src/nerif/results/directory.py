@@ -36,7 +36,7 @@ __all__ = [
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
-MERIDIAN, LIVE, LIVE_LOOK = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
+MERIDIAN, LIVE, LIVE_FIELD = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
 TRIALS, CROSS_VALIDATION, FIGURES, CALIBRATION = "trials", "cross_validation", "figures", "calibration.toml"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
@@ -155,7 +155,7 @@ class ResultDirectory:
 
         A foreign calibration is renamed only when one is written.
         """
-        names = (*FILES, *MERIDIAN, LIVE, LIVE_LOOK)
+        names = (*FILES, *MERIDIAN, LIVE, LIVE_FIELD)
         self.files.remove(names)
         self.files.set_aside([name for name in names if name != CALIBRATION])
         if self.has(CALIBRATION):

@@ -1,4 +1,4 @@
-"""What a rig will see, before it is built.
+"""Expected displacement and resolution of a rig before it is built.
 
 Sources: Raffel, Background-oriented schlieren (BOS) techniques, Exp. Fluids 56 (2015) 60; Gojani, Kamishi & Obayashi,
 Measurement sensitivity and resolution for background oriented schlieren, J. Vis. 16 (2013) 201.
@@ -12,59 +12,49 @@ from dataclasses import dataclass, replace
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.common.settings import Positive, check_settings
 from nerif.geometry import Ring
 from nerif.physics.gas_optics import ambient_index
 
 __all__ = ["DesignSettings", "Expectation", "expect"]
 
-DIFFRACTION = 2.44  # diameter of the Airy disc over wavelength and f-number
+AIRY = 2.44  # diameter of the Airy disc over wavelength and f-number
 DOT = 3.0  # px
 
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """The flow to be measured, the light and the optical flow.
+    """The flow, the light and the optical flow."""
 
-    Raises
-    ------
-    InputError
-        If a number is not positive, or the temperatures are the same.
-    """
-
-    index_contrast: float = 2.0e-4
+    index_contrast: Positive = 2.0e-4
     """Largest difference of the index to the ambient."""
-    temperature: float | None = None
-    """Hottest (or coldest) temperature of air, K; takes the place of index_contrast."""
-    ambient_temperature: float = 293.15
+    temperature: Positive | None = None
+    """Hottest (or coldest) temperature of air, K; replaces index_contrast."""
+    ambient_temperature: Positive = 293.15
     """Temperature of the air around, K."""
-    pressure_pa: float = 101325.0
+    pressure_pa: Positive = 101325.0
     """Pressure, Pa."""
-    f_number: float = 16.0
+    f_number: Positive = 16.0
     """Focal length over aperture; of a telecentric lens the f-number on the sensor's side."""
-    wavelength_nm: float = 532.0
+    wavelength_nm: Positive = 532.0
     """Wavelength of the light, nm."""
-    flow_size: float = 50.0
+    flow_size: Positive = 50.0
     """Width of the flow, and path length through it, mm."""
-    feature_size: float = 5.0
+    feature_size: Positive = 5.0
     """Smallest structure of interest, which has the whole contrast, mm."""
-    displacement_noise: float = 0.03
+    displacement_noise: Positive = 0.03
     """Noise of the optical flow, px."""
-    window: float = 8.0
-    """What the optical flow averages over, px."""
+    window: Positive = 8.0
+    """Averaging window of the optical flow, px."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise InputError(f"expected a positive number, got {value}", field=name)
+        check_settings(self)
         if self.temperature == self.ambient_temperature:
-            raise InputError(
-                f"expected another one than ambient_temperature, {self.temperature:g} K", field="temperature"
-            )
+            raise InputError(f"expected not ambient_temperature, {self.temperature} K", field="temperature")
 
     @property
     def contrast(self) -> float:
-        """Largest difference of the index to the ambient, by the temperature if that is given."""
+        """Largest difference of the index to the ambient, by the temperature if that is set."""
         if self.temperature is None:
             return self.index_contrast
         flow, ambient = (
@@ -76,46 +66,31 @@ class DesignSettings:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What comes of it; lengths in mm in the plane of the flow unless said otherwise."""
+    """Properties of a rig; lengths in mm in the plane of the flow unless stated otherwise."""
 
-    pixel_at_flow: float
-    """Edge of a pixel, mm."""
-    pixel_at_background: float
-    """Edge of a pixel on the background, mm."""
-    field_of_view: tuple[float, float]
-    """Width and height of the image at the flow, mm."""
-    background_size: tuple[float, float]
-    """Width and height of the pattern to print, a tenth more than the image shows, mm."""
-    dot: float
-    """Size of a dot of 3 px on the background, mm."""
-    sensitivity: float
-    """Displacement of a deflection in the middle of the flow, px per mrad."""
-    deflection: float
-    """Largest deflection by a Gaussian structure of the feature size, mrad."""
-    displacement: float
-    """Its displacement, px."""
-    displacement_of_sheet: float
-    """Displacement of a layer of the feature size seen edge-on through the whole flow, px: an upper bound."""
-    smallest_contrast: float
-    """Index contrast whose displacement is the noise."""
-    cone: float
-    """Diameter of the cone of rays to a pixel where it passes the flow, lens focused on the background, mm."""
-    window: float
-    """What the optical flow averages over, mm."""
-    diffraction: float
-    """Diameter of the Airy disc, mm."""
-    resolution: float
-    """All three together: root of the sum of squares, mm."""
-    notes: tuple[str, ...]
-    """What looks wrong."""
+    pixel_at_flow: float  # edge of a pixel, mm
+    pixel_at_background: float  # edge of a pixel on the background, mm
+    field_of_view: tuple[float, float]  # width and height of the image at the flow, mm
+    background_size: tuple[float, float]  # of the pattern to print, a tenth larger than the image, mm
+    dot: float  # size of a dot of 3 px on the background, mm
+    sensitivity: float  # displacement of a deflection in the middle of the flow, px per mrad
+    deflection: float  # largest deflection by a Gaussian structure of the feature size, mrad
+    displacement: float  # its displacement, px
+    displacement_of_sheet: float  # of a layer of the feature size, edge-on through the whole flow: upper bound, px
+    smallest_contrast: float  # index contrast whose displacement equals the noise
+    cone: float  # diameter of the rays to a pixel at the flow, focused on the background, mm
+    window: float  # averaging window of the optical flow, mm
+    diffraction: float  # diameter of the Airy disc, mm
+    resolution: float  # root of the sum of squares of the three, mm
+    notes: tuple[str, ...]  # warnings
 
 
 def expect(ring: Ring, flow: DesignSettings) -> Expectation:
-    """Return what the first camera of a ring will see of a flow around the origin.
+    """Return the expected properties of the first camera of a ring for a flow around the origin.
 
-    The largest deflection by n = dn exp(-r^2 / 2 s^2) is dn sqrt(2 pi / e), at the distance s from its middle, whatever
-    its size; by a layer of thickness a, edge-on over a length L, dn L / a. The displacement is that times the lever arm
-    and the sensitivity S of the forward model (docs/conventions.md), taken from the camera itself.
+    The largest deflection by n = dn exp(-r^2 / 2 s^2) is dn sqrt(2 pi / e), at the distance s from its centre, for any
+    size; by a layer of thickness a, edge-on over a length L, it is dn L / a. The displacement is the deflection times
+    the lever arm and the sensitivity S of the forward model (docs/conventions.md).
     """
     camera = ring.cameras()[0]
     height, width = camera.image_size
@@ -127,22 +102,20 @@ def expect(ring: Ring, flow: DesignSettings) -> Expectation:
     at_flow, at_background = (float(camera.pixel_size(p)) for p in (torch.zeros_like(ray.origin), ray.end_points))
     deflection = 1000 * flow.contrast * math.sqrt(2 * math.pi / math.e)
     displacement = per_mrad * deflection
-    sheet = per_mrad * 1000 * flow.contrast * flow.flow_size / flow.feature_size
-    # the cone has its tip on the background, and the lens's f-number times the magnification there
+    # the tip of the cone is on the background, where the f-number is multiplied by the magnification
     cone = lever * (ring.pixel_pitch / at_background) / flow.f_number
-    airy = DIFFRACTION * flow.wavelength_nm * 1e-6 * flow.f_number / ring.pixel_pitch * at_flow
+    airy = AIRY * flow.wavelength_nm * 1e-6 * flow.f_number / ring.pixel_pitch * at_flow
     window = flow.window * at_flow
-    size = (1.1 * width * at_background, 1.1 * height * at_background)
     result = Expectation(
         pixel_at_flow=at_flow,
         pixel_at_background=at_background,
         field_of_view=(width * at_flow, height * at_flow),
-        background_size=size,
+        background_size=(1.1 * width * at_background, 1.1 * height * at_background),
         dot=DOT * at_background,
         sensitivity=per_mrad,
         deflection=deflection,
         displacement=displacement,
-        displacement_of_sheet=sheet,
+        displacement_of_sheet=per_mrad * 1000 * flow.contrast * flow.flow_size / flow.feature_size,
         smallest_contrast=flow.contrast * flow.displacement_noise / displacement,
         cone=cone,
         window=window,
@@ -158,31 +131,31 @@ def _notes(e: Expectation, ring: Ring, flow: DesignSettings) -> list[str]:
     if e.displacement < 3 * flow.displacement_noise:
         notes.append(
             f"the displacement of {e.displacement:.3f} px is hardly above the noise of {flow.displacement_noise:g} px: "
-            "move the background away from the flow, or magnify it more"
+            "move the background away from the flow, or increase the magnification"
         )
     if e.displacement > flow.window / 2:
         notes.append(f"the displacement of {e.displacement:.1f} px is more than half a window of {flow.window:g} px")
     if e.resolution > flow.feature_size:
-        largest = max((e.cone, "stop the lens down, or bring the background nearer"), (e.window, "use smaller windows"),
-                      (e.diffraction, "open the lens"))  # fmt: skip
+        remedies = {
+            "stop the lens down, or bring the background nearer": e.cone,
+            "use smaller windows": e.window,
+            "open the lens": e.diffraction,
+        }
         notes.append(
             f"structures of {flow.feature_size:g} mm are finer than the resolution of {e.resolution:.2f} mm: "
-            f"{largest[1]}"
+            f"{max(remedies, key=lambda remedy: remedies[remedy])}"
         )
     if min(e.field_of_view) < flow.flow_size:
-        notes.append(
-            f"the flow of {flow.flow_size:g} mm is larger than the image of {e.field_of_view[0]:.0f} x "
-            f"{e.field_of_view[1]:.0f} mm"
-        )
+        width, height = e.field_of_view
+        notes.append(f"the flow of {flow.flow_size:g} mm is larger than the image of {width:.0f} x {height:.0f} mm")
     if e.dot < 0.2:
-        notes.append(f"dots of {e.dot:.2f} mm are finer than most printers can do, 0.2 mm")
+        notes.append(f"dots of {e.dot:.2f} mm are finer than the 0.2 mm of most printers")
     if ring.background_distance < flow.flow_size:
-        notes.append("the background stands inside or next to the flow")
+        notes.append("the background is inside or next to the flow")
     angles = sorted(a % 180 for a in ring.angles)
-    if len(angles) >= 2:
-        gap = max(b - a for a, b in zip(angles, [*angles[1:], angles[0] + 180], strict=True))
-        if gap > 60:
-            notes.append(f"no view within a gap of {gap:.0f} degrees: structures across it will be smeared")
-    else:
-        notes.append("one view alone gives no depth")
+    if len(angles) < 2:
+        return [*notes, "one view alone gives no depth"]
+    gap = max(b - a for a, b in zip(angles, [*angles[1:], angles[0] + 180], strict=True))
+    if gap > 60:
+        notes.append(f"no view within a gap of {gap:.0f} degrees: structures across it will be smeared")
     return notes

@@ -1,10 +1,11 @@
-"""A whole rendered experiment: images of targets, background and flow of every view, as a laboratory would take them.
+"""A whole rendered experiment: images of targets, background and flow of every view.
 
-The folder is one that nerif calibrate and nerif displacement read (imaging/views.py).
+nerif calibrate and nerif displacement read its folder (imaging/readers/views.py).
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -35,7 +36,7 @@ SIDES = {
     (0, 1): ("x-", "z-", "y-"),
     (0, -1): ("x+", "z+", "y-"),
 }
-"""World axes along the axes of an upright target that faces the x or y direction of the world named by the key."""
+"""World axes along the axes of an upright target, by the x and y direction of the world that it faces."""
 
 KINDS = ("target", "background", "reference", "flow")
 """Folders of a view."""
@@ -45,7 +46,7 @@ ORIGIN = torch.zeros(3, dtype=torch.float64)
 
 @dataclass(frozen=True)
 class Experiment:
-    """How the images are taken."""
+    """Settings of the images."""
 
     kind: str = "dots"
     """Background: dots, wavelet or multiscale."""
@@ -75,87 +76,78 @@ class Experiment:
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,
         truth_voxels: int = 100, on_image: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
-        """Render all images into VIEW/{target,background,reference,flow}/, with settings to calibrate, and the truth.
+        """Render VIEW/{target,background,reference,flow}/; write calibrate.toml and truth/{calibration.toml,volume.nc}.
+
+        Raises InputError if a view has images that this program did not write: even under other names they would be
+        taken for images of the experiment.
 
         Parameters
         ----------
-        folder : to write; calibrate.toml, truth/calibration.toml and truth/volume.nc come with the images
         cameras : of the rig, with their lenses
-        phantom, box : field of index excess, and the box that holds it
+        phantom, box : field of index excess, and its box
         n_ambient : refractive index around it
-        truth_voxels : of the truth, along the longest edge of the box
-        on_image : called after each image (`images` of them in all)
-
-        Raises
-        ------
-        InputError
-            If truth_voxels, or a setting of target or background, can't be; or if a view has images already that this
-            program did not write: renamed ones would be taken for images of the experiment.
+        truth_voxels : along the longest edge of the box
+        on_image : called after each image (`images` of them in total)
         """
         if truth_voxels < 1:
             raise InputError(f"expected at least 1, got {truth_voxels}", field="truth_voxels")
         _check_images(folder, cameras)
-        self._write_truth(folder / "truth", cameras, phantom, box, n_ambient, truth_voxels)
+        truth = folder / "truth"
+        truth.mkdir(parents=True, exist_ok=True)
+        with OwnFiles(truth).writing("calibration.toml") as path:
+            write_cameras(path, [CalibratedCamera.from_camera(c) for c in cameras])
+        grid = Grid.of_resolution(box, truth_voxels)
+        with OwnFiles(truth).writing("volume.nc") as path:
+            write_netcdf(path, [Volume(phantom.sample(grid), grid, attributes={"n_ambient": n_ambient})])
         with OwnFiles(folder).writing("calibrate.toml") as path:
-            self._write_settings(path, cameras)
+            write_toml(path, self._calibration_settings(cameras))
         for i, camera in enumerate(cameras):
             self._background_images(folder / camera.name, camera, i, phantom, box, n_ambient, on_image)
         if self.poses:
             self.write_targets(folder, cameras, on_image)
 
-    def _write_truth(
-        self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float, voxels: int
-    ) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        files = OwnFiles(folder)
-        with files.writing("calibration.toml") as path:
-            write_cameras(path, [CalibratedCamera.from_camera(c) for c in cameras])
-        grid = Grid.of_resolution(box, voxels)
-        volume = Volume(phantom.sample(grid), grid, attributes={"n_ambient": n_ambient})
-        with files.writing("volume.nc") as path:
-            write_netcdf(path, [volume])
-
-    def _write_settings(self, path: Path, cameras: Sequence[Camera]) -> None:
-        """Settings of nerif calibrate by which the rig's own world comes out."""
-        settings = {
+    def _calibration_settings(self, cameras: Sequence[Camera]) -> dict[str, object]:
+        """Settings of nerif calibrate that reproduce the world of the rig."""
+        settings: dict[str, object] = {
             "world": "0",
             "axes": world_axes(cameras),
             "background_scale": background_scale(cameras),
             "target": asdict(self.target_for(cameras)),
+            **_lens_settings(cameras[0]),
         }
-        settings |= _lens_as_calibrated(cameras[0])
         if not cameras[0].projection.shows_depth:
             settings["projection"] = cameras[0].projection.name
             settings["side"] = side_of_one(cameras)
             settings["background_distance"] = -cameras[0].plane.offset
-        write_toml(path, settings)
+        return settings
 
     def write_targets(
         self, folder: Path, cameras: Sequence[Camera], on_image: Callable[[], None] = lambda: None
     ) -> None:
         """Render the images of the target into VIEW/{target,background}/."""
         target = self.target_for(cameras)
-        laid = target.scaled(background_scale(cameras))
+        on_background = target.scaled(background_scale(cameras))
         for j, pose in enumerate(target_poses(cameras, target, self.poses, self.seed)):
             for camera in cameras:
                 if _faces(pose, camera):
                     self._target_image(folder / camera.name / "target" / f"pose_{j:03d}.tif", camera, target, pose)
                 on_image()
         for camera in cameras:
-            for j, pose in enumerate(background_poses(camera, laid, self.backgrounds)):
-                self._target_image(folder / camera.name / "background" / f"laid_{j:03d}.tif", camera, laid, pose)
+            for j, pose in enumerate(background_poses(camera, on_background, self.backgrounds)):
+                path = folder / camera.name / "background" / f"laid_{j:03d}.tif"
+                self._target_image(path, camera, on_background, pose)
                 on_image()
 
     def target_for(self, cameras: Sequence[Camera]) -> CalibrationTarget:
-        """Return the target, of a size that fits the images if none is given."""
+        """Return the target; without a pitch, of a size that fits the images."""
         pitch = self.pitch
         if pitch == 0:
-            seen = (float(c.pixel_size(ORIGIN)) * torch.tensor(c.image_size) for c in cameras)
-            pitch = 0.75 * min(min(float(s[1]) / (self.columns + 1), float(s[0]) / (self.rows + 1)) for s in seen)
+            fields = (float(c.pixel_size(ORIGIN)) * torch.tensor(c.image_size) for c in cameras)
+            pitch = 0.75 * min(min(float(s[1]) / (self.columns + 1), float(s[0]) / (self.rows + 1)) for s in fields)
         return CalibrationTarget(self.target, self.columns, self.rows, pitch)
 
     def images(self, views: int) -> int:
-        """Number of images of `views` views (those of targets that face away counted)."""
+        """Return the number of images of `views` views, including targets that face away."""
         return views * (self.references + 1 + (self.poses + self.backgrounds if self.poses else 0))
 
     def _background_images(
@@ -171,41 +163,35 @@ class Experiment:
         for k in range(self.references):
             self._save(folder / "reference" / f"reference_{k:03d}.tif", still)
             on_image()
-        flow = render(camera, texture, phantom, box, n_ambient, self.samples)
-        self._save(folder / "flow" / "flow_000.tif", flow)
+        self._save(folder / "flow" / "flow_000.tif", render(camera, texture, phantom, box, n_ambient, self.samples))
         on_image()
 
     def _target_image(self, path: Path, camera: Camera, target: CalibrationTarget, pose: Pose) -> None:
-        sharp = replace(camera, lens=None)
-        self._save(path, render(sharp, place(target, pose, camera), samples=self.samples))
+        self._save(path, render(replace(camera, lens=None), place(target, pose, camera), samples=self.samples))
 
     def _save(self, path: Path, light: Float[Tensor, "row column"]) -> None:
-        import zlib
-
         import tifffile
 
         path.parent.mkdir(parents=True, exist_ok=True)
         seed = zlib.crc32("/".join(path.parts[-3:]).encode()) + self.seed  # the same images in any folder and order
         counts = self.sensor.expose(light, seed)
-        # a 16-bit file tells that only so many bits of it are used
-        tags = [(281, "H", 1, 2**self.sensor.bits - 1, False)]
+        tags = [(281, "H", 1, 2**self.sensor.bits - 1, False)]  # MaxSampleValue: the bits used out of 16
         with OwnFiles(path.parent).writing(path.name):
             tifffile.imwrite(path, counts, extratags=tags)
 
 
 def _check_images(folder: Path, cameras: Sequence[Camera]) -> None:
-    for place in (folder / camera.name / kind for camera in cameras for kind in KINDS):
-        files = OwnFiles(place)
-        strange = [p.name for p in sorted(place.glob("*")) if p.name != WRITTEN and p.name not in files]
-        if strange:
+    for images in (folder / camera.name / kind for camera in cameras for kind in KINDS):
+        files = OwnFiles(images)
+        foreign = [p.name for p in sorted(images.glob("*")) if p.name != WRITTEN and p.name not in files]
+        if foreign:
             raise InputError(
-                f"holds {strange[0]}, which nerif render did not write, and was left as it is; give another --out",
-                field=place,
+                f"contains {foreign[0]}, which nerif render did not write; unchanged, give another --out", field=images
             )
 
 
-def _lens_as_calibrated(camera: Camera) -> dict[str, float]:
-    """The options of nerif calibrate for the lens: of a telecentric camera calibration has z_cam = 0 at the origin."""
+def _lens_settings(camera: Camera) -> dict[str, float]:
+    """Options of nerif calibrate for the lens; its telecentric cameras have z_cam = 0 at the origin."""
     if camera.lens is None or camera.lens.diameter == 0:
         return {}
     diameter, focus = camera.lens.diameter, camera.lens.focus
@@ -216,7 +202,7 @@ def _lens_as_calibrated(camera: Camera) -> dict[str, float]:
 
 
 def background_scale(cameras: Sequence[Camera]) -> float:
-    """Return how much larger the target on the backgrounds has to be to look as large as at the origin."""
+    """Return the scale of the target on the backgrounds that gives it the image size of the target at the origin."""
     middle = [torch.tensor([[(n - 1) / 2 for n in c.image_size[::-1]]], dtype=torch.float64) for c in cameras]
     ends = [c.rays(m).end_points[0] for c, m in zip(cameras, middle, strict=True)]
     ratios = [float(c.pixel_size(end) / c.pixel_size(ORIGIN)) for c, end in zip(cameras, ends, strict=True)]
@@ -224,12 +210,12 @@ def background_scale(cameras: Sequence[Camera]) -> float:
 
 
 def world_axes(cameras: Sequence[Camera]) -> tuple[str, str, str]:
-    """Return the axes (as nerif calibrate takes them) of the first target pose: the rig's own world."""
+    """Return the world axes (option of nerif calibrate) along the axes of the first target pose."""
     return SIDES[_side(cameras)]
 
 
 def side_of_one(cameras: Sequence[Camera]) -> tuple[str, str]:
-    """Return a view that stands to one side of the first target pose, and on which side of the world that is."""
+    """Return the view farthest to one side of the first target pose, and that side of the world."""
     across = (_side(cameras)[0] == 0, _side(cameras)[1] == 0)  # x or y
     places = [-c.sight(ORIGIN)[:2] @ torch.tensor(across, dtype=torch.float64) for c in cameras]
     i = max(range(len(cameras)), key=lambda k: abs(float(places[k])))
@@ -245,38 +231,37 @@ def _side(cameras: Sequence[Camera]) -> tuple[int, int]:
 
 
 def target_poses(cameras: Sequence[Camera], target: CalibrationTarget, count: int, seed: int) -> list[Pose]:
-    """Return poses (target to world) around the origin, turned towards the cameras; the first one stands straight.
+    """Return poses (target to world) around the origin, facing the cameras; the first one is upright.
 
-    The others face between two neighbouring cameras, tilted by up to 35 degrees and moved by up to a tenth of the
-    target's size, so that each is seen by several cameras.
+    The others face between two neighbouring cameras, tilted by up to 35 degrees and shifted by up to a tenth of the
+    target's size, so that several cameras see each.
     """
     from scipy.spatial.transform import Rotation
 
     if count < 4:
         raise InputError(f"expected 4 target poses or more, got {count}", field="poses")
     rng = np.random.default_rng(seed)
-    towards_camera = np.stack([-c.sight(ORIGIN).numpy() for c in cameras])
-    side = _side(cameras)
-    poses = [Pose(_facing(np.array([*side, 0.0])), np.zeros(3))]
+    directions = np.stack([-c.sight(ORIGIN).numpy() for c in cameras])
+    poses = [Pose(_facing(np.array([*_side(cameras), 0.0])), np.zeros(3))]
     for k in range(count - 1):
         at = (k + rng.random()) / (count - 1) * (len(cameras) - 1)
         i = min(int(at), max(len(cameras) - 2, 0))
         j = min(i + 1, len(cameras) - 1)
-        towards = (1 - (at - i)) * towards_camera[i] + (at - i) * towards_camera[j]
+        direction = (1 - (at - i)) * directions[i] + (at - i) * directions[j]
         tilt = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
         shift = 0.1 * max(target.size) * rng.uniform(-1, 1, 3)
-        poses.append(Pose(_facing(towards / np.linalg.norm(towards)) @ tilt, shift))
+        poses.append(Pose(_facing(direction / np.linalg.norm(direction)) @ tilt, shift))
     return poses
 
 
 def background_poses(camera: Camera, target: CalibrationTarget, count: int) -> list[Pose]:
-    """Return poses of the target laid on a camera's background: in the middle, then towards the corners."""
+    """Return poses of the target on a camera's background: in the middle, then towards the corners."""
     from scipy.spatial.transform import Rotation
 
     middle = background_texture(camera, torch.zeros(2, 2, dtype=torch.float64), 1.0)
     frame = torch.stack([middle.right, middle.down, torch.linalg.cross(middle.right, middle.down)], dim=1).numpy()
     centre = (middle.corner + middle.right + middle.down).numpy()
-    width, height = (s / 2.2 for s in pattern_size(camera))  # half of what the image shows
+    width, height = (s / 2.2 for s in pattern_size(camera))  # half of the image
     room = np.maximum(0.9 * np.array([width, height]) - np.array(target.size) / 2, 0)
     corners = [(0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, 0), (1, 0)]
     poses = []
@@ -288,19 +273,16 @@ def background_poses(camera: Camera, target: CalibrationTarget, count: int) -> l
 
 
 def place(target: CalibrationTarget, pose: Pose, camera: Camera) -> Texture:
-    """Return a target in space as something to render, drawn finely enough for a camera."""
-    at = torch.from_numpy(pose.translation)
-    fine = float(camera.pixel_size(at)) / 3  # as the points of a pixel: finer edges would alias
-    values, texel = torch.from_numpy(target.raster(fine)), target.raster_pixel(fine)
+    """Return a target in space as a texture that is fine enough for a camera."""
+    centre = torch.from_numpy(pose.translation)
+    fine = float(camera.pixel_size(centre)) / 3  # as the points of a pixel: finer edges would alias
     right, down = (torch.from_numpy(pose.rotation[:, k].copy()) for k in range(2))
-    height, width = values.shape
-    corner = torch.from_numpy(pose.translation) - right * (width * texel / 2) - down * (height * texel / 2)
-    return Texture(values, texel, corner, right, down)
+    return Texture.around(centre, right, down, torch.from_numpy(target.raster(fine)), target.raster_pixel(fine))
 
 
-def _facing(towards: np.ndarray) -> np.ndarray:
-    """Rotation of an upright target whose front faces a direction."""
-    z = -towards
+def _facing(direction: np.ndarray) -> np.ndarray:
+    """Rotation of an upright target that faces a direction."""
+    z = -direction
     x = np.cross([0.0, 0.0, -1.0], z)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1)

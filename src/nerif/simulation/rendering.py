@@ -1,25 +1,28 @@
-"""Images that a camera would take: a textured plane seen through a field by curved rays, lens disc, pixels and noise.
+"""Rendered images: a textured plane through a field by curved rays, with lens, pixels and noise.
 
 A pixel averages over its area and over the lens. Each ray is bent by the field and meets the plane at X; the image
-is the mean of the texture at X. Without a field the same rays run straight: the reference.
+is the mean of the texture at X. Without a field the same rays are straight: the reference.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError, Points
+from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.fields.base import Field
 from nerif.forward.ray_tracing import trace
 from nerif.geometry import Box, Camera, Lens, Plane, Rays
 from nerif.simulation.simulate import STEPS
 
-__all__ = ["Sensor", "Texture", "background_texture", "render"]
+__all__ = ["Sensor", "Texture", "background_texture", "pattern_size", "render"]
 
 
 @dataclass(frozen=True)
@@ -28,10 +31,10 @@ class Texture:
 
     Parameters
     ----------
-    values : (row, column) reflectance, 0 to 1
+    values : reflectance, 0 to 1
     texel : edge of a texel, mm
-    corner : (3,) outer corner of the first texel, mm, world frame
-    right, down : (3,) unit vectors along columns and rows
+    corner : outer corner of the first texel, mm, world frame
+    right, down : unit vectors along columns and rows
     surround : reflectance beyond the edges
     """
 
@@ -42,9 +45,18 @@ class Texture:
     down: Float[Tensor, 3]
     surround: float = 0.5
 
+    @classmethod
+    def around(
+        cls, centre: Float[Tensor, 3], right: Float[Tensor, 3], down: Float[Tensor, 3],
+        values: Float[Tensor, "row column"], texel: float,
+    ) -> Texture:  # fmt: skip
+        """Return a texture by the position of its centre, mm."""
+        rows, columns = values.shape
+        return cls(values, texel, centre - right * (columns * texel / 2) - down * (rows * texel / 2), right, down)
+
     @property
     def plane(self) -> Plane:
-        """The plane it lies on."""
+        """Plane of the texture."""
         normal = torch.linalg.cross(self.right, self.down)
         return Plane(normal, float(normal @ self.corner))
 
@@ -67,30 +79,26 @@ class Sensor:
     Parameters
     ----------
     bits : of the counts, 8 to 16
-    exposure : share of full scale that white paper reaches
-    full_well : electrons at full scale; shot noise is its Poisson noise. 0 is no shot noise
+    exposure : share of full scale of white paper
+    full_well : electrons at full scale, which determine the shot noise; 0 for none
     read_noise : standard deviation, electrons
     """
 
-    bits: int = 12
-    exposure: float = 0.8
-    full_well: float = 10000.0
-    read_noise: float = 10.0
+    bits: Annotated[int, Ge(8), Le(16)] = 12
+    exposure: Positive = 0.8
+    full_well: NonNegative = 10000.0
+    read_noise: NonNegative = 10.0
 
     def __post_init__(self) -> None:
-        if not 8 <= self.bits <= 16:
-            raise InputError(f"expected 8 to 16, got {self.bits}", field="bits")
-        if not self.exposure > 0 or not self.full_well >= 0 or not self.read_noise >= 0:
-            raise InputError("expected exposure > 0, full_well >= 0 and read_noise >= 0", field="sensor")
+        check_settings(self)
 
     def expose(self, light: Float[Tensor, "row column"], seed: int) -> np.ndarray:
         """Return counts of light from 0 (black) to 1 (white paper): shot noise, read noise, rounding, saturation."""
         rng = np.random.default_rng(seed)
         share = self.exposure * light.clamp_min(0).numpy()
         if self.full_well > 0:
-            share = (rng.poisson(share * self.full_well) + self.read_noise * rng.standard_normal(share.shape)) / (
-                self.full_well
-            )
+            electrons = rng.poisson(share * self.full_well) + self.read_noise * rng.standard_normal(share.shape)
+            share = electrons / self.full_well
         counts = np.clip(np.round(share * (2**self.bits - 1)), 0, 2**self.bits - 1)
         return counts.astype(np.uint8 if self.bits == 8 else np.uint16)
 
@@ -98,17 +106,12 @@ class Sensor:
 def background_texture(camera: Camera, values: Float[Tensor, "row column"], texel: float) -> Texture:
     """Lay a pattern onto the background of a camera, upright and in the middle of its image."""
     height, width = camera.image_size
-    middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
-    ray = camera.rays(middle)
-    centre = ray.end_points[0]
+    ray = camera.rays(torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64))
     normal = camera.plane.normal.to(torch.float64)
     normal = normal if float(normal @ ray.direction[0]) > 0 else -normal
     right = torch.linalg.cross(camera.rotation[1], normal)
     right = right / right.norm()
-    down = torch.linalg.cross(normal, right)
-    rows, columns = values.shape
-    corner = centre - right * (columns * texel / 2) - down * (rows * texel / 2)
-    return Texture(values, texel, corner, right, down)
+    return Texture.around(ray.end_points[0], right, torch.linalg.cross(normal, right), values, texel)
 
 
 def pattern_size(camera: Camera) -> tuple[float, float]:
@@ -116,11 +119,10 @@ def pattern_size(camera: Camera) -> tuple[float, float]:
     height, width = camera.image_size
     edge = torch.tensor([-0.5, 0.5], dtype=torch.float64)
     corners = torch.cartesian_prod(edge * width + (width - 1) / 2, edge * height + (height - 1) / 2)
-    rays = camera.rays(corners)
-    hits = rays.end_points
     texture = background_texture(camera, torch.zeros(2, 2, dtype=torch.float64), 1.0)
     centre = texture.corner + texture.right + texture.down
-    reach = ((hits - centre) @ torch.stack([texture.right, texture.down], dim=1)).abs().amax(dim=0)
+    axes = torch.stack([texture.right, texture.down], dim=1)
+    reach = ((camera.rays(corners).end_points - centre) @ axes).abs().amax(dim=0)
     return 2.2 * float(reach[0]), 2.2 * float(reach[1])
 
 
@@ -138,58 +140,54 @@ def render(
 
     Parameters
     ----------
-    camera : its own background plane plays no part: the texture's does, to which a lens without focus is focused
-    texture : what it looks at
-    field, box : what lies between, of index excess, and where; None is the reference
+    camera : its background plane is replaced by the texture's, on which a lens without focus is focused
+    field, box : index excess between camera and texture, and its box; None for the reference
     n_ambient : refractive index around the field
     samples : points along each edge of a pixel over which the texture is averaged. Rays are bent at pixel centres and
-        their movement on the plane interpolated between them by cubic splines (tests/simulation/test_rendering.py: the
-        difference to bending every one)
+        their shift on the plane is interpolated by cubic splines (error: tests/simulation/test_rendering.py)
     steps : Runge-Kutta steps through the box
     """
     if samples < 1:
         raise InputError(f"expected at least one point along the edge of a pixel, got {samples}", field="samples")
     height, width = camera.image_size
-    shift = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
+    points = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
     camera = replace(camera, background=texture.plane, lens=(camera.without_window.lens or Lens()))
     assert camera.lens is not None
     light, offsets = torch.zeros(height, width, dtype=torch.float64), camera.lens.offsets()
     for offset in offsets:
-        movement = None
+        shift = None
         if field is not None:
             assert box is not None
             centres = _rays(camera, camera.pixel_grid().reshape(-1, 2), offset)
-            movement = _movement(field, centres, texture.plane, box, n_ambient, steps).reshape(height, width, 3)
-        for dv in shift:
-            for du in shift:
+            shift = _shift(field, centres, texture.plane, box, n_ambient, steps).reshape(height, width, 3)
+        for dv in points:
+            for du in points:
                 pixels = camera.pixel_grid() + torch.stack([du, dv])
-                rays = _rays(camera, pixels.reshape(-1, 2), offset)
-                points = rays.end_points
-                if movement is not None:
-                    points = points + _between(movement, float(dv), float(du)).reshape(-1, 3)
-                light += texture.at(points).reshape(height, width)
+                hits = _rays(camera, pixels.reshape(-1, 2), offset).end_points
+                if shift is not None:
+                    hits = hits + _between(shift, float(dv), float(du)).reshape(-1, 3)
+                light += texture.at(hits).reshape(height, width)
     return light / (len(offsets) * samples**2)
 
 
 def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], offset: Float[Tensor, 4]) -> Rays:
-    """Rays from a point of the lens through where each pixel is in focus, on to the background."""
+    """Rays from a point of the lens through the focus of each pixel to the background."""
     return camera.rays(pixels).through(offset.expand(len(pixels), 1, 4))
 
 
-def _movement(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float, steps: int) -> Float[Tensor, "n 3"]:
-    """How far (mm) on the plane refraction moves the point that each ray meets."""
+def _shift(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float, steps: int) -> Float[Tensor, "n 3"]:
+    """Shift (mm) on the plane, by refraction, of the end point of each ray."""
     rays = rays.clip(box)
-    moved = torch.zeros_like(rays.origin)
+    shift = torch.zeros_like(rays.origin)
     for part in torch.split(rays.crosses.nonzero()[:, 0], 1 << 14):
-        chosen = rays[part]
-        position, heading = trace(field, chosen.to(dtype=torch.float32), steps, n_ambient)
-        # in single precision the straight ray is off by 1e-4 mm: move only by what the field bends
-        start = chosen.to(dtype=torch.float32)
+        start = rays[part].to(dtype=torch.float32)
+        position, heading = trace(field, start, steps, n_ambient)
+        # in single precision the straight ray has an error of 1e-4 mm: take the difference of the two
         length = (start.far - start.near).double()[:, None]
         exit_ = (start.origin + start.near[:, None] * start.direction).double() + length * start.direction.double()
         straight = torch.nn.functional.normalize(start.direction.double(), dim=-1)
-        moved[part] = _hit(position, heading, plane) - _hit(exit_, straight, plane)
-    return moved
+        shift[part] = _hit(position, heading, plane) - _hit(exit_, straight, plane)
+    return shift
 
 
 def _hit(position: Tensor, heading: Tensor, plane: Plane) -> Tensor:
@@ -197,11 +195,10 @@ def _hit(position: Tensor, heading: Tensor, plane: Plane) -> Tensor:
     return position + reach[:, None] * heading
 
 
-def _between(movement: Float[Tensor, "row column 3"], dv: float, du: float) -> Float[Tensor, "row column 3"]:
-    """The movement at pixel centres, moved by a part of a pixel."""
+def _between(values: Float[Tensor, "row column 3"], dv: float, du: float) -> Float[Tensor, "row column 3"]:
+    """Values at pixel centres, interpolated at an offset within the pixel."""
     if dv == 0 and du == 0:
-        return movement
+        return values
     from scipy.ndimage import shift
 
-    moved = shift(movement.numpy(), (-dv, -du, 0), order=3, mode="nearest")
-    return torch.from_numpy(moved)
+    return torch.from_numpy(shift(values.numpy(), (-dv, -du, 0), order=3, mode="nearest"))

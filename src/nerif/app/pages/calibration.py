@@ -180,7 +180,7 @@ class CalibrationPage:
         with self.note:
             for text in notes:
                 text_html(text, classes="note")
-        self.start.set_enabled(bool(self.experiment.value and self.out.value) and self.form.right)
+        self.start.set_enabled(bool(self.experiment.value and self.out.value) and self.form.valid)
 
     def _toggled(self, name: str) -> None:
         left = self.left
@@ -194,7 +194,7 @@ class CalibrationPage:
 
     def _start(self) -> None:
         with refusals():
-            self.form.made()
+            self.form.record()
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
             self.told.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
@@ -236,7 +236,7 @@ class CalibrationPage:
     async def _images(self) -> None:
         """Show the images of the view that is chosen."""
         view = self.views.get(self.view.value or "")
-        if view is None or not self.form.right:
+        if view is None or not self.form.valid:
             return
         self._show()
         with refusals():
@@ -245,7 +245,7 @@ class CalibrationPage:
 
     def _targets(self) -> dict[str, CalibrationTarget]:
         """What is looked for; a ruler needs none, then it is that of the form's defaults."""
-        made = form_of(False).record if self.simple else self.form.made()
+        made = form_of(False).record if self.simple else self.form.record()
         return {"target": made.target, "background": made.target.scaled(made.background_scale)}
 
     def _wanted(self) -> tuple[Any, ...]:
@@ -253,7 +253,7 @@ class CalibrationPage:
 
     async def _look_again(self) -> None:
         """Look anew after another target has been typed, or another experiment chosen."""
-        if self.form.right and self._wanted() != self.seen:
+        if self.form.valid and self._wanted() != self.seen:
             await self._images()
 
 

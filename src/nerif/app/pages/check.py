@@ -84,7 +84,7 @@ class CheckPage:
     def show(self) -> None:
         """Show the command line as it is now."""
         self.command.show(self.arguments)
-        self.button.set_enabled(self.form.right)
+        self.button.set_enabled(self.form.valid)
 
     def _changed(self) -> None:
         self._keep()
@@ -118,7 +118,7 @@ class CheckPage:
         said: list[str] = []
         found = None
         with refusals(said.append):
-            asked = self.form.made()
+            asked = self.form.record()
 
             def work() -> Consistency:
                 measurement = Measurement.read(self.work.project.path(name))

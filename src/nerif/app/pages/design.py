@@ -52,9 +52,9 @@ def build(work: Workspace) -> None:
     def show() -> None:
         work.keep(PAGE.name, form.changed(view.values))
         command.show(view.arguments)
-        if not view.right:
+        if not view.valid:
             return
-        asked = view.made()
+        asked = view.record()
         told.set_content(_told(expect(asked.ring, asked.flow), asked))
         drawing.set_content(rig_drawing(asked.ring.cameras(), asked.flow.flow_size))
 

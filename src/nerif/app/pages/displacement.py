@@ -112,7 +112,7 @@ class DisplacementPage:
         html = ""
         with refusals(said.append):
             asked = replace(
-                self.job.view.made(), folder=self.work.project.path(str(self.experiment.value)),
+                self.job.view.record(), folder=self.work.project.path(str(self.experiment.value)),
                 calibration=self.work.project.path(str(self.calibration.value)), views=(str(self.view.value),),
                 images=False,
             )  # fmt: skip

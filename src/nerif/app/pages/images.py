@@ -86,7 +86,7 @@ class ImagesPage:
 
     def keep(self) -> None:
         """Keep what is chosen and edited over a reload."""
-        self.kept[self.experiment] = self.edits.kept
+        self.kept[self.experiment] = self.edits.draft
         self.work.keep(PAGE.name, {"experiment": self.experiment, "view": self.chosen, "edits": self.kept})
 
     def _sum_up(self, wrong: Sequence[str]) -> None:
@@ -236,7 +236,7 @@ class ImagesPage:
         with refusals():
             folder = self.work.project.path(self.experiment)
             await self.work.beside(write_crops, folder, self.edits.changed)
-            self.kept[self.experiment] = {**self.edits.kept, "now": {}}
+            self.kept[self.experiment] = {**self.edits.draft, "now": {}}
             ui.notify(f"{self.experiment}/views.toml is written.", type="positive")
             await self.build()
 

@@ -136,11 +136,11 @@ class ReconstructPage:
         kept = {"measurement": self.measurement.name, "method": self.method.value, "preset": self.preset.value}
         self.work.keep(PAGE.name, {**kept, **self.values})
         self.command.show(self.arguments())
-        self.start.set_enabled(bool(self.measurement.name and self.out.value) and self.view.right)
+        self.start.set_enabled(bool(self.measurement.name and self.out.value) and self.view.valid)
 
     def _start(self) -> None:
         with refusals():
-            self.view.made()
+            self.view.record()
             self.work.project.path(self.measurement.name)
             out = self.work.project.relative(self.out.value)
             job = self.work.jobs.add(self.arguments(), f"{self.measurement.name} → {out}", out)

@@ -13,20 +13,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Lt
 from jaxtyping import Bool, Float, Shaped
 
-from nerif.common.conventions import InputError, check_positive
+from nerif.common.conventions import InputError
+from nerif.common.settings import Positive, check_settings
 from nerif.imaging.displacement.noise import FLOOR, local_correlation, smoothing_error, structure_variance
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
-from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.exposure import saturated
 from nerif.imaging.readers.frames import as_float
 
-__all__ = ["DisplacementMap", "DisplacementSettings", "Reference", "displacement", "measure"]
+__all__ = ["DisplacementMap", "DisplacementSettings", "Reference", "border", "displacement", "measure", "remove_shake"]
 
 Grey = Shaped[np.ndarray, "row column"]
 Image = Float[np.ndarray, "row column"]
@@ -46,24 +48,21 @@ class DisplacementSettings:
     method: str = "correlation"
     """correlation (windows of 12 px x smoothness; best on dots), dis (fast, good on noise), deepflow (the paper's),
     ilk, tvl1."""
-    smoothness: float = 1.0
+    smoothness: Positive = 1.0
     """Above 1 for smoother displacements; scales window or regularisation (fixed for deepflow)."""
-    local_contrast: int = 0
+    local_contrast: Annotated[int, Ge(0)] = 0
     """Window (px) over which brightness and contrast are equalised; 0 matches them over the whole image only."""
-    shake_border: int = 0
+    shake_border: Annotated[int, Ge(0)] = 0
     """Width (px) of the flow-free border to which shift, rotation and zoom are fitted and removed; 0 for none."""
-    max_sigma: float = 0.5
+    max_sigma: Positive = 0.5
     """Pixels with more noise than this are not valid, px."""
-    min_correlation: float = 0.5
+    min_correlation: Annotated[float, Ge(-1), Lt(1)] = 0.5
     """Pixels with a lower local correlation of flow image and warped reference are not valid."""
 
     def __post_init__(self) -> None:
         if self.method not in FLOWS:
             raise InputError(f"expected one of {', '.join(FLOWS)}, got '{self.method}'", field="method")
-        check_positive(self, "smoothness", "max_sigma")
-        check_positive(self, "local_contrast", "shake_border", zero=True)
-        if not -1 <= self.min_correlation < 1:
-            raise InputError(f"expected a number from -1 to 1, got {self.min_correlation}", field="min_correlation")
+        check_settings(self)
 
     @property
     def reach(self) -> float:
@@ -218,6 +217,41 @@ def _means(samples: Iterator[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
 
 def _without_shake(d: Vectors, settings: DisplacementSettings) -> Vectors:
     return remove_shake(d, border(d.shape[:2], settings.shake_border)) if settings.shake_border else d
+
+
+def remove_shake(d: Vectors, still: PixelMask) -> Vectors:
+    """Subtract the similarity d = t + [[a, -b], [b, a]] p that fits best where nothing flows.
+
+    Parameters
+    ----------
+    d : px
+    still : pixels without flow, fitted with Cauchy's loss, robust to outliers
+    """
+    if still.sum() < 8:
+        raise InputError(
+            f"expected at least 8 pixels without flow, got {int(still.sum())}; widen the border", field="shake"
+        )
+    from scipy.optimize import least_squares
+
+    rows, columns = np.mgrid[: d.shape[0], : d.shape[1]].astype(np.float64)
+    scale = max(d.shape[:2]) / 2
+    x, y = (columns - columns.mean()) / scale, (rows - rows.mean()) / scale
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    design = np.stack([np.stack([one, zero, x, -y], axis=-1), np.stack([zero, one, y, x], axis=-1)], axis=-2)
+    a, b = design[still].reshape(-1, 4), d[still].reshape(-1).astype(np.float64)
+    start = np.linalg.lstsq(a, b, rcond=None)[0]
+    noise = 1.4826 * np.median(np.abs(a @ start - b)) + 1e-6
+    fit = least_squares(lambda p: a @ p - b, start, jac=lambda p: a, loss="cauchy", f_scale=2 * noise)
+    return (d - (design.reshape(-1, 4) @ fit.x).reshape(d.shape)).astype(np.float32)
+
+
+def border(shape: tuple[int, ...], width: int) -> PixelMask:
+    """Return the outer `width` px of an image."""
+    if 2 * width >= min(shape):
+        raise InputError(f"expected less than half the image ({min(shape) // 2} px), got {width}", field="shake_border")
+    mask = np.ones(shape, dtype=bool)
+    mask[width:-width, width:-width] = False
+    return mask
 
 
 def _equalised(flow: Image, reference: Image, window: int) -> tuple[Image, Image]:

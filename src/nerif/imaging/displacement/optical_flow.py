@@ -10,7 +10,6 @@ al., DAGM 2007; ILK: Le Besnerais & Champagnat, ICIP 2005.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -23,8 +22,7 @@ def deepflow(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.n
     """OpenCV's DeepFlow; its smoothness is fixed."""
     import cv2
 
-    start: Any = None
-    return np.asarray(cv2.optflow.createOptFlow_DeepFlow().calc(flow, reference, start))
+    return np.asarray(cv2.optflow.createOptFlow_DeepFlow().calc(flow, reference, None))  # type: ignore[call-overload]
 
 
 def dis(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:
@@ -37,8 +35,7 @@ def dis(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarra
     method.setVariationalRefinementIterations(20)
     method.setVariationalRefinementAlpha(20.0 * smoothness)
     first, second = (np.clip(np.round(i), 0, 255).astype(np.uint8) for i in (flow, reference))
-    start: Any = None
-    return np.asarray(method.calc(first, second, start))
+    return np.asarray(method.calc(first, second, None))  # type: ignore[call-overload]
 
 
 def tvl1(flow: np.ndarray, reference: np.ndarray, smoothness: float) -> np.ndarray:

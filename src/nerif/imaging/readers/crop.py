@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
 from nerif.common.conventions import InputError
+from nerif.common.settings import check_settings
 from nerif.imaging.readers.frames import size_in_words
 
 __all__ = ["Crop"]
+
+Pixels = Annotated[int, Ge(0)]
 
 
 @dataclass(frozen=True)
@@ -24,21 +29,19 @@ class Crop:
     rotate : 0, 90, 180 or 270 degrees counter-clockwise
     """
 
-    row: int = 0
-    column: int = 0
-    height: int = 0
-    width: int = 0
+    row: Pixels = 0
+    column: Pixels = 0
+    height: Pixels = 0
+    width: Pixels = 0
     flip: str = ""
     rotate: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("row", "column", "height", "width"):
-            if getattr(self, name) < 0:
-                raise InputError(f"expected {name} 0 or more (px), got {getattr(self, name)}", field="crop")
+        check_settings(self)
         if self.flip not in ("", "horizontal", "vertical", "both"):
-            raise InputError(f"expected flip 'horizontal', 'vertical', 'both' or '', got '{self.flip}'", field="crop")
+            raise InputError(f"expected 'horizontal', 'vertical', 'both' or '', got '{self.flip}'", field="flip")
         if self.rotate not in (0, 90, 180, 270):
-            raise InputError(f"expected rotate 0, 90, 180 or 270 (degrees), got {self.rotate}", field="crop")
+            raise InputError(f"expected 0, 90, 180 or 270 degrees, got {self.rotate}", field="rotate")
 
     def shape_of(self, shape: tuple[int, int], name: str = "crop") -> tuple[int, int]:
         """Return height and width after the crop of a frame of `shape`; InputError if it reaches beyond."""

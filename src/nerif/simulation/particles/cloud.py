@@ -1,4 +1,4 @@
-"""A cloud of small bright particles, and the ideal volume that a reconstruction of it is judged by.
+"""A cloud of small bright particles, and its ideal volume, the truth of a reconstruction.
 
 E(x) = sum_p b_p G(x - x_p),      G a Gaussian of integral 1, averaged over the voxel
 """
@@ -22,18 +22,18 @@ DIAMETER = 3.0
 """Of a particle image in px, and of a particle of the ideal volume in voxels: four standard deviations (1/e^2)."""
 
 QUANTITY = "emission"
-REACH = 5.0  # standard deviations, beyond which a Gaussian is left out
+REACH = 5.0  # standard deviations at which a Gaussian is truncated
 
 
 @dataclass(frozen=True)
 class Particles:
-    """Particles in a box.
+    """Particles in an illuminated box.
 
     Parameters
     ----------
-    positions : (n, 3) mm, world frame
-    brightness : (n,) what each gives off: the integral over its emission, mm^2
-    box : in which the light is, mm
+    positions : mm, world frame
+    brightness : integral over the emission of each, mm^2
+    box : mm
     """
 
     positions: Float[Tensor, "n 3"]
@@ -45,18 +45,9 @@ class Particles:
 
     @classmethod
     def draw(cls, box: Box, count: int, variation: float = 0.0, seed: int = 0) -> Particles:
-        """Draw particles evenly over a box, of brightness 1 mm^2 in the mean.
+        """Return particles uniformly distributed in a box, of mean brightness 1 mm^2.
 
-        Parameters
-        ----------
-        count : of particles
-        variation : standard deviation of the logarithm of the brightness
-        seed : of positions and brightness
-
-        Raises
-        ------
-        InputError
-            If there would be no particle.
+        `variation` is the standard deviation of the logarithm of the brightness.
         """
         if count < 1:
             raise InputError(f"expected at least 1 particle, got {count}", field="count")
@@ -68,19 +59,14 @@ class Particles:
         brightness = torch.exp(logarithm - variation**2 / 2)
         return cls(unit.new_tensor(box.lower) + unit * unit.new_tensor(box.edges), brightness, box)
 
-    def moved(self, positions: Float[Tensor, "n 3"]) -> Particles:
-        """Return the particles at other positions (mm); those beyond the box, in which the light is, are gone."""
+    def moved_to(self, positions: Float[Tensor, "n 3"]) -> Particles:
+        """Return the particles at other positions (mm), without those outside the box."""
         lower, upper = positions.new_tensor(self.box.lower), positions.new_tensor(self.box.upper)
-        lit = ((positions >= lower) & (positions <= upper)).all(dim=1)
-        return Particles(positions[lit], self.brightness[lit], self.box)
+        inside = ((positions >= lower) & (positions <= upper)).all(dim=1)
+        return Particles(positions[inside], self.brightness[inside], self.box)
 
     def volume(self, grid: Grid, diameter: float = DIAMETER) -> Volume:
-        """Return the ideal volume: every particle a Gaussian, averaged over the voxels.
-
-        Parameters
-        ----------
-        grid : Grid
-        diameter : four standard deviations, voxels
+        """Return the ideal volume: every particle a Gaussian of a diameter (voxels), averaged over the voxels.
 
         Source: Elsinga, Scarano, Wieneke & van Oudheusden, Exp. Fluids 41 (2006) 933, Sec. 3.
         """
@@ -94,14 +80,14 @@ class Particles:
 def spread(
     places: Float[Tensor, "n d"], amounts: Float[Tensor, " n"], deviation: float, shape: tuple[int, ...]
 ) -> Float[Tensor, "*shape"]:
-    """Return an array of so many cells onto which points are spread as Gaussians, each integrated over the cells.
+    """Return an array of cells with each point as a Gaussian, integrated over the cells.
 
     Parameters
     ----------
     places : of the points, in cells along each axis of the array, 0 at the centre of the first
-    amounts : what the cells that a Gaussian covers add up to
+    amounts : integral over each Gaussian
     deviation : standard deviation, cells
-    shape : of the array; what falls beside it is lost
+    shape : of the array, outside of which the Gaussians are cut off
     """
     if not deviation > 0:
         raise InputError(f"expected above 0, got {4 * deviation}", field="diameter")
@@ -121,7 +107,7 @@ def spread(
 
 
 def quality_factor(reconstructed: Float[Tensor, "z y x"], ideal: Float[Tensor, "z y x"]) -> float:
-    """Return how well a volume of particles was reconstructed: 1 for the ideal volume, in whatever scale.
+    """Return the quality of a reconstruction, 1 for the ideal volume in any scale.
 
         Q = sum E1 E0 / sqrt(sum E1^2 sum E0^2)
 

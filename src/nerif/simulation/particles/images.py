@@ -1,8 +1,8 @@
-"""Images of particles: Gaussian images of a given diameter in px, integrated over the pixels, with shot noise.
+"""Images of particles: Gaussians of a diameter in px, integrated over the pixels, with shot noise.
 
     L(p) = sum_i b_i / a_i integral over pixel p of G(p' - p_i) dp'
 
-b_i is the brightness of a particle, p_i its image and a_i the area (mm^2) that a pixel has where it is.
+b_i is the brightness of a particle, p_i its image and a_i the area (mm^2) of a pixel at its position.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from nerif.simulation.particles.cloud import DIAMETER, QUANTITY, Particles, spre
 
 __all__ = ["image", "images"]
 
-STEP = 1e-3  # mm, over which the scale of an image is taken
+STEP = 1e-3  # mm, of the difference quotient for the scale of an image
 
 
 def images(
@@ -32,18 +32,13 @@ def images(
     diameter: float = DIAMETER,
     seed: int = 0,
 ) -> Measurement:
-    """Return what cameras see of particles: a measurement of emission, in the box of the particles.
+    """Return the images of particles as a measurement of emission in their box.
 
     Parameters
     ----------
-    counts : detected quanta of a particle of mean brightness in one image, whose shot noise there is; 0 for none
+    counts : detected quanta of a particle of mean brightness in one image, which have shot noise; 0 for no noise
     diameter : of a particle image, four standard deviations, px
     seed : of the noise
-
-    Raises
-    ------
-    InputError
-        If a number cannot be one, or a camera sees no particle.
     """
     if not 0 <= counts < math.inf:
         raise InputError(f"expected 0 or more, got {counts}", field="counts")
@@ -54,17 +49,18 @@ def images(
     sigma = torch.full_like(radiance, float("nan"))
     for i, camera in enumerate(cameras):
         h, w = camera.image_size
-        clean = image(particles, camera, diameter)
-        if not float(clean.sum()) > 0:
+        values = image(particles, camera, diameter)
+        total = float(values.sum())
+        if not total > 0:
             raise InputError(
                 f"expected some in view '{camera.name}', got none; check camera and box", field="particles"
             )
         if counts:
-            unit = float(clean.sum()) / (counts * len(particles))  # radiance of one quantum
-            found = torch.poisson(clean / unit, generator)
-            clean, noise = unit * found, unit * found.clamp_min(1).sqrt()
+            quantum = total / (counts * len(particles))  # radiance of one
+            detections = torch.poisson(values / quantum, generator)
+            values, noise = quantum * detections, quantum * detections.clamp_min(1).sqrt()
             sigma[i, :h, :w] = noise.float()
-        radiance[i, :h, :w] = clean.float()
+        radiance[i, :h, :w] = values.float()
     measurement = measurement_of({kind: radiance[..., None]}, cameras, particles.box, AMBIENT_INDEX)
     if not counts:
         return measurement
@@ -72,21 +68,14 @@ def images(
 
 
 def image(particles: Particles, camera: Camera, diameter: float = DIAMETER) -> Float[Tensor, "row column"]:
-    """Return the radiance of particles in the pixels of a camera, without noise.
-
-    Parameters
-    ----------
-    diameter : of a particle image, four standard deviations, px
-    """
+    """Return the radiance of particles in the pixels of a camera, without noise; diameter as in `images`."""
     places = camera.project(particles.positions)
     amounts = particles.brightness * _px_per_mm2(camera, particles.positions, places)
     return spread(places.flip(-1), amounts, diameter / 4, camera.image_size)
 
 
-def _px_per_mm2(
-    camera: Camera, points: Float[Tensor, "n 3"], places: Float[Tensor, "n 2"]
-) -> Float[Tensor, " n"]:  # fmt: skip
-    """Pixels that a square millimetre across the line of sight covers, at points whose images are given."""
+def _px_per_mm2(camera: Camera, points: Float[Tensor, "n 3"], places: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
+    """Pixels per square millimetre across the line of sight, at points and their images."""
     direction = camera.rays(places, sensitivity=False).direction
     least = torch.nn.functional.one_hot(direction.abs().argmin(dim=1), 3).to(direction)
     across = torch.linalg.cross(direction, least)

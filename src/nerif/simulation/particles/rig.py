@@ -1,4 +1,4 @@
-"""Four cameras before a thin volume, as is the habit of tomographic particle imaging."""
+"""Four cameras in front of a thin volume, as is common in tomographic particle imaging."""
 
 from __future__ import annotations
 
@@ -13,27 +13,22 @@ from nerif.geometry import Box, Camera, Ring
 
 __all__ = ["four_cameras"]
 
-PX_PER_MM = 10  # at the middle of the box
+PX_PER_MM = 10  # in the middle of the box
 DISTANCE = 500.0  # mm
 PITCH = 0.02  # mm
-MARGIN = 2  # px that the box stays away from the edges of the images
+MARGIN = 2  # px between the box and the edges of the images
 
 
 def four_cameras(pixels: int = 200, depth: int = 40, angle: float = 30.0) -> tuple[tuple[Camera, ...], Box]:
-    """Return four cameras at the corners of a square, and the largest box of a depth that all of them see whole.
+    """Return four cameras at the corners of a square, and the largest box of a depth that is in all images.
 
-    The box is thin along x, and the cameras look at it from +x, 500 mm away; a pixel is 0.1 mm at its middle.
+    The box is thin along x; the cameras are 500 mm away from it at +x. A pixel is 0.1 mm in its middle.
 
     Parameters
     ----------
     pixels : of an edge of each image
     depth : of the box along x, in pixels
     angle : between the x-axis and each line of sight, degrees
-
-    Raises
-    ------
-    InputError
-        If there is no such box.
     """
     if not 0 < angle < 80:
         raise InputError(f"expected between 0 and 80 degrees, got {angle}", field="angle")
@@ -52,9 +47,7 @@ def four_cameras(pixels: int = 200, depth: int = 40, angle: float = 30.0) -> tup
         box = Box.around_origin((depth / PX_PER_MM, width / PX_PER_MM, width / PX_PER_MM))
         if all(_sees(camera, box) for camera in cameras):
             return tuple(cameras), box
-    raise InputError(
-        f"expected images that hold a box {depth} px deep, got {pixels} px; give more of them", field="pixels"
-    )
+    raise InputError(f"expected images that hold a box {depth} px deep, got {pixels} px; increase it", field="pixels")
 
 
 def _sees(camera: Camera, box: Box) -> bool:

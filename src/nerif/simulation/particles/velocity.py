@@ -1,4 +1,4 @@
-"""Velocity of particles between two volumes, by window correlation in 3-D (imaging/correlation.py)."""
+"""Velocity of particles between two volumes, by window correlation in 3-D (imaging/displacement/correlation.py)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["Velocity", "velocity_between"]
 
 @dataclass(frozen=True)
 class Velocity:
-    """Displacement of particles at the nodes of a grid, and the time that it took.
+    """Displacement of particles at the nodes of a grid over a time.
 
     Parameters
     ----------
-    points : (z, y, x, 3) nodes, the centres of the windows, mm
-    displacement : (z, y, x, 3) along x, y, z, mm; NaN where none was found
+    points : nodes, the centres of the windows, mm
+    displacement : along x, y, z, mm; NaN where not valid
     seconds : between the two instants
     """
 
@@ -32,42 +32,29 @@ class Velocity:
 
     @property
     def values(self) -> Float[Tensor, "z y x 3"]:
-        """Velocity along x, y, z, mm/s; NaN where none was found."""
+        """Velocity along x, y, z, mm/s; NaN where not valid."""
         return self.displacement / self.seconds
 
     @property
-    def found(self) -> Bool[Tensor, "z y x"]:
-        """Where there is a vector."""
+    def valid(self) -> Bool[Tensor, "z y x"]:
+        """Nodes with a vector."""
         return self.displacement.isfinite().all(dim=-1)
 
     def rms_error(self, truth: Float[Tensor, "z y x 3"]) -> float:
-        """Return the rms error of the displacement, mm, over components of the vectors found.
-
-        Parameters
-        ----------
-        truth : velocity at the points, mm/s
-        """
-        difference = (self.displacement - truth.to(self.displacement) * self.seconds)[self.found]
+        """Return the rms error of the displacement, mm, over components of valid vectors; truth in mm/s."""
+        difference = (self.displacement - truth.to(self.displacement) * self.seconds)[self.valid]
         return float(difference.square().mean().sqrt())
 
 
 def velocity_between(first: Volume, second: Volume, seconds: float, window: int = 32, passes: int = 4) -> Velocity:
-    """Return the velocity of what stands in two volumes, halfway between their instants.
-
-    Both are moved by half of what is known so far, pass after pass, so that windows are compared at the middle of their
-    way, and what is found holds there to second order in time.
+    """Return the velocity of particles in two volumes halfway between their instants, to second order in time.
 
     Parameters
     ----------
     first, second : on one grid of cubic voxels
     seconds : between them
     window : edge of the windows, voxels; they overlap by three quarters
-    passes : number of passes
-
-    Raises
-    ------
-    InputError
-        If the grids differ, voxels are not cubes, no time passes, or a window does not fit in.
+    passes : number of passes, in each of which both volumes are warped by half of the displacement so far
 
     Source: Elsinga, Scarano, Wieneke & van Oudheusden, Exp. Fluids 41 (2006) 933, Sec. 2.4; Scarano & Riethmuller, Exp.
     Fluids 29 (2000) S51, for the central scheme.
