@@ -40,19 +40,19 @@ def test_rays_move_as_those_of_the_corrected_cameras(projection, lens, backgroun
     corrections = Corrections(cameras, torch.randn(2, 8, generator=torch.Generator().manual_seed(0)).double() * sizes)
     pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(1)).double() * 100
 
-    def seen(by) -> Rays:
+    def rays_of(by) -> Rays:
         return Rays.concatenate([c.rays(pixels, True, i).clip(BOX) for i, c in enumerate(by)])
 
-    expected, found = seen(corrections.corrected), corrections.apply(seen(cameras), BOX)
-    assert float((expected.direction - seen(cameras).direction).abs().max()) > 1e-3
-    pairs = [(getattr(expected, n), getattr(found, n)) for n in ("origin", "direction", "near", "far")]
+    expected, result = rays_of(corrections.corrected), corrections.apply(rays_of(cameras), BOX)
+    assert float((expected.direction - rays_of(cameras).direction).abs().max()) > 1e-3
+    pairs = [(getattr(expected, n), getattr(result, n)) for n in ("origin", "direction", "near", "far")]
     if background:
-        pairs += [(getattr(expected.ends, n), getattr(found.ends, n)) for n in ("sensitivity", "distance")]
+        pairs += [(getattr(expected.ends, n), getattr(result.ends, n)) for n in ("sensitivity", "distance")]
     if lens is not None:
-        pairs += [(getattr(expected.lens, n), getattr(found.lens, n)) for n in ("axis", "normal", "radius", "focus")]
-    for wanted, got in pairs:
-        assert torch.allclose(wanted, got, rtol=1e-9, atol=1e-8)
-    assert torch.equal(found.view, expected.view)
+        pairs += [(getattr(expected.lens, n), getattr(result.lens, n)) for n in ("axis", "normal", "radius", "focus")]
+    for a, b in pairs:
+        assert torch.allclose(a, b, rtol=1e-9, atol=1e-8)
+    assert torch.equal(result.view, expected.view)
 
 
 @pytest.mark.parametrize("order", [("perspective", "telecentric"), ("telecentric", "perspective")])
