@@ -59,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_slow_run_is_shown_to_be_one():
-    job = SimpleNamespace(state="running", asked="")
+    job = SimpleNamespace(state="running", request="")
     live = {"title": "training", "step": 6, "seconds": 100.0, "progress": 0.1, "losses": {}, "remark": "a <b>"}
     assert told(job, live).endswith("<p class=note>a &lt;b&gt;</p>")
     assert "note" not in told(job, {**live, "remark": ""})

@@ -52,7 +52,7 @@ class MaskCard:
             button = ui.button("Show the threshold's mask", icon="contrast", on_click=self._threshold)
             button.props("flat no-caps dense")
         self.place = ui.element("div").classes("stack")
-        self.told = ui.html("", sanitize=False).classes("told").props('aria-live="polite"')
+        self.status = ui.html("", sanitize=False).classes("status").props('aria-live="polite"')
         record = Mask(Path(name), Path("masked.nc"))
         self._writing = asyncio.Lock()
         form = Form(record, only=SETTINGS)
@@ -124,7 +124,7 @@ class MaskCard:
 
     def _tell(self) -> None:
         views = ", ".join(self.edits.drawn) or "no view"
-        self.told.set_content(escape(f"Drawn in {views}."))
+        self.status.set_content(escape(f"Drawn in {views}."))
 
     async def _threshold(self) -> None:
         index = self.measurement.names.index(str(self.view.value))

@@ -10,7 +10,7 @@ from nicegui import ui
 
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_told import JobTold
+from nerif.app.job_status import JobStatus
 from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
@@ -82,7 +82,7 @@ class CalibrationPage:
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                    self.told = JobTold(work, f"{PAGE.name}.run", self._ended)
+                    self.status = JobStatus(work, f"{PAGE.name}.run", self._ended)
                 with card("The rig"):
                     self.calibration = self._select("Calibration", list(found.calibrations), None)
                     self.rig = ui.element("div").classes("rig")
@@ -196,7 +196,7 @@ class CalibrationPage:
         with refusals():
             self.form.record()
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
-            self.told.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
+            self.status.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
     async def _ended(self, job: Job) -> None:
         """Show what the run wrote."""

@@ -13,7 +13,7 @@ from nerif.app.file_choice import FileChoice
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
-from nerif.app.job_told import JobTold
+from nerif.app.job_status import JobStatus
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
@@ -62,9 +62,9 @@ class CheckPage:
                 with card("What was found"):
                     self.told = ui.element("div").classes("stack").props('aria-live="polite"')
                     with self.told:
-                        text_html("Nothing has been compared yet.", classes="told")
+                        text_html("Nothing has been compared yet.", classes="status")
                 with card("Undone") as self.correction:
-                    self.correcting = JobTold(work, f"{PAGE.name}.undone", offer=self.choice.choose)
+                    self.correcting = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
         self.correction.set_visibility(bool(self.correcting.job))
         self.show()
 
@@ -130,7 +130,7 @@ class CheckPage:
         self.told.clear()
         with self.told:
             for text in said:
-                text_html(text, classes="told")
+                text_html(text, classes="status")
             if found is not None:
                 self._show(name, arguments, found)
 
@@ -142,7 +142,7 @@ class CheckPage:
         if findings:
             ui.html(f"<h3>Found</h3><ul class=notes>{findings}</ul>", sanitize=False)
         elif found.views:
-            text_html("Nothing odd found.", classes="told")
+            text_html("Nothing odd found.", classes="status")
         if notes:
             ui.html(f"<h3>Notes</h3><ul>{notes}</ul>", sanitize=False)
         if found.corrections:
@@ -183,7 +183,7 @@ async def build(work: Workspace) -> None:
     """Build the page."""
     contents = await work.beside(work.project.contents)
     if not contents.measurements:
-        text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="told")
+        text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="status")
         return
     CheckPage(work, contents.measurements)
 

@@ -63,7 +63,7 @@ class DisplacementPage:
             self._views()
         else:
             lacking = "are no images of an experiment" if not contents.experiments else "is no calibration"
-            text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="told")
+            text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="status")
         self.below = ui.element("div").classes("stack")
         self._show(contents.measurements)
 
@@ -127,7 +127,7 @@ class DisplacementPage:
         self.shown.clear()
         with self.shown:
             for text in said:
-                text_html(text, classes="told")
+                text_html(text, classes="status")
             ui.html(html, sanitize=False)
 
 

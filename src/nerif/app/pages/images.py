@@ -93,7 +93,7 @@ class ImagesPage:
     def _sum_up(self, wrong: Sequence[str]) -> None:
         lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
         listed = f"<ul class=notes aria-label='What is wrong'>{lines}</ul>" if lines else ""
-        said = f"<p class=told>{len(self.views)} views. {'' if wrong else 'Nothing is wrong with what was read.'}</p>"
+        said = f"<p class=status>{len(self.views)} views. {'' if wrong else 'Nothing is wrong with what was read.'}</p>"
         self.summary.clear()
         with self.summary:
             ui.html(said + listed, sanitize=False)

@@ -11,7 +11,7 @@ from nicegui import ui
 
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
-from nerif.app.job_told import JobTold
+from nerif.app.job_status import JobStatus
 from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, figures, refusals, text_html
@@ -141,7 +141,7 @@ class ResultsPage:
 
         button = "Write it anew" if file.is_file() else "Write the report"
         ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
-        writing = JobTold(self.work, f"{PAGE.name}.report {name}", written)
+        writing = JobStatus(self.work, f"{PAGE.name}.report {name}", written)
 
     # -- for others ----------------------------------------------------------------------------------------------
 
