@@ -122,8 +122,8 @@ class MaskCard:
 
             await self.work.beside(work)
 
-    def _tell(self) -> None:
-        views = ", ".join(self.edits.drawn) or "no view"
+    def _show_views(self) -> None:
+        views = ", ".join(self.edits.drawings) or "no view"
         self.status.set_content(escape(f"Drawn in {views}."))
 
     async def _threshold(self) -> None:

@@ -35,7 +35,7 @@ def main(directory: Path, words: Sequence[str]) -> None:
         )
         began = psutil.Process(process.pid).create_time()
         write_json(directory / STARTED, {"pid": process.pid, "began": began, "time": time.time()})
-        if json.loads((directory / JOB).read_text())["request"]:  # to stop before the start
+        if json.loads((directory / JOB).read_text())["request"]:  # to stop, before this process could get a signal
             process.send_signal(signal.SIGINT)
         code = process.wait()
     write_json(directory / ENDED, {"code": code, "time": time.time()})

@@ -82,7 +82,7 @@ class CalibrationPage:
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                    self.status = JobStatus(work, f"{PAGE.name}.run", self._ended)
+                    self.notice = JobStatus(work, f"{PAGE.name}.run", self._ended)
                 with card("The rig"):
                     self.calibration = self._select("Calibration", list(outcome.calibrations), None)
                     self.rig = ui.element("div").classes("rig")
@@ -196,7 +196,7 @@ class CalibrationPage:
         with refusals():
             self.form.record()
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
-            self.status.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
+            self.notice.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
     async def _ended(self, job: Job) -> None:
         """Show what the run wrote."""

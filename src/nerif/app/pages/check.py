@@ -59,10 +59,10 @@ class CheckPage:
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                with card("What was found"):
-                    self.told = ui.element("div").classes("stack").props('aria-live="polite"')
-                    with self.told:
-                        text_html("Nothing has been compared yet.", classes="status")
+                with card("Findings"):
+                    self.notice = ui.element("div").classes("stack").props('aria-live="polite"')
+                    with self.notice:
+                        text_html("The views have not been compared yet.", classes="status")
                 with card("Undone") as self.correction:
                     self.correcting = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
         self.correction.set_visibility(bool(self.correcting.job))
@@ -127,12 +127,12 @@ class CheckPage:
             result = await self.work.beside(work)
         timer.cancel()
         self.button.enable()
-        self.told.clear()
-        with self.told:
-            for text in said:
+        self.notice.clear()
+        with self.notice:
+            for text in messages:
                 text_html(text, classes="status")
-            if found is not None:
-                self._show(name, arguments, found)
+            if result is not None:
+                self._show(name, arguments, result)
 
     def _show(self, name: str, compared: Sequence[str], result: Consistency) -> None:
         """The verdicts, and the correction that is offered."""
@@ -141,8 +141,8 @@ class CheckPage:
         findings = "".join(f"<li>{escape(str(finding))}</li>" for finding in result.findings)
         if findings:
             ui.html(f"<h3>Found</h3><ul class=notes>{findings}</ul>", sanitize=False)
-        elif found.views:
-            text_html("Nothing odd found.", classes="status")
+        elif result.views:
+            text_html("No problems found.", classes="status")
         if notes:
             ui.html(f"<h3>Notes</h3><ul>{notes}</ul>", sanitize=False)
         if result.corrections:

@@ -124,9 +124,9 @@ class DisplacementPage:
 
             html = await self.work.beside(work)
         self.button.enable()
-        self.shown.clear()
-        with self.shown:
-            for text in said:
+        self.display.clear()
+        with self.display:
+            for text in lines:
                 text_html(text, classes="status")
             ui.html(html, sanitize=False)
 

@@ -92,7 +92,7 @@ class ImagesPage:
     def _sum_up(self, wrong: Sequence[str]) -> None:
         lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
         listed = f"<ul class=notes aria-label='What is wrong'>{lines}</ul>" if lines else ""
-        said = f"<p class=status>{len(self.views)} views. {'' if wrong else 'Nothing is wrong with what was read.'}</p>"
+        messages = f"<p class=status>{len(self.views)} views. {'' if wrong else 'No problems found.'}</p>"
         self.summary.clear()
         with self.summary:
             ui.html(messages + listed, sanitize=False)
