@@ -50,7 +50,7 @@ def test_help_is_that_of_the_class_that_has_the_field():
         ({"views": "many"}, "views", "valid integer"),
         ({"magnification": 0.5}, "magnification", "with projection = telecentric"),
         ({"image_size": [0, 4]}, "image_size", "(height, width) > 0"),
-        ({"temperature": 293.15}, "temperature", "another one than ambient_temperature"),
+        ({"temperature": 293.15}, "temperature", "not ambient_temperature"),
     ],
 )
 def test_what_is_wrong_stands_beside_its_field(values, name, said):

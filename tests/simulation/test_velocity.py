@@ -125,7 +125,7 @@ def empty(grid: Grid) -> Volume:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: VortexRing(0.0, 1.0, 1.0), "radius: expected a length above 0 mm, got 0.0"),
+        (lambda: VortexRing(0.0, 1.0, 1.0), "radius: expected a positive number"),
         (lambda: VortexRing(4.0, 0.1, 1.0), r"core: expected at least 0.05 of the radius, 4.0 mm, got 0.1"),
         (lambda: RING.advect(Particles.draw(BOX, 2), 1.0, steps=0), "steps: expected at least 1, got 0"),
         (lambda: velocity_between(empty(GRID), empty(GRID), 0.0), "seconds: expected a time above 0, got 0.0"),

@@ -24,7 +24,18 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.geometry import Camera, Rays
 
-__all__ = ["ForwardModel", "Light", "Map", "Mask", "PerRay", "SampleVectors", "Samples", "Weights", "midpoints"]
+__all__ = [
+    "ForwardModel",
+    "Light",
+    "Map",
+    "Mask",
+    "PerRay",
+    "SampleVectors",
+    "Samples",
+    "Weights",
+    "masked_blur",
+    "midpoints",
+]
 
 MIN_PATH = 1e-3  # of the longest path through the box; shorter rays are not used to estimate the size of the field
 
@@ -240,3 +251,12 @@ def midpoints(rays: Rays, samples: int, of_pixel: int = 1) -> tuple[Samples, Sam
     index = torch.arange(samples, dtype=rays.near.dtype, device=rays.near.device)
     index = index + place.repeat(len(rays) // of_pixel)[:, None]
     return rays.near[:, None] + index * step, step
+
+
+def masked_blur(values: Float[Tensor, "row column c"], good: Mask, px: float) -> Float[Tensor, "row column c"]:
+    """Return the mean of good pixels, weighted by a Gaussian of a standard deviation, in double precision."""
+    from scipy.ndimage import gaussian_filter
+
+    weight = torch.from_numpy(gaussian_filter(good.double().numpy(), px)).clamp(min=1e-6)
+    filled = torch.where(good[..., None], values, 0.0).double()
+    return torch.from_numpy(gaussian_filter(filled.numpy(), (px, px, 0))) / weight[..., None]

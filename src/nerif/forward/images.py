@@ -27,7 +27,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.fields.grid import spline_weights
-from nerif.forward.base import ForwardModel, Light, Map, Mask, PerRay, Samples, Weights
+from nerif.forward.base import ForwardModel, Light, Map, Mask, PerRay, Samples, Weights, masked_blur
 from nerif.forward.deflection import LeverArm
 from nerif.geometry import Rays
 
@@ -38,7 +38,6 @@ __all__ = [
     "difference_variance",
     "grey_variance",
     "local_mean",
-    "masked_blur",
 ]
 
 DEGREE = 4  # total, of the polynomials of gain and offset
@@ -432,15 +431,6 @@ def _of_patches(rays: Rays, pixels: int) -> tuple[Tensor, Float[Tensor, "m 2"]]:
     row, column = torch.meshgrid(within, within, indexing="ij")
     pixel = corner[:, None] + torch.stack([column, row], dim=-1).reshape(-1, 2)
     return rays.view.repeat_interleave(pixels), pixel.reshape(-1, 2)
-
-
-def masked_blur(values: Float[Tensor, "row column c"], good: Mask, px: float) -> Float[Tensor, "row column c"]:
-    """Return the mean of good pixels, weighted by a Gaussian of a standard deviation, in double precision."""
-    from scipy.ndimage import gaussian_filter
-
-    weight = torch.from_numpy(gaussian_filter(good.double().numpy(), px)).clamp(min=1e-6)
-    filled = torch.where(good[..., None], values, 0.0).double()
-    return torch.from_numpy(gaussian_filter(filled.numpy(), (px, px, 0))) / weight[..., None]
 
 
 def grey_variance(grey: Grey, read: float, shot: float) -> Grey:

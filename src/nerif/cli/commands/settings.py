@@ -138,9 +138,12 @@ def merge(default: T, values: dict[str, Any], source: str) -> T:
         elif dataclasses.is_dataclass(getattr(default, key)) and isinstance(value, dict):
             changes[key] = merge(getattr(default, key), value, f"{source} [{key}]")
         else:
-            changes[key] = _typed(_hints(type(default))[key], key, value, source)
+            changes[key] = _typed(typing.get_type_hints(type(default))[key], key, value, source)
     changes |= {name: merge(getattr(default, name), inner, source) for name, inner in flat.items()}
-    return dataclasses.replace(default, **changes)  # type: ignore[type-var]
+    try:
+        return dataclasses.replace(default, **changes)  # type: ignore[type-var]
+    except InputError as error:  # a choice or limit (common/settings.py)
+        raise error.inside(source) from None
 
 
 def _typed(hint: Any, name: str, value: Any, source: str) -> Any:
