@@ -101,16 +101,16 @@ def test_defaults_are_not_written():
 
 
 @pytest.mark.parametrize(
-    ("name", "typed", "meant"),
+    ("name", "text", "value"),
     [
         ("views", 5.0, 5), ("f_number", 8, 8.0), ("extra_angles", "10 20.5", [10, 20.5]),
         ("image_size", "48, 64", [48, 64]), ("image_size", "a 4", ["a", 4]), ("temperature", None, None),
     ],
 )  # fmt: skip
-def test_what_is_typed_is_taken_as_it_is_record_value(name, typed, meant):
+def test_a_control_value_becomes_that_of_the_record(name, text, value):
     field = FORM.field(name)
-    found = _record_value(field, typed)
-    assert found == meant
-    if isinstance(meant, list):
-        assert [type(v) for v in found] == [type(v) for v in meant]
+    result = _record_value(field, text)
+    assert result == value
+    if isinstance(value, list):
+        assert [type(v) for v in result] == [type(v) for v in value]
     assert _control_value(field, field.default) is not None or field.optional

@@ -1,4 +1,4 @@
-"""Images come back as written, lazily and in order; what is wrong with a file is said with its name."""
+"""Images are read lazily, in order and as written; an error names the file."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import types
 import zlib
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+from imageio import v3
+from PIL import Image
 
 from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
 from nerif.common.conventions import InputError
+from nerif.imaging.readers import image_files
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.frames import Frames, read_each
 from nerif.imaging.readers.open import open_frames
@@ -22,6 +26,7 @@ from nerif.imaging.readers.views import View
 from refusals import refused
 
 N, H, W = 4, 7, 10
+LUMINANCE = [0.299, 0.587, 0.114]
 
 
 @pytest.fixture
@@ -47,11 +52,11 @@ def same(frames: Frames, stack: np.ndarray) -> None:
         np.testing.assert_array_equal(frames[i], expected)
 
 
-def good_frames(frames: Frames) -> tuple[list[int], list[str]]:
-    """Numbers of the frames that can be read, and what is said of the others."""
-    found = dict(read_each(frames, range(len(frames))))
-    wrong = {i: str(x) for i, x in found.items() if isinstance(x, InputError)}
-    return [i for i in found if i not in wrong], [*wrong.values()]
+def good_frames(frames: Frames) -> tuple[list[int], dict[str, str]]:
+    """Numbers of the readable frames, and the errors of the others by their names."""
+    images = dict(read_each(frames, range(len(frames))))
+    errors = {i: x for i, x in images.items() if isinstance(x, InputError)}
+    return [i for i in images if i not in errors], {error.field: str(error) for error in errors.values()}
 
 
 # --- images
@@ -62,11 +67,13 @@ def good_frames(frames: Frames) -> tuple[list[int], list[str]]:
 )
 def test_tiff_stack(tmp_path, stack12, options):
     write_tiff(tmp_path / "stack.tif", stack12, photometric="minisblack", **options)
-    frames = open_frames(tmp_path / "stack.tif")
+    frames = open_frames("stack.tif", tmp_path)
     same(frames, stack12)
-    assert frames.bits == 16
-    assert frames.times is None
-    assert open_frames("stack.tif", tmp_path).name(2) == "stack.tif frame 2"
+    assert (frames.bits, frames.times, frames.name(2)) == (16, None, "stack.tif frame 2")
+    np.testing.assert_array_equal(frames[-1], stack12[-1])
+    np.testing.assert_array_equal(np.stack(list(frames)), stack12)
+    with pytest.raises(IndexError):
+        frames[N]
 
 
 def test_several_tiffs_of_several_pages(tmp_path, stack12):
@@ -78,8 +85,6 @@ def test_several_tiffs_of_several_pages(tmp_path, stack12):
 
 
 def test_tiff_compressed_by_lzw(tmp_path, stack8):
-    from PIL import Image
-
     first, *others = [Image.fromarray(image) for image in stack8]
     first.save(tmp_path / "lzw.tif", compression="tiff_lzw", save_all=True, append_images=others)
     same(open_frames(tmp_path / "lzw.tif"), stack8)
@@ -98,11 +103,17 @@ def test_tiff_with_packed_bits(tmp_path, rng, bits):
     assert frames.bits == bits
 
 
-def test_bits_of_tiff_metadata(tmp_path, stack12):
+def test_bits_of_metadata(tmp_path, stack12):
     write_tiff(tmp_path / "max.tif", stack12[0], extratags=[(281, "H", 1, 4095, True)])
-    assert open_frames(tmp_path / "max.tif").bits == 12
     write_tiff(tmp_path / "x.ome.tif", stack12[0], metadata={"axes": "YX", "SignificantBits": 14})
-    assert open_frames(tmp_path / "x.ome.tif").bits == 14
+    assert [open_frames(tmp_path / name).bits for name in ("max.tif", "x.ome.tif")] == [12, 14]
+    write_cv(tmp_path / "a.png", stack12[0] << 4)
+    data = (tmp_path / "a.png").read_bytes()
+    chunk = struct.pack(">I", 1) + b"sBIT\x0c" + struct.pack(">I", zlib.crc32(b"sBIT\x0c"))
+    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])  # behind the signature and IHDR
+    frames = open_frames(tmp_path / "a.png")
+    same(frames, stack12[:1])
+    assert frames.bits == 12
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp"])
@@ -110,54 +121,30 @@ def test_images_of_8_bit(tmp_path, stack8, suffix):
     write_images(tmp_path / "cam1", stack8, suffix)
     frames = open_frames("cam1", tmp_path)
     same(frames, stack8)
-    assert frames.bits == 8
-    assert frames.name(3) == f"cam1/ref_003{suffix}"
+    assert (frames.bits, frames.name(3)) == (8, f"cam1/ref_003{suffix}")
 
 
-def test_png_of_16_bit(tmp_path, stack12):
+def test_png_and_jpeg_by_other_programs(tmp_path, stack8, stack12):
     write_images(tmp_path / "cam1", stack12)
     same(open_frames(tmp_path / "cam1" / "ref_*.png"), stack12)
-
-
-def test_png_written_by_imageio(tmp_path, stack8):
-    from imageio import v3
-
     v3.imwrite(tmp_path / "a.png", stack8[0])
     same(open_frames(tmp_path / "a.png"), stack8[:1])
-
-
-def test_png_says_its_significant_bits(tmp_path, stack12):
-    write_cv(tmp_path / "a.png", stack12[0] << 4)
-    data = (tmp_path / "a.png").read_bytes()
-    chunk = b"sBIT\x0c"
-    chunk = struct.pack(">I", 1) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])  # behind the signature and IHDR
-    frames = open_frames(tmp_path / "a.png")
-    same(frames, stack12[:1])
-    assert frames.bits == 12
-
-
-def test_jpeg(tmp_path):
     smooth = (np.add.outer(np.arange(16), 2 * np.arange(24)) * 3).astype(np.uint8)
     write_cv(tmp_path / "a.jpg", smooth)
-    image = open_frames(tmp_path / "a.jpg")[0]
-    assert image.shape == (16, 24)
-    assert np.abs(image.astype(int) - smooth).max() < 12
+    np.testing.assert_allclose(open_frames(tmp_path / "a.jpg")[0], smooth.astype(float), atol=12)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif"])
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", "planes.tif"])
 def test_colours_become_luminance(tmp_path, rng, suffix):
     rgb = rng.integers(0, 256, (H, W, 3)).astype(np.uint8)
     path = tmp_path / f"a{suffix}"
-    write_tiff(path, rgb, photometric="rgb") if suffix == ".tif" else write_cv(path, rgb[..., ::-1])
-    expected = np.rint(rgb @ [0.299, 0.587, 0.114]).astype(np.uint8)
-    same(open_frames(path), expected[None])
-
-
-def test_colour_planes_of_tiff(tmp_path, rng):
-    rgb = rng.integers(0, 256, (H, W, 3)).astype(np.uint8)
-    write_tiff(tmp_path / "a.tif", np.moveaxis(rgb, -1, 0), photometric="rgb", planarconfig="separate")
-    same(open_frames(tmp_path / "a.tif"), np.rint(rgb @ [0.299, 0.587, 0.114]).astype(np.uint8)[None])
+    if suffix == "planes.tif":
+        write_tiff(path, np.moveaxis(rgb, -1, 0), photometric="rgb", planarconfig="separate")
+    elif suffix == ".tif":
+        write_tiff(path, rgb, photometric="rgb")
+    else:
+        write_cv(path, rgb[..., ::-1])
+    same(open_frames(path), np.rint(rgb @ LUMINANCE).astype(np.uint8)[None])
 
 
 def test_equal_channels_and_alpha_change_nothing(tmp_path, stack12, rng):
@@ -167,19 +154,14 @@ def test_equal_channels_and_alpha_change_nothing(tmp_path, stack12, rng):
 
 
 def test_natural_order(tmp_path, stack8):
+    folder = tmp_path / "run[3]"  # brackets are literal
+    folder.mkdir()
     for i, name in enumerate(("img1", "img2", "img10", "Img11")):
-        write_cv(tmp_path / f"{name}.png", stack8[i])
-    (tmp_path / "._img3.png").write_bytes(b"left by another system")
-    (tmp_path / "notes.txt").write_text("x")
-    same(open_frames(tmp_path), stack8)
-    same(open_frames(tmp_path / "*"), stack8)
-    same(open_frames(tmp_path / "img?.png"), stack8[:2])
-
-
-def test_brackets_in_a_folder_name_mean_themselves(tmp_path, stack8):
-    write_images(tmp_path / "run[3]", stack8)
-    same(open_frames(tmp_path / "run[3]"), stack8)
-    same(open_frames(f"{tmp_path}/run[3]/*.png[1:]"), stack8[1:])
+        write_cv(folder / f"{name}.png", stack8[i])
+    (folder / "._img3.png").write_bytes(b"of another system")
+    (folder / "notes.txt").write_text("x")
+    for spec, expected in (("", stack8), ("*", stack8), ("img?.png", stack8[:2]), ("*.png[1:]", stack8[1:])):
+        same(open_frames(f"{folder}/{spec}"), expected)
 
 
 # --- Photron
@@ -187,40 +169,32 @@ def test_brackets_in_a_folder_name_mean_themselves(tmp_path, stack8):
 
 @pytest.mark.parametrize("xml", [False, True])
 @pytest.mark.parametrize(("h", "w"), [(7, 10), (7, 9), (1, 3)], ids=["even", "odd", "tiny"])
-def test_photron_packed_12_bit(tmp_path, rng, xml, h, w):
+def test_photron_packed_12_bit(tmp_path, rng, xml, h, w, monkeypatch):
     stack = rng.integers(0, 4096, (5, h, w)).astype(np.uint16)
     header = write_photron(tmp_path, packed(stack), 5, h, w, xml=xml)
+    monkeypatch.chdir(tmp_path)
+    for path in (header, header.name, tmp_path / "rec.mraw"):
+        same(open_frames(path), stack)
+    frames = open_frames(header.name, tmp_path)
+    assert (frames.bits, frames.name(3)) == (12, "rec.mraw frame 3")
+    np.testing.assert_allclose(frames.times, np.arange(5) / 20000)
+
+
+@pytest.mark.parametrize(
+    ("bit", "depth", "side", "shift"),
+    [(8, 8, "Lower", 0), (16, 12, "Lower", 0), (16, 12, "Higher", 4)],
+)
+def test_photron_whole_bytes(tmp_path, rng, bit, depth, side, shift):
+    stack = rng.integers(0, 255, (N, H, W)).astype(np.uint8 if bit == 8 else np.uint16)
+    header = write_photron(tmp_path, (stack << shift).tobytes(), bit=bit, depth=depth, side=side, rate=500)
     frames = open_frames(header)
     same(frames, stack)
-    same(open_frames(tmp_path / "rec.mraw"), stack)
-    assert frames.bits == 12
-    np.testing.assert_allclose(frames.times, np.arange(5) / 20000)
-    assert open_frames(header.name, tmp_path).name(3) == "rec.mraw frame 3"
-
-
-@pytest.mark.parametrize(("bit", "dtype"), [(8, np.uint8), (16, np.uint16)])
-def test_photron_whole_bytes(tmp_path, rng, bit, dtype):
-    stack = rng.integers(0, 255, (N, H, W)).astype(dtype)
-    write_photron(tmp_path, stack.tobytes(), bit=bit, depth={8: 8, 16: 12}[bit], rate=500)
-    frames = open_frames(tmp_path / "rec.cih")
-    same(frames, stack)
-    assert frames.bits == {8: 8, 16: 12}[bit]
+    assert frames.bits == depth
     np.testing.assert_allclose(frames.times, np.arange(N) / 500)
 
 
-def test_photron_upper_side_is_shifted_down(tmp_path, stack12):
-    header = write_photron(tmp_path, (stack12 << 4).astype("<u2").tobytes(), bit=16, side="Higher")
-    same(open_frames(header), stack12)
-
-
-def test_relative_photron_path(tmp_path, stack12, monkeypatch):
-    write_photron(tmp_path, packed(stack12))
-    monkeypatch.chdir(tmp_path)
-    same(open_frames("rec.cih"), stack12)
-
-
 def test_photron_reads_one_frame_of_a_long_recording(tmp_path):
-    n, h, w = 2000, 1024, 1000  # 3 GB that are not there
+    n, h, w = 2000, 1024, 1000  # a sparse file of 3 GB
     header = write_photron(tmp_path, b"", n, h, w)
     with (tmp_path / "rec.mraw").open("r+b") as file:
         file.truncate(n * h * w * 3 // 2)
@@ -231,33 +205,22 @@ def test_photron_reads_one_frame_of_a_long_recording(tmp_path):
     assert frames[777][0, :3].tolist() == [0x123, 0x456, 0]
 
 
-def test_photron_file_that_ends_too_early(tmp_path, stack12):
+def test_truncated_photron_file(tmp_path, stack12):
     header = write_photron(tmp_path, packed(stack12)[: 2 * H * W * 3 // 2 + 20])
     frames = open_frames(header.name, tmp_path)
-    with refused("rec.mraw frame 2"):
-        frames[2]
-    good, lines = good_frames(frames)
-    assert good == [0, 1]
-    assert [line.split(":")[0] for line in lines] == ["rec.mraw frame 2", "rec.mraw frame 3"]
+    good, errors = good_frames(frames)
+    assert (good, list(errors)) == ([0, 1], ["rec.mraw frame 2", "rec.mraw frame 3"])
     np.testing.assert_array_equal(frames[1], stack12[1])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"bit": 36}, "rec.cih: expected a monochrome MRaw recording .* of 36 bit"),
-        ({"kind": "Tiff"}, "got Tiff of 12 bit"),
-        ({"n": 0}, "Total Frame"),
-        ({"h": "none"}, "rec.cih: cannot be read as a Photron header"),
-    ],
-)
-def test_photron_header_that_cannot_be(tmp_path, change, message):
+@pytest.mark.parametrize("change", [{"bit": 36}, {"kind": "Tiff"}, {"n": 0}, {"h": "none"}])
+def test_invalid_photron_header(tmp_path, change):
     write_photron(tmp_path, b"", **change)
     with refused("rec.cih"):
         open_frames("rec.cih", tmp_path)
 
 
-def test_photron_partner_missing(tmp_path):
+def test_photron_needs_both_files(tmp_path):
     header = write_photron(tmp_path, b"")
     (tmp_path / "rec.mraw").unlink()
     with refused("rec.cih"):
@@ -275,18 +238,8 @@ def test_photron_partner_missing(tmp_path):
 
 @pytest.fixture
 def lavision(monkeypatch):
-    """A module with the parts of lvpyio 1.5 that are used; file contents are NumPy arrays."""
+    """A substitute for lvpyio 1.5, whose files are NumPy arrays; returns the paths that are read."""
     reads = []
-
-    class Buffer:
-        def __init__(self, frames):
-            self.frames, self.attributes = frames, {}
-
-        def __len__(self):
-            return len(self.frames)
-
-        def __getitem__(self, index):
-            return self.frames[index]
 
     def read_buffer(path):
         assert isinstance(path, str)
@@ -296,9 +249,9 @@ def lavision(monkeypatch):
         except ValueError:
             raise RuntimeError("Can't read buffers with different frame sizes yet!") from None
         key = "PIXEL" if path.endswith(".im7") else "U0"
-        return Buffer([types.SimpleNamespace(components={key: types.SimpleNamespace(planes=[a])}) for a in stack])
+        return [types.SimpleNamespace(components={key: types.SimpleNamespace(planes=[a])}) for a in stack]
 
-    monkeypatch.setitem(sys.modules, "lvpyio", types.SimpleNamespace(read_buffer=read_buffer, reads=reads))
+    monkeypatch.setitem(sys.modules, "lvpyio", types.SimpleNamespace(read_buffer=read_buffer))
     return reads
 
 
@@ -311,24 +264,25 @@ def test_lavision_images(tmp_path, stack12, lavision):
     write_lavision(tmp_path / "B00001.im7", stack12[:2])
     write_lavision(tmp_path / "B00002.im7", stack12[2:])
     frames = open_frames(".", tmp_path)
-    assert len(lavision) == 1  # how many are in the first is taken for all
+    assert len(lavision) == 1  # all have as many images as the first
     same(frames, stack12)
     assert frames.name(3) == "B00002.im7 frame 1"
     same(open_frames(tmp_path / "B00002.im7[1]"), stack12[3:])
 
 
-def test_lavision_files_that_hold_something_else(tmp_path, stack12, lavision):
+def test_invalid_lavision_files(tmp_path, stack12, lavision):
     write_lavision(tmp_path / "a.vc7", stack12)
     with pytest.raises(InputError, match=r"a.vc7: expected images, got vectors"):
         open_frames("a.vc7", tmp_path)[0]
     write_lavision(tmp_path / "B1.im7", stack12[:2])
     write_lavision(tmp_path / "B2.im7", stack12[:1])
     (tmp_path / "B3.im7").write_bytes(b"damaged")
-    good, lines = good_frames(open_frames("*.im7", tmp_path))
-    assert good == [0, 1, 2]
-    assert "B2.im7 frame 1: expected at least 2 images" in lines[0]
-    assert "B3.im7 frame 0: cannot be read" in lines[1]
-    assert "different frame sizes" in lines[1]
+    frames = open_frames("*.im7", tmp_path)
+    errors = [str(image) for _, image in read_each(frames, range(3, 6)) if isinstance(image, InputError)]
+    assert good_frames(frames)[0] == [0, 1, 2]
+    assert errors[0].startswith("B2.im7 frame 1: expected at least 2 images")
+    assert errors[1].startswith("B3.im7 frame 0: cannot be read")
+    assert "different frame sizes" in errors[1]
 
 
 @pytest.mark.parametrize("suffix", ["im7", "vc7"])
@@ -351,6 +305,9 @@ def test_npy_is_mapped(tmp_path, stack12):
     one = open_frames("one.npy", tmp_path)
     same(one, stack12[:1])
     assert one.name(0) == "one.npy"
+    np.save(tmp_path / "none.npy", stack12[:0])
+    with refused("none.npy"):
+        open_frames("none.npy", tmp_path)
 
 
 def test_npz(tmp_path, stack12, stack8):
@@ -358,35 +315,24 @@ def test_npz(tmp_path, stack12, stack8):
     same(open_frames(tmp_path / "a.npz"), stack12)
     np.savez_compressed(tmp_path / "b.npz", flow=stack12, ref=stack8)
     same(open_frames(f"{tmp_path}/b.npz:ref[1:]"), stack8[1:])
-    with refused("b.npz"):
-        open_frames("b.npz", tmp_path)
-    with refused("b.npz:x"):
-        open_frames("b.npz:x", tmp_path)
+    for spec in ("b.npz", "b.npz:x"):
+        with refused(spec):
+            open_frames(spec, tmp_path)
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.h5"])
 def test_truncated_arrays(tmp_path, stack12, name):
-    import h5py
-
     if name == "a.h5":
         with h5py.File(tmp_path / name, "w") as file:
             file["x"] = stack12
     else:
         (np.save if name == "a.npy" else np.savez)(tmp_path / name, stack12)
     os.truncate(tmp_path / name, (tmp_path / name).stat().st_size - 100)
-    with pytest.raises(InputError, match=f"{name}: cannot be read"):
+    with refused(name):
         open_frames(name, tmp_path)
 
 
-def test_empty_array(tmp_path, stack12):
-    np.save(tmp_path / "a.npy", stack12[:0])
-    with pytest.raises(InputError, match=r"a.npy: expected one frame at least"):
-        open_frames(tmp_path / "a.npy")
-
-
 def test_hdf5(tmp_path, stack12, stack8):
-    import h5py
-
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["cam1/flow"] = stack12
         file["cam1/flow"].attrs["bits"] = 12
@@ -399,20 +345,13 @@ def test_hdf5(tmp_path, stack12, stack8):
     np.testing.assert_allclose(frames.times, [0.5, 1.5])
     one = open_frames("a.h5:cam2/still", tmp_path)
     same(one, stack8[:1])
-    assert one.times.tolist() == [7.0]
-    assert one.name(0) == "a.h5:cam2/still"
-    for spec, message in (
-        ("a.h5", "expected one dataset of 2 or 3 dims, got 2"),
-        ("a.h5:cam3", "a.h5:cam3: no such dataset"),
-        ("a.h5:cam1/times", "expected 2 or 3 dims"),
-    ):
-        with pytest.raises(InputError, match=message):
+    assert (one.times.tolist(), one.name(0)) == ([7.0], "a.h5:cam2/still")
+    for spec in ("a.h5", "a.h5:cam3", "a.h5:cam1/times"):
+        with refused(spec):
             open_frames(spec, tmp_path)
 
 
 def test_hdf5_with_one_dataset_and_wrong_times(tmp_path, stack12):
-    import h5py
-
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["deep/in/it"] = stack12
     same(open_frames(tmp_path / "a.hdf5"), stack12)
@@ -435,52 +374,31 @@ def test_selection(tmp_path, stack12, selection, expected):
     same(frames, stack12[expected])
     np.testing.assert_allclose(frames.times, np.array(expected) / 20000)
     assert frames.name(0).endswith(f"rec.mraw frame {expected[0]}")
-
-
-def test_selection_of_files_and_pages(tmp_path, stack12):
     write_images(tmp_path / "cam1", stack12)
-    same(open_frames("cam1/ref_*.png[1:3]", tmp_path), stack12[1:3])
-    same(open_frames("cam1[2]", tmp_path), stack12[2:3])
-    write_tiff(tmp_path / "s.tif", stack12, photometric="minisblack")
-    same(open_frames("s.tif[::3]", tmp_path), stack12[::3])
+    same(open_frames(f"cam1/ref_*.png{selection}", tmp_path), stack12[expected])
+    same(open_frames(f"cam1{selection}", tmp_path), stack12[expected])
 
 
-@pytest.mark.parametrize(
-    ("selection", "message"),
-    [("[4]", "expected a frame from 0 to 3"), ("[-5]", "from 0 to 3"), ("[9:]", "none of the 4"), ("[::0]", "step")],
-)
-def test_selection_of_nothing(tmp_path, stack8, selection, message):
+@pytest.mark.parametrize("selection", ["[4]", "[-5]", "[9:]", "[::0]"])
+def test_empty_selection(tmp_path, stack8, selection):
     np.save(tmp_path / "a.npy", stack8)
-    with pytest.raises(InputError, match=message):
+    with refused(f"a.npy{selection}"):
         open_frames(f"a.npy{selection}", tmp_path)
 
 
-def test_frames_are_a_sequence(tmp_path, stack8):
-    np.save(tmp_path / "a.npy", stack8)
-    frames = open_frames(tmp_path / "a.npy")
-    np.testing.assert_array_equal(frames[-1], stack8[-1])
-    np.testing.assert_array_equal(np.stack(list(frames)), stack8)
-    with pytest.raises(IndexError):
-        frames[N]
-
-
-def test_files_are_read_when_asked_for(tmp_path, rng, monkeypatch):
-    from nerif.imaging.readers import image_files
-
+def test_files_are_read_on_access(tmp_path, rng, monkeypatch):
     write_images(tmp_path / "cam1", rng.integers(0, 256, (30, H, W)).astype(np.uint8))
-    read = []
-    real = image_files.FileFrames.load
-    monkeypatch.setattr(image_files.FileFrames, "load", lambda self, i: (read.append(i), real(self, i))[1])
+    reads = []
+    load = image_files.FileFrames.load
+    monkeypatch.setattr(image_files.FileFrames, "load", lambda self, i: (reads.append(i), load(self, i))[1])
     frames = open_frames(tmp_path / "cam1")
-    assert len(frames) == 30
-    assert read == []
-    assert frames.shape == (H, W)
-    assert len(read) == 5
+    assert (len(frames), reads) == (30, [])
+    assert (frames.shape, len(reads)) == ((H, W), 5)
     frames[11]
-    assert read[5:] == [11]
+    assert reads[5:] == [11]
 
 
-# --- crops and sequences
+# --- crops and pairs of sequences
 
 
 @pytest.mark.parametrize("flip", ["", "horizontal", "vertical", "both"])
@@ -500,8 +418,7 @@ def test_crop_up_to_the_edge():
     image = np.arange(9 * 14).reshape(9, 14)
     np.testing.assert_array_equal(Crop()(image), image)
     np.testing.assert_array_equal(Crop(row=2, column=5, width=4)(image), image[2:, 5:9])
-    turned = Crop(rotate=90)(image)
-    assert turned[0, 0] == image[0, -1]  # counter-clockwise: the upper right corner comes to the upper left
+    assert Crop(rotate=90)(image)[0, 0] == image[0, -1]  # counter-clockwise
 
 
 @pytest.mark.parametrize("crop", [Crop(5, 0, 5, 3), Crop(0, 12, 3, 3), Crop(9), Crop(0, 14)])
@@ -510,75 +427,64 @@ def test_crop_beyond_the_frame(crop):
         crop(np.zeros((9, 14)))
 
 
-@pytest.mark.parametrize("change", [{"row": -1}, {"width": -2}, {"flip": "left"}, {"rotate": 45}])
-def test_crop_that_cannot_be(change):
-    with refused("crop"):
-        Crop(**change)
+@pytest.mark.parametrize(("field", "value"), [("row", -1), ("width", -2), ("flip", "left"), ("rotate", 45)])
+def test_invalid_crop(field, value):
+    with refused(field):
+        Crop(**{field: value})
 
 
-def test_reference_and_flow_must_be_alike(tmp_path, stack12, stack8):
+def test_reference_and_flow_have_one_size_and_depth(tmp_path, stack12, stack8):
     for name, array in (("ref", stack12), ("small", stack12[:, :5]), ("bytes", stack8)):
         np.save(tmp_path / f"{name}.npy", array)
-
-    def check(flow: str, crop: Crop | None = None) -> None:
-        View("a", tmp_path, {"reference": "ref.npy", "flow": flow}, crop).check_alike()
-
-    check("ref.npy")
-    with refused("view 'a'"):
-        check("small.npy")
-    with refused("view 'a'"):
-        check("bytes.npy")
-
-
-def test_depth_that_the_files_tell_counts(tmp_path, stack12):
     header = write_photron(tmp_path, packed(stack12))
-    np.save(tmp_path / "flow.npy", stack12)
-    sources = {"reference": f"{header}[:1]", "flow": f"{header}[1:]"}
-    View("a", tmp_path, sources).check_alike()
-    View("a", tmp_path, {**sources, "flow": "flow.npy"}).check_alike()  # 16 bit as read, and may well be 12
+    pairs = {"ref.npy": "ref.npy", f"{header}[:1]": f"{header}[1:]", str(header): "ref.npy"}  # 16 bit may be 12
+    for reference, flow in pairs.items():
+        View("a", tmp_path, {"reference": reference, "flow": flow}).check_alike()
+    for flow in ("small.npy", "bytes.npy"):
+        with refused("view 'a'"):
+            View("a", tmp_path, {"reference": "ref.npy", "flow": flow}).check_alike()
 
 
-# --- what can be wrong
+# --- errors
 
 
 @pytest.mark.parametrize(
-    ("spec", "message"),
+    ("spec", "field", "remedy"),
     [
-        ("cam1/ref_04.png", "^cam1/ref_04.png: no such file or folder; did you mean 'cam1/ref_00[0-3].png'"),
-        ("Cam2/ref_*.png", "^Cam2/ref_.*: expected files of this pattern, got none; did you mean 'cam1'"),
-        ("cam1/flow_*.tif", "^cam1/flow_.*: expected files of this pattern, got none"),
-        ("zzz", "^zzz: no such file or folder$"),
-        ("nowhere/at/all.tif", "no such file"),
-        ("empty", r"^empty: expected images .*got none; is it the right folder"),
-        ("held", r"^held: expected images .*got none; name the file, such as 'held/a.npy'"),
-        ("notes.txt", r"^notes.txt: expected one of .tif .*, got '.txt'"),
-        ("held/*.npy", r"^held/a.npy: one of 2 files of a pattern"),
+        ("cam1/ref_04.png", "cam1/ref_04.png", "did you mean 'cam1/ref_00[0-3].png'"),
+        ("Cam2/ref_*.png", "Cam2/ref_*.png", "did you mean 'cam1'"),
+        ("cam1/flow_*.tif", "cam1/flow_*.tif", "none"),
+        ("zzz", "zzz", "folder$"),
+        ("nowhere/at/all.tif", "nowhere/at/all.tif", "no such"),
+        ("empty", "empty", "is it the right folder"),
+        ("arrays", "arrays", "name the file, such as 'arrays/a.npy'"),
+        ("notes.txt", "notes.txt", "'.txt'"),
+        ("arrays/*.npy", "arrays/a.npy", "one recording"),
     ],
 )
-def test_files_that_are_not_there(tmp_path, stack8, spec, message):
+def test_missing_files(tmp_path, stack8, spec, field, remedy):
     write_images(tmp_path / "cam1", stack8)
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "held").mkdir()
-    np.save(tmp_path / "held" / "a.npy", stack8)
-    np.save(tmp_path / "held" / "b.npy", stack8)
+    for name in ("empty", "arrays"):
+        (tmp_path / name).mkdir()
+    for name in "ab":
+        np.save(tmp_path / "arrays" / f"{name}.npy", stack8)
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=remedy) as error:
         open_frames(spec, tmp_path)
+    assert error.value.field == field
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif"])
 @pytest.mark.parametrize("bad", [0, 2])
 def test_truncated_images(tmp_path, rng, suffix, bad):
-    stack = rng.integers(0, 256, (N, 40, 50)).astype(np.uint8)
-    write_images(tmp_path / "cam1", stack, suffix)
+    write_images(tmp_path / "cam1", rng.integers(0, 256, (N, 40, 50)).astype(np.uint8), suffix)
     file = tmp_path / "cam1" / f"ref_{bad:03d}{suffix}"
     os.truncate(file, file.stat().st_size // 2)
     frames = open_frames("cam1", tmp_path)
-    with pytest.raises(InputError, match=f"cam1/ref_{bad:03d}{suffix}: cannot be read, truncated or damaged"):
+    with refused(f"cam1/{file.name}"):
         frames[bad]
-    good, lines = good_frames(frames)
-    assert good == [i for i in range(N) if i != bad]
-    assert len(lines) == 1
+    good, errors = good_frames(frames)
+    assert (good, list(errors)) == ([i for i in range(N) if i != bad], [f"cam1/{file.name}"])
     assert frames[1].shape == (40, 50)
 
 
@@ -587,57 +493,38 @@ def test_stack_that_breaks_off_between_pages(tmp_path, stack12, caplog):
     for image in stack12[1:]:
         write_tiff(tmp_path / "s.tif", image, append=True)
     os.truncate(tmp_path / "s.tif", (tmp_path / "s.tif").stat().st_size - H * W * 2 - 300)
-    good, lines = good_frames(open_frames("s.tif", tmp_path))
-    assert good == [0, 1]
-    assert [line.split(",")[0] for line in lines] == [f"s.tif frame {i}: cannot be read" for i in (2, 3)]
-    assert "the file ends after 3 frames" in lines[1]
+    good, errors = good_frames(open_frames("s.tif", tmp_path))
+    assert (good, list(errors)) == ([0, 1], ["s.tif frame 2", "s.tif frame 3"])
+    assert "the file ends after 3 frames" in errors["s.tif frame 3"]
     assert not caplog.records
 
 
-def test_files_of_nothing(tmp_path, stack8):
+def test_empty_files(tmp_path):
     for name in ("a.png", "b.tif", "c.jpg"):
         (tmp_path / name).touch()
     frames = open_frames(".", tmp_path)
-    good, lines = good_frames(frames)
-    assert good == []
-    assert [line.split(":")[0] for line in lines] == ["a.png", "b.tif", "c.jpg"]
-    with pytest.raises(InputError, match=r"a.png: cannot be read"):
+    good, errors = good_frames(frames)
+    assert (good, list(errors)) == ([], ["a.png", "b.tif", "c.jpg"])
+    with refused("a.png"):
         _ = frames.shape
 
 
-@pytest.mark.parametrize("odd", [0, 1])
-def test_one_image_of_another_size(tmp_path, stack8, odd):
+@pytest.mark.parametrize("i", [0, 1, 2])
+def test_one_image_of_another_size_or_depth(tmp_path, stack8, stack12, i):
     write_images(tmp_path / "cam1", stack8)
-    write_cv(tmp_path / "cam1" / f"ref_{odd:03d}.png", stack8[0, :5, :6])
+    write_cv(tmp_path / "cam1" / f"ref_{i:03d}.png", stack12[2] if i == 2 else stack8[0, :5, :6])
     frames = open_frames("cam1", tmp_path)
-    with pytest.raises(InputError, match=rf"cam1/ref_00{odd}.png: expected 7 x 10 px .* as in .*, got 5 x 6 px"):
-        frames[odd]
-    assert good_frames(frames)[0] == [i for i in range(N) if i != odd]
-
-
-def test_one_image_of_another_depth(tmp_path, stack8, stack12):
-    write_images(tmp_path / "cam1", stack8)
-    write_cv(tmp_path / "cam1" / "ref_002.png", stack12[2])
-    good, lines = good_frames(open_frames("cam1", tmp_path))
-    assert good == [0, 1, 3]
-    assert "cam1/ref_002.png: expected 7 x 10 px (height x width) of uint8 as in" in lines[0]
-    assert "of uint16" in lines[0]
+    good, errors = good_frames(frames)
+    assert (good, list(errors)) == ([k for k in range(N) if k != i], [f"cam1/ref_00{i}.png"])
+    with refused(f"cam1/ref_00{i}.png"):
+        frames[i]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif"])
 def test_images_of_one_bit(tmp_path, stack8, suffix):
-    from PIL import Image
-
     Image.fromarray(stack8[0] > 100).save(tmp_path / f"a{suffix}")
-    with pytest.raises(InputError, match=rf"a{suffix}: expected grey values of 8 to 16 bit, got a? ?1-bit"):
+    with pytest.raises(InputError, match=rf"^a{suffix}: .*1-bit"):
         open_frames(f"a{suffix}", tmp_path)[0]
-
-
-@pytest.mark.parametrize("dtype", [np.int32, np.int16, bool, np.uint32, np.complex64])
-def test_arrays_of_other_types(tmp_path, dtype):
-    np.save(tmp_path / "a.npy", np.ones((H, W), dtype))
-    with refused("a.npy"):
-        open_frames("a.npy", tmp_path)[0]
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4"])
@@ -650,18 +537,17 @@ def test_float_frames(tmp_path, rng, dtype, top, bits):
     assert frames.bits == bits
 
 
-@pytest.mark.parametrize(("low", "high"), [(-0.5, 1.0), (0.0, 1.7), (0.0, 70000.0)])
-def test_float_frames_of_unclear_range(tmp_path, low, high):
-    np.save(tmp_path / "a.npy", np.linspace(low, high, H * W).reshape(H, W))
+RAMP = np.linspace(0, 1, H * W).reshape(H, W)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.ones((H, W), dtype) for dtype in (np.int32, np.int16, bool, np.uint32, np.complex64)]
+    + [1.5 * RAMP - 0.5, 1.7 * RAMP, 7e4 * RAMP]
+    + [np.where(RAMP > 0.5, value, RAMP) for value in (np.nan, np.inf)],
+    ids=lambda image: f"{image.dtype} {image.flat[0]} to {image.flat[-1]}",
+)
+def test_invalid_values(tmp_path, image):
+    np.save(tmp_path / "a.npy", image)
     with refused("a.npy"):
         open_frames("a.npy", tmp_path)[0]
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_not_a_number(tmp_path, rng, value):
-    stack = rng.random((N, H, W)).astype(np.float32)
-    stack[1, 2, 3:5] = value
-    np.save(tmp_path / "a.npy", stack)
-    good, lines = good_frames(open_frames("a.npy", tmp_path))
-    assert good == [0, 2, 3]
-    assert lines == ["a.npy frame 1: expected numbers in all pixels, got NaN or infinity in 2 of 70"]

@@ -36,7 +36,7 @@ NAMES = {
 
 
 def progress_of(work: Workspace, job: Job) -> tuple[float, str]:
-    """Return how far a run is, from 0 to 1, and what it is doing; of one that does not tell, 0 and nothing."""
+    """Return the progress of a run, from 0 to 1, and its current work; 0 and nothing if unknown."""
     if job.out.endswith(".zarr") and job.state in ("running", "paused"):
         return film_progress(work.project.path(job.out))
     live = read_live(work.project.path(job.out)) if job.out and job.state in ("running", "paused") else {}
@@ -88,7 +88,7 @@ class JobsDrawer:
         jobs, progress = await self.work.beside(self._look)
         open_ = sum(job.state in ("running", "queued", "paused") for job in jobs)
         self.button.set_text(f"Runs ({open_})" if open_ else "Runs")
-        state = repr([(j.id, j.state, j.asked, j.place) for j in jobs]) + repr(progress)
+        state = repr([(j.id, j.state, j.request, j.place) for j in jobs]) + repr(progress)
         if state == self._shown:
             return
         self._shown = state
@@ -104,10 +104,10 @@ class JobsDrawer:
         return jobs, {job.id: progress_of(self.work, job) for job in jobs}
 
     def _row(self, job: Job, share: float, title: str) -> None:
-        said = f"{job.state}, {job.asked} asked" if job.state == "running" and job.asked else job.state
+        lines = f"{job.state}, {job.request} requested" if job.state == "running" and job.request else job.state
         with ui.element("div").classes(f"run {job.state}").props('role="listitem"'):
             ui.html(
-                f"<b>{escape(job.title)}</b><span class=state>{escape(said)} {escape(title)}</span>"
+                f"<b>{escape(job.title)}</b><span class=state>{escape(lines)} {escape(title)}</span>"
                 f"<code>{escape(job.line)}</code>", sanitize=False,
             )  # fmt: skip
             if job.state == "refused":

@@ -68,10 +68,10 @@ class Still:
         InputError
             If the result lacks it.
         """
-        found = self._volumes
-        if quantity not in found:
-            raise InputError(f"expected one of {', '.join(found)}, got '{quantity}'", field=self.path.name)
-        return found[quantity]
+        outcome = self._volumes
+        if quantity not in outcome:
+            raise InputError(f"expected one of {', '.join(outcome)}, got '{quantity}'", field=self.path.name)
+        return outcome[quantity]
 
     def limits(self, quantity: str) -> Limits:
         """Return the ends of its colours."""
@@ -126,8 +126,8 @@ def source_of(path: Path) -> Source:
 
 
 def _worth_showing(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
-    kept = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
-    return tuple(name for q in kept for name in (q, f"{q}_std") if name in quantities)
+    memory = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
+    return tuple(name for q in memory for name in (q, f"{q}_std") if name in quantities)
 
 
 @lru_cache(maxsize=6)
