@@ -20,11 +20,12 @@ from annotated_types import Ge, Gt, Le, Lt
 
 from nerif.common.conventions import InputError
 
-__all__ = ["Count", "NonNegative", "Positive", "check_settings"]
+__all__ = ["Count", "Length", "NonNegative", "Positive", "check_settings"]
 
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Count = Annotated[int, Ge(1)]
+Length = Annotated[float, Gt(0), Lt(math.inf)]
 
 LIMITS: dict[type, tuple[Callable[[Any, Any], bool], str]] = {
     Gt: (operator.gt, "a number above {}"),

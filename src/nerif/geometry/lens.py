@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
+from nerif.common.conventions import LARGEST_LENGTH, InputError
+from nerif.common.settings import Count, check_settings
 from nerif.geometry.grid import Box
 
 __all__ = ["Columns", "Lens", "LensDiscs", "spread_points"]
@@ -70,16 +72,15 @@ class Lens:
 
     diameter: float = 0.0
     focus: float | None = None
-    points: int = 19
-    window: float = 0.0
+    points: Count = 19
+    window: Annotated[float, Ge(0), Le(MAX_WINDOW)] = 0.0
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if not 0 <= self.diameter <= LARGEST_LENGTH:
             raise InputError(f"expected 0 mm or more, got {self.diameter}", field="aperture_diameter")
         if self.focus is not None and not 0 < abs(self.focus) <= LARGEST_LENGTH:
             raise InputError(f"expected a distance other than 0 mm, got {self.focus}", field="focus_distance")
-        check_positive(self, "points")
-        check_positive(self, "window", zero=True, limit=MAX_WINDOW)
 
     @property
     def wide(self) -> bool:

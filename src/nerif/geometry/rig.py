@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
+from nerif.common.conventions import InputError
+from nerif.common.settings import Count, Length, check_settings
 from nerif.geometry.camera import Camera, Plane, Projection, projection_named
 from nerif.geometry.grid import Box
 
@@ -19,7 +20,7 @@ __all__ = ["Ring", "paper_rig"]
 class Ring:
     """A ring of identical cameras aimed at the origin, z up."""
 
-    views: int = 9
+    views: Count = 9
     """Number of cameras, equally spaced over the arc, both ends included."""
     arc: tuple[float, float] = (0.0, 170.0)
     """First and last azimuth, degrees."""
@@ -29,33 +30,27 @@ class Ring:
     """Elevation of the optical axes above the horizontal, degrees."""
     projection: str = "perspective"
     """Projection: perspective, or telecentric (parallel rays)."""
-    focal_length: float = 50.0
+    focal_length: Length = 50.0
     """Focal length, mm."""
-    magnification: float | None = None
+    magnification: Length | None = None
     """Magnification of telecentric lenses; default: focal_length / distance."""
-    pixel_pitch: float = 0.02
+    pixel_pitch: Length = 0.02
     """Pixel pitch of the sensor, mm."""
-    image_size: tuple[int, int] = (200, 200)
+    image_size: tuple[Count, Count] = (200, 200)
     """Image height and width, px."""
-    distance: float = 700.0
+    distance: Length = 700.0
     """Distance from the lens to the centre of the box, mm."""
-    background_distance: float = 500.0
+    background_distance: Length = 500.0
     """Distance from the centre of the box to the background, mm."""
 
     def __post_init__(self) -> None:
-        lengths = ("focal_length", "pixel_pitch", "distance", "background_distance")
-        check_positive(self, "views", *lengths, limit=LARGEST_LENGTH)
+        check_settings(self)
         for name in ("arc", "extra_angles", "elevation"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
                 raise InputError(f"expected degrees, got {getattr(self, name)}", field=name)
-        perspective = self.kind.shows_depth
-        if self.magnification is not None and (perspective or not 0 < self.magnification < math.inf):
-            got = f"{self.magnification} with {self.projection}"
-            raise InputError(
-                f"expected a positive number, with projection = telecentric, got {got}", field="magnification"
-            )
-        if min(self.image_size) < 1:
-            raise InputError(f"expected (height, width) > 0 px, got {self.image_size}", field="image_size")
+        _ = self.kind  # validates its name
+        if self.magnification is not None and self.kind.shows_depth:
+            raise InputError(f"expected projection = telecentric, got {self.projection}", field="magnification")
 
     @property
     def kind(self) -> Projection:

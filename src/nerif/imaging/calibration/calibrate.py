@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from nerif.common.conventions import FACES, InputError
 from nerif.common.files import check_known
+from nerif.common.settings import Positive, check_settings
 from nerif.geometry import Projection, projection_named
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
 from nerif.imaging.calibration.first_guess import first_guess, mirror
@@ -44,7 +45,7 @@ class CalibrationSettings:
     """World x, y, z along axes of the target in that pose (x right, y down, z into the page); default: z is up."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of the target in that pose, in world coordinates, mm."""
-    max_error: float = 1.0
+    max_error: Positive = 1.0
     """Largest rms reprojection error to accept, px."""
     side: tuple[str, str] | None = None
     """For telecentric cameras: one view and the side of the world on which it stands, such as cam1 x+; images of flat
@@ -56,8 +57,7 @@ class CalibrationSettings:
                 raise InputError(
                     f"expected coefficients from {' '.join(COEFFICIENTS)}, got '{name}'", field="distortion"
                 )
-        if not self.max_error > 0:
-            raise InputError(f"expected a positive number of px, got {self.max_error}", field="max_error")
+        check_settings(self)
         if not self.kind.shows_depth and (self.side is None or self.side[1] not in FACES):
             raise InputError(
                 f"expected a view and the side of the world on which it stands ({' '.join(FACES)}), such as cam1 x+, "

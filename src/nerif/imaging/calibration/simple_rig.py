@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
+from nerif.common.conventions import InputError
+from nerif.common.settings import Length, check_settings
 from nerif.geometry import Box, Lens, Plane
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera
 from nerif.imaging.calibration.importers.importers import ImportSettings
@@ -41,15 +42,15 @@ Pixel = tuple[float, float]
 class SimpleRig:
     """Measures of one camera that looks across the axis of a flow."""
 
-    distance: float | None = None
+    distance: Length | None = None
     """With --simple: distance along the optical axis from the camera (entrance pupil) to the axis of the flow, mm."""
-    mm_per_px: float | None = None
+    mm_per_px: Length | None = None
     """With --simple: mm per pixel at the axis: length of a ruler held there over its length in the image."""
-    focal_length: float | None = None
+    focal_length: Length | None = None
     """With --simple, without mm_per_px: focal length of the lens, mm; some per cent off for close-ups."""
-    pixel_pitch_um: float | None = None
+    pixel_pitch_um: Length | None = None
     """With --focal-length: pixel pitch of the sensor, micrometres."""
-    f_number: float | None = None
+    f_number: Length | None = None
     """With --focal-length: f-number of the lens, which is then focused on the background; without it, thin rays."""
     axis_from: Pixel | None = None
     """With --simple: column and row of a point of the axis; default: the middle of the image's lower edge."""
@@ -59,8 +60,7 @@ class SimpleRig:
     """With --simple: column and row of the optical axis, if it is not in the middle of the image (of a crop)."""
 
     def __post_init__(self) -> None:
-        lengths = ("distance", "mm_per_px", "focal_length", "pixel_pitch_um", "f_number")
-        check_positive(self, *(name for name in lengths if getattr(self, name) is not None), limit=LARGEST_LENGTH)
+        check_settings(self)
         for name in ("axis_from", "axis_to", "principal_point"):
             value = getattr(self, name)
             if value is not None and not math.isfinite(math.fsum(value)):

@@ -7,14 +7,16 @@ centre of the first pixel, world to camera, mm.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Lt
 
-from nerif.common.conventions import InputError, check_positive
+from nerif.common.conventions import InputError
+from nerif.common.settings import Positive, check_settings
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.camera import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
@@ -34,7 +36,7 @@ ENDINGS = (*READERS, ".mat")
 class ImportSettings:
     """Properties of the cameras that the file of another program may lack."""
 
-    scale_mm: float = 1.0
+    scale_mm: Positive = 1.0
     """Unit of length of the imported file, mm."""
     pose: int = 1
     """Number of the target image that defines the world frame, for MATLAB files with one pose per image."""
@@ -48,10 +50,10 @@ class ImportSettings:
     lenses: of the cone of rays at z_cam = 0, which calibration places at the origin. Also for target images."""
     focus_distance: float | None = None
     """Distance of the plane in focus along the optical axis, mm; default: that of the file, or the background."""
-    pose_sigma_mm: float | None = None
+    pose_sigma_mm: Annotated[float, Ge(0), Lt(math.inf)] | None = None
     """Standard deviation of the camera positions, mm, the prior of reconstruct --refine; default with target images:
     0.05 in addition to their noise; with --simple: 1."""
-    pose_sigma_deg: float | None = None
+    pose_sigma_deg: Annotated[float, Ge(0), Lt(math.inf)] | None = None
     """Standard deviation of the camera rotations, degrees; default with target images: 0.005 in addition to their
     noise; with --simple: 0.5."""
 
@@ -59,9 +61,7 @@ class ImportSettings:
         if self.focus_distance is not None and self.aperture_diameter is None:
             raise InputError("expected together with aperture_diameter, got it alone", field="focus_distance")
         _ = self.lens  # validates its numbers
-        sigmas = [name for name in ("pose_sigma_mm", "pose_sigma_deg") if getattr(self, name) is not None]
-        check_positive(self, *sigmas, zero=True, limit=sys.float_info.max)
-        check_positive(self, "scale_mm")
+        check_settings(self)
         if (self.pose_sigma_mm is None) != (self.pose_sigma_deg is None):
             raise InputError("expected both or neither", field="pose_sigma_mm, pose_sigma_deg")
 
