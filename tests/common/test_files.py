@@ -1,13 +1,18 @@
-"""Files appear whole or not at all, and nothing is left behind."""
+"""Files are written completely or not at all, and no temporary file remains; TOML and its errors."""
 
 from __future__ import annotations
 
 import pytest
 
-from nerif.common.files import atomic
+from nerif.common.files import atomic, check_known, read_toml, write_toml
+from refusals import refused
 
 
-def test_a_file_takes_its_name_at_the_end_and_keeps_its_ending(tmp_path):
+def names(folder):
+    return [p.name for p in folder.iterdir()]
+
+
+def test_a_file_takes_its_name_at_the_end_and_keeps_its_suffix(tmp_path):
     path = tmp_path / "a.nc"
     path.write_text("old")
     with atomic(path) as part:
@@ -15,37 +20,45 @@ def test_a_file_takes_its_name_at_the_end_and_keeps_its_ending(tmp_path):
         part.write_text("new")
         assert path.read_text() == "old"
     assert path.read_text() == "new"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.nc"]
+    with pytest.raises(RuntimeError), atomic(path) as part:  # noqa: PT012
+        part.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "new"
+    assert names(tmp_path) == ["a.nc"]
 
 
-def test_an_error_leaves_what_was_there_and_no_part(tmp_path):
-    path = tmp_path / "a.toml"
-    path.write_text("old")
-
-    def fails() -> None:
-        with atomic(path) as part:
-            part.write_text("half")
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        fails()
-    assert path.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.toml"]
-
-
-def test_a_directory_replaces_a_directory_but_a_file_does_not_and_what_a_killed_run_left_is_gone(tmp_path):
-    path = tmp_path / "s.zarr"
-    path.mkdir()
-    (path / "old").write_text("1")
-    left = tmp_path / ".s.part.zarr"
-    left.mkdir()
-    (left / "half").write_text("1")
+def test_a_directory_is_replaced_by_a_directory_only(tmp_path):
+    path, rest = tmp_path / "s.zarr", tmp_path / ".s.part.zarr"  # the rest of a killed process
+    for folder in (path, rest):
+        folder.mkdir()
+        (folder / "old").write_text("1")
     with atomic(path) as part:
         assert not part.exists()
         part.mkdir()
         (part / "new").write_text("1")
-    assert [p.name for p in path.iterdir()] == ["new"]
+    assert names(path) == ["new"]
     with pytest.raises(OSError), atomic(path) as part:
         part.write_text("a file")
-    assert [p.name for p in path.iterdir()] == ["new"]
-    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+    assert names(path) == ["new"]
+    assert names(tmp_path) == ["s.zarr"]
+
+
+def test_toml_is_read_as_written_below_a_comment(tmp_path):
+    table = {"a": 1.5, "b": {"c": ["x", "y"]}}
+    write_toml(tmp_path / "t.toml", table, "# about\n")
+    assert (tmp_path / "t.toml").read_text().startswith("# about\na = 1.5\n")
+    assert read_toml(tmp_path / "t.toml") == table
+    check_known({"width": 1}, ("width", "height"), "x.toml")
+    with refused("x.toml"):
+        check_known({"widht": 1}, ("width", "height"), "x.toml", more="; see there")
+
+
+@pytest.mark.parametrize("content", [b"[a", b"\xff", "folder", "none"])
+def test_invalid_toml(content, tmp_path):
+    path = tmp_path / "t.toml"
+    if content == "folder":
+        path.mkdir()
+    elif content != "none":
+        path.write_bytes(content)
+    with refused(path):
+        read_toml(path, "file; expected a calibration")

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
-from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
-from nerif.imaging.displacement.correlation import normalised_median_outliers
 from nerif.simulation.particles.cloud import Particles
 from nerif.simulation.particles.ring import VortexRing
 from nerif.simulation.particles.velocity import velocity_between
+from refusals import refused
 
 RING = VortexRing(radius=4.0, core=1.2, circulation=300.0, centre=(0.5, -1.0, 2.0))
 BOX = Box((-1.6, -2.4, -2.0), (1.6, 2.4, 2.0))
@@ -49,13 +47,13 @@ def test_the_ring_is_free_of_divergence_and_at_rest_far_away():
     assert float(ratio) == pytest.approx(1 / 8, rel=0.02)
 
 
-def test_a_ring_within_a_box_is_as_fast_as_asked():
+def test_a_ring_within_a_box_has_the_largest_speed():
     ring = VortexRing.within(BOX, speed=70.0)
     points = Grid(BOX, (41, 49, 33)).points().reshape(-1, 3)
     assert float(ring.velocity(points).norm(dim=1).max()) == pytest.approx(70.0, rel=0.02)
 
 
-def test_particles_go_with_the_ring_and_back():
+def test_particles_move_with_the_ring_and_back():
     cloud = Particles.draw(Box.cube(40.0), 50, seed=1)
     inside = cloud.moved_to(cloud.positions / 4)
     there = RING.advect(inside, 0.02)
@@ -73,7 +71,7 @@ def shifted(shift: tuple[float, float, float]) -> tuple[Volume, Volume]:
     return cloud.volume(GRID), moved.volume(GRID)
 
 
-def test_a_shift_is_found_with_its_direction_and_unit():
+def test_velocity_of_a_shift():
     shift = (1.3, -2.6, 0.7)
     velocity = velocity_between(*shifted(shift), seconds=0.002, window=16, passes=3)
     assert velocity.points.shape == velocity.values.shape == (7, 9, 5, 3)
@@ -87,7 +85,7 @@ def test_a_shift_is_found_with_its_direction_and_unit():
 
 
 def test_the_velocity_is_that_halfway():
-    """In a rotation what is seen from one instant alone points inward, by (1 - cos 0.2) = 0.02 of the radius."""
+    """In a rotation a one-sided difference points inward, by (1 - cos 0.2) = 0.02 of the radius."""
     cloud = Particles.draw(Box.cube(8.0), 20_000, seed=2)
     c, s = math.cos(0.1), math.sin(0.1)
     turn = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]]).double()
@@ -111,30 +109,23 @@ def test_where_there_are_no_particles_there_is_no_velocity():
     assert float(velocity.valid[velocity.points[..., 1] < -0.5].double().mean()) > 0.95
 
 
-def test_outliers_are_told_in_three_dimensions():
-    vectors = np.zeros((4, 5, 6, 3))
-    vectors[2, 1, 3, 2] = 3.0
-    bad = normalised_median_outliers(vectors)
-    assert np.argwhere(bad).tolist() == [[2, 1, 3]]
-
-
 def empty(grid: Grid) -> Volume:
     return Volume(torch.zeros(grid.shape), grid)
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "field"),
     [
-        (lambda: VortexRing(0.0, 1.0, 1.0), "radius: expected a positive number"),
-        (lambda: VortexRing(4.0, 0.1, 1.0), r"core: expected at least 0.05 of the radius, 4.0 mm, got 0.1"),
-        (lambda: RING.advect(Particles.draw(BOX, 2), 1.0, steps=0), "steps: expected at least 1, got 0"),
-        (lambda: velocity_between(empty(GRID), empty(GRID), 0.0), "seconds: expected a time above 0, got 0.0"),
-        (lambda: velocity_between(empty(GRID), empty(Grid(BOX, (4, 4, 4))), 1.0), "second: expected the grid"),
-        (lambda: velocity_between(*[empty(Grid(BOX, (40, 48, 16)))] * 2, 1.0), "grid: expected cubic voxels"),
-        (lambda: velocity_between(empty(GRID), empty(GRID), 1.0, window=33), "window: expected .* edge, 32, got 33"),
-        (lambda: velocity_between(empty(GRID), empty(GRID), 1.0, 16, passes=0), "passes: expected at least 1, got 0"),
+        (lambda: VortexRing(0.0, 1.0, 1.0), "radius"),
+        (lambda: VortexRing(4.0, 0.1, 1.0), "core"),
+        (lambda: RING.advect(Particles.draw(BOX, 2), 1.0, steps=0), "steps"),
+        (lambda: velocity_between(empty(GRID), empty(GRID), 0.0), "seconds"),
+        (lambda: velocity_between(empty(GRID), empty(Grid(BOX, (4, 4, 4))), 1.0), "second"),
+        (lambda: velocity_between(*[empty(Grid(BOX, (40, 48, 16)))] * 2, 1.0), "grid"),
+        (lambda: velocity_between(empty(GRID), empty(GRID), 1.0, window=33), "window"),
+        (lambda: velocity_between(empty(GRID), empty(GRID), 1.0, 16, passes=0), "passes"),
     ],
-)  # fmt: skip
-def test_bad_input(call, message):
-    with pytest.raises(InputError, match=message):
+)
+def test_invalid_input(call, field):
+    with refused(field):
         call()
