@@ -27,7 +27,7 @@ __all__ = ["LiveView", "curve_options", "look_html", "status_html"]
 
 EVERY = 1.0  # seconds
 CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
-STATES = {"pause": ("running",), "stop": ("running", "queued"), "resume": ("paused", "stopped", "failed")}  # states
+STATES = {"pause": ("running",), "stop": ("running", "queued"), "resume": ("paused", "stopped", "failed")}
 GREY, COLOURS = "#76838f", ["#2f86c9", "#d9721f"]  # visible on light and dark
 GRID: dict[str, Any] = {"axisLabel": {"color": GREY}, "nameTextStyle": {"color": GREY}}
 GRID["splitLine"] = {"lineStyle": {"color": "#76838f55"}}
