@@ -1,4 +1,4 @@
-"""The runs of the project, on every page: what waits, goes on and has ended, and what can be done with each."""
+"""The runs of the project on every page: state, progress and actions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerif.results.live import read_live
 __all__ = ["JobsDrawer", "film_progress", "progress_of"]
 
 EVERY = 1.0  # seconds
-SHOWN = 30  # runs
+MOST = 30  # runs in the drawer
 ACTIONS = {
     "running": ("pause", "stop"),
     "queued": ("first", "earlier", "later", "stop"),
@@ -36,7 +36,7 @@ NAMES = {
 
 
 def progress_of(work: Workspace, job: Job) -> tuple[float, str]:
-    """Return the progress of a run, from 0 to 1, and its current work; 0 and nothing if unknown."""
+    """Return the progress of a run, 0 to 1, and its stage; 0 and an empty text if unavailable."""
     if job.out.endswith(".zarr") and job.state in ("running", "paused"):
         return film_progress(work.project.path(job.out))
     live = read_live(work.project.path(job.out)) if job.out and job.state in ("running", "paused") else {}
@@ -46,12 +46,12 @@ def progress_of(work: Workspace, job: Job) -> tuple[float, str]:
 
 
 def film_progress(path: Path) -> tuple[float, str]:
-    """Return the share of the frames of a film that are done, and that in words; of a store not yet made, nothing."""
+    """Return the fraction of complete frames of a film, and the count as text; 0 and empty before there is a store."""
     if not (path / "zarr.json").is_file():
         return 0.0, ""
     try:
         store = VolumeSequence(path)
-    except InputError:  # just being made
+    except InputError:  # incomplete
         return 0.0, ""
     done, count = len(finished_frames(store)), len(store)
     return done / max(count, 1), f"{done} of {count} frames"
@@ -61,7 +61,7 @@ class JobsDrawer:
     """A button with the number of open runs, and the drawer that it opens."""
 
     def __init__(self, work: Workspace) -> None:
-        self.work, self._shown = work, ""
+        self.work, self._state = work, ""
         self.button = ui.button("Runs", icon="playlist_play", on_click=self.toggle)
         self.button.props('flat no-caps aria-label="Runs" aria-expanded=false')
 
@@ -76,7 +76,7 @@ class JobsDrawer:
         ui.timer(EVERY, self._refresh)
 
     def toggle(self) -> None:
-        """Open or close it."""
+        """Open or close the drawer."""
         self.drawer.toggle()
         self.button.props(f"aria-expanded={'true' if self.drawer.value else 'false'}")
 
@@ -89,25 +89,25 @@ class JobsDrawer:
         open_ = sum(job.state in ("running", "queued", "paused") for job in jobs)
         self.button.set_text(f"Runs ({open_})" if open_ else "Runs")
         state = repr([(j.id, j.state, j.request, j.place) for j in jobs]) + repr(progress)
-        if state == self._shown:
+        if state == self._state:
             return
-        self._shown = state
+        self._state = state
         self.place.clear()
         with self.place:
-            for job in jobs[:SHOWN]:
+            for job in jobs[:MOST]:
                 self._row(job, *progress[job.id])
             if not jobs:
-                ui.html("<p class=note>Nothing has been run from here yet.</p>", sanitize=False)
+                ui.html("<p class=note>No runs yet.</p>", sanitize=False)
 
     def _look(self) -> tuple[list[Job], dict[str, tuple[float, str]]]:
         jobs = self.work.jobs.all()
         return jobs, {job.id: progress_of(self.work, job) for job in jobs}
 
     def _row(self, job: Job, share: float, title: str) -> None:
-        lines = f"{job.state}, {job.request} requested" if job.state == "running" and job.request else job.state
+        state = f"{job.state}, {job.request} requested" if job.state == "running" and job.request else job.state
         with ui.element("div").classes(f"run {job.state}").props('role="listitem"'):
             ui.html(
-                f"<b>{escape(job.title)}</b><span class=state>{escape(lines)} {escape(title)}</span>"
+                f"<b>{escape(job.title)}</b><span class=state>{escape(state)} {escape(title)}</span>"
                 f"<code>{escape(job.line)}</code>", sanitize=False,
             )  # fmt: skip
             if job.state == "refused":
@@ -130,8 +130,8 @@ class JobsDrawer:
     def _log(self, id: str) -> None:
         with refusals(), ui.dialog(value=True) as dialog, ui.card().classes("log"):
             job = self.work.jobs.get(id)
-            text = "\n".join(self.work.jobs.log(id)) or "Nothing printed yet."
-            began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(job.started)) if job.started else "not begun"
+            text = "\n".join(self.work.jobs.log(id)) or "The log is empty."
+            began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(job.started)) if job.started else "not started"
             ui.html(f"<h2>{escape(job.title)}</h2><p class=note>{began}</p>", sanitize=False)
             ui.html(f"<pre tabindex=0>{escape(text)}</pre>", sanitize=False)
             ui.button("Close", on_click=dialog.close).props("flat no-caps")

@@ -1,4 +1,4 @@
-"""The isosurface of a field that is being found, which sharpens from look to look."""
+"""Isosurface of the present field of a reconstruction in progress."""
 
 from __future__ import annotations
 
@@ -16,49 +16,49 @@ from nerif.geometry import Box
 from nerif.report.isosurface import default_level, surface_triangles
 from nerif.results.live import Look
 
-__all__ = ["LiveSurface", "said_of"]
+__all__ = ["LiveSurface", "caption_of"]
 
 COLOUR = "#4aa3dd"
 SIZE = (1080, 380)
 
 
 class LiveSurface:
-    """A scene with the surface of the last look, where the page is being built; empty before the first one."""
+    """A scene with the latest isosurface, added to the page under construction; empty before the first one."""
 
     def __init__(self) -> None:
         self.place = ui.element("figure").classes("live-surface")
         self._scene: BoxScene | None = None
-        self._shown: list[Any] = []
+        self._surfaces: list[Any] = []
 
-    def forget(self) -> None:
-        """Show nothing: another run is followed."""
+    def clear(self) -> None:
+        """Remove the scene."""
         self.place.clear()
-        self._scene, self._shown = None, []
+        self._scene, self._surfaces = None, []
 
-    def show(self, name: str, stamp: int, box: Box, lines: str) -> None:
+    def show(self, name: str, stamp: int, box: Box, caption: str) -> None:
         """Show the surface of a look.
 
         Parameters
         ----------
-        name : of the result directory, relative to the project
-        stamp : that changes with each look
+        name : result directory, relative to the project
+        stamp : number that changes with each look
         box : mm
-        lines : description of the view
+        caption : description of the surface
         """
         if self._scene is None or self._scene.box != box:
-            self.forget()
+            self.clear()
             with self.place:
-                self._scene = BoxScene(box, lines, SIZE)
+                self._scene = BoxScene(box, caption, SIZE)
                 self._caption = ui.html("", sanitize=False)
-        for surface in self._shown[:-1]:  # the last one stays until this one is there
+        for surface in self._surfaces[:-1]:  # the previous one stays until the new one is loaded
             surface.delete()
-        self._shown = [*self._shown[-1:], self._scene.add(live_address(name, stamp), COLOUR)]
-        self._scene.name(f"{lines} Drag to turn, scroll to come nearer.")
-        self._caption.set_content(f"<figcaption>{escape(lines)}</figcaption>")
+        self._surfaces = [*self._surfaces[-1:], self._scene.add(live_address(name, stamp), COLOUR)]
+        self._scene.name(f"{caption} Drag to turn, scroll to zoom.")
+        self._caption.set_content(f"<figcaption>{escape(caption)}</figcaption>")
 
 
-def said_of(look: Look) -> str:
-    """Return in words where the isosurface of a look is."""
+def caption_of(look: Look) -> str:
+    """Return the level and extent of the isosurface of a look as text."""
     volume = look.volume
     level = default_level(volume)
     corners = surface_triangles(volume, level).reshape(-1, 3)
