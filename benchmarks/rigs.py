@@ -46,10 +46,13 @@ COLUMNS = {
 
 
 def cases(quick: bool) -> Iterator[Settings]:
-    case = {"seconds": 90.0, "seed": 0, "pixels": 200, "truth_voxels": 100, "folder_of_rigs": "../shared/data/rigs"}
+    case = {"seconds": 90.0, "seed": 0, "folder_of_rigs": "../shared/data/rigs"}
+    case |= {"pixels": 200, "f_number": 8.0, "truth_voxels": 100}  # of the rig "images"
     default = {"aperture": "auto", "refine": "", "source": "displacements"}
     if quick:
-        yield case | default | {"rig": IMAGES, "method": "nerif", "seconds": 3.0, "pixels": 24, "truth_voxels": 24}
+        yield case | default | {"rig": IMAGES, "method": "nerif"} | {
+            "seconds": 3.0, "pixels": 24, "f_number": 0.0, "truth_voxels": 24,
+        }  # fmt: skip
         return
     for rig in GOALS | REFINED:
         for method in ("nerif", "tv"):
@@ -65,11 +68,11 @@ def cases(quick: bool) -> Iterator[Settings]:
 
 def measure(
     folder: Path, rig: str, method: str, aperture: str, refine: str, source: str, seconds: float, pixels: int,
-    seed: int, truth_voxels: int, folder_of_rigs: str,
+    f_number: float, seed: int, truth_voxels: int, folder_of_rigs: str,
 ) -> dict[str, Any]:  # fmt: skip
     path = ROOT / folder_of_rigs / f"{rig}.nc"
     if rig == IMAGES:
-        path = photographed(folder, pixels, 8.0, "dots", 3.0, 0.0, 0.0, truth_voxels) / "correlation.nc"
+        path = photographed(folder, pixels, f_number, "dots", 3.0, 0.0, 0.0, truth_voxels) / "correlation.nc"
     elif not path.is_file():
         raise Unavailable(f"no {rig}.nc in {folder_of_rigs}")
     measurement = Measurement.read(path)
