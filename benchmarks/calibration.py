@@ -39,8 +39,8 @@ COLUMNS = {
 
 def cases(quick: bool) -> Iterator[Settings]:
     yield {
-        "views": 2 if quick else 9, "arc": 20.0 if quick else 170.0, "pixels": 200 if quick else 640, "sensor": 20.0,
-        "poses": 6 if quick else 40, "backgrounds": 1 if quick else 5, "target": "charuco", "seed": 0,
+        "views": 2 if quick else 9, "arc": 20.0 if quick else 170.0, "pixels": 320 if quick else 640, "sensor": 20.0,
+        "poses": 8 if quick else 40, "backgrounds": 1 if quick else 5, "target": "charuco", "seed": 0,
     }  # fmt: skip
 
 

@@ -46,6 +46,7 @@ ROUTES = (
 """Method, optical flow (none: images alone), data that are fitted."""
 DEFAULTS: Settings = {
     "pixels": 128, "seconds": 30.0, "f_number": 0.0, "background": "dots", "dot": 3.0, "shift": 0.0, "drift": 0.0,
+    "truth_voxels": 100,
 }  # fmt: skip
 """Edge (px), time of NeRIF (s), f-number of 50 mm lenses (0: pinholes), pattern and its size (px), largest displacement
 (px; 0: that of the flame), drift of the illumination from one side of the image to the other, and as much overall."""
@@ -68,7 +69,7 @@ COLUMNS = {
 
 
 def cases(quick: bool) -> Iterator[Settings]:
-    small = {"pixels": 32, "seconds": 3.0}
+    small = {"pixels": 32, "seconds": 3.0, "truth_voxels": 30}
     for changes, routes in [(small, (0, 3))] if quick else CASES:
         for method, flow, source in (ROUTES[i] for i in routes):
             yield {**DEFAULTS, **changes, "method": method, "flow": flow, "source": source, "seed": 0}
@@ -84,10 +85,17 @@ def pattern(background: str, dot: float, seed: int, width: float, height: float,
 
 
 def photographed(
-    folder: Path, pixels: int, f_number: float, background: str, dot: float, shift: float, drift: float
+    folder: Path,
+    pixels: int,
+    f_number: float,
+    background: str,
+    dot: float,
+    shift: float,
+    drift: float,
+    truth_voxels: int,
 ) -> Path:
     """Render images and measure displacements once for all routes; return the folder of measurements and truth."""
-    folder = folder / f"images-{pixels}-{f_number:g}-{background}-{dot:g}-{shift:g}-{drift:g}"
+    folder = folder / f"images-{pixels}-{f_number:g}-{background}-{dot:g}-{shift:g}-{drift:g}-{truth_voxels}"
     if (folder / "none.nc").is_file():
         return folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -101,7 +109,7 @@ def photographed(
         factor = shift / float(exact.norm(dim=-1).max())
         field, exact = Scaled(field, factor), exact * factor
     torch.save(exact, folder / "exact.pt")
-    grid = Grid.of_resolution(box, 100)
+    grid = Grid.of_resolution(box, truth_voxels)
     write_netcdf(folder / "truth.nc", [Volume.of(field.sample(grid), grid, "index_excess", N_AMBIENT)])
     sensor, images = Sensor(bits=12), []
     for i, camera in enumerate(cameras):
@@ -127,9 +135,9 @@ def photographed(
 
 def measure(
     folder: Path, pixels: int, seconds: float, f_number: float, background: str, dot: float, shift: float, drift: float,
-    method: str, flow: str, source: Source, seed: int,
+    truth_voxels: int, method: str, flow: str, source: Source, seed: int,
 ) -> dict[str, Any]:  # fmt: skip
-    folder = photographed(folder, pixels, f_number, background, dot, shift, drift)
+    folder = photographed(folder, pixels, f_number, background, dot, shift, drift, truth_voxels)
     measurement = Measurement.read(folder / f"{flow}.nc")
     if method == "nerif":
         result = NeRIF(time_limit=seconds, epochs=1e9, seed=seed, source=source, device="cpu")(measurement)

@@ -47,37 +47,33 @@ COLUMNS = {
 
 
 def cases(quick: bool) -> Iterator[Settings]:
-    case = {"seconds": 3.0 if quick else 90.0, "seed": 0, "folder_of_rigs": "../shared/data/rigs"}
+    case = {"seconds": 90.0, "seed": 0, "folder_of_rigs": "../shared/data/rigs"}
+    case |= {"pixels": 200, "f_number": 8.0, "truth_voxels": 100}  # of the rig "images"
+    default = {"aperture": "auto", "refine": "", "source": "displacements"}
     if quick:
-        yield case | {
-            "rig": IMAGES,
-            "method": "nerif",
-            "pixels": 32,
-            "aperture": "auto",
-            "refine": "",
-            "source": IMAGES,
-        }
+        yield case | default | {"rig": IMAGES, "method": "nerif"} | {
+            "seconds": 3.0, "pixels": 24, "f_number": 0.0, "truth_voxels": 24,
+        }  # fmt: skip
         return
     for rig in GOALS | REFINED:
         for method in ("nerif", "tv"):
-            base = case | {"rig": rig, "method": method, "pixels": 200}
-            default = {"aperture": "auto", "refine": "", "source": "displacements"}
+            base = case | default | {"rig": rig, "method": method}
             if rig == IMAGES:
-                yield base | default | {"source": IMAGES}
-            yield base | default
+                yield base | {"source": IMAGES}
+            yield base
             if rig.startswith(("f", "window")):
-                yield base | default | {"aperture": "off"}
+                yield base | {"aperture": "off"}
             if rig in REFINED and method == "nerif":
-                yield base | default | {"refine": REFINED[rig][0]}
+                yield base | {"refine": REFINED[rig][0]}
 
 
 def measure(
     folder: Path, rig: str, method: str, aperture: Aperture, refine: str, source: Source, seconds: float, pixels: int,
-    seed: int, folder_of_rigs: str,
+    f_number: float, seed: int, truth_voxels: int, folder_of_rigs: str,
 ) -> dict[str, Any]:  # fmt: skip
     path = ROOT / folder_of_rigs / f"{rig}.nc"
     if rig == IMAGES:
-        path = photographed(folder, pixels, 8.0, "dots", 3.0, 0.0, 0.0) / "correlation.nc"
+        path = photographed(folder, pixels, f_number, "dots", 3.0, 0.0, 0.0, truth_voxels) / "correlation.nc"
     elif not path.is_file():
         raise Unavailable(f"no {rig}.nc in {folder_of_rigs}")
     measurement = Measurement.read(path)

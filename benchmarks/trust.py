@@ -47,7 +47,7 @@ def cases(quick: bool) -> Iterator[Settings]:
     if quick:
         yield {
             "phantom": "gaussians", "noise": 0.05, "views": 6, "f_number": 0.0, "method": "nerif", "kind": "fast",
-            "steps": 20, "pixels": 24, "voxels": 24, "seed": 0,
+            "steps": 10, "pixels": 16, "voxels": 16, "seed": 0,
         }  # fmt: skip
         return
     phantoms = ("gaussians", "flame", "octahedron", "fire")
